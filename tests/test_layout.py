@@ -25,7 +25,7 @@ FOLDERS: dict[str, set[str]] = {
     "ondevice": {"errors", "host", "model", "opencl", "raster", "codec"},
     "clustering": {"errors", "host", "model", "opencl"},
     "formats": {"plain_text", "errors", "host", "model", "opencl", "codec", "clustering"},
-    "quality": {"errors", "host", "model", "opencl", "raster", "formats"},
+    "quality": {"errors", "host", "model", "opencl", "raster", "workers", "formats"},
     "outputs": {"errors", "host", "model", "opencl", "raster", "codec", "ondevice", "formats", "clustering"},
     "stages": {"errors", "host", "model", "opencl", "raster", "workers", "codec", "quality", "outputs"},
     "pipeline": {

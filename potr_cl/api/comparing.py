@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING, Any
 from potr_cl.api.inputs import (
     CamerasSource,
     ColourSource,
-    DeviceSource,
     SceneSource,
     bytes_of_source,
     cameras_of,
     chosen_views,
+    coded_scene,
     colour_of,
-    device_of,
     drawable_of,
     name_of,
     rules_of,
@@ -33,7 +32,8 @@ from potr_cl.plain_text import plain
 from potr_cl.quality.compare import (
     Comparison,
     SceneFile,
-    ViewFigures,
+    comparing,
+    comparison_of,
     comparison_report,
     find_ground_truth,
     format_comparison,
@@ -42,12 +42,14 @@ from potr_cl.quality.compare import (
     missing_photographs,
     size_report,
 )
-from potr_cl.quality.compare import compare as compare_pictures
+from potr_cl.quality.figures import ViewFigures
+from potr_cl.quality.judging import Looks
 from potr_cl.quality.metrics import Lpips
-from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.quality.shared_judging import SharedJudging
 from potr_cl.raster.rules import RULES, RasterRules
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.report.labels import U8, comparison_picture, shrunk
+from potr_cl.workers.opening import ClusterSource, DevicesSource, Workers, open_workers
 
 if TYPE_CHECKING:
     from potr_cl.viewer.server import Viewer
@@ -160,14 +162,15 @@ def compare(
     cameras: CamerasSource | None = None,
     *,
     truth: str | os.PathLike[str] | None = None,
-    views: Sequence[str | int] | None = None,
+    views: Sequence[str | int] | str | int | None = None,
     split: str | None = None,
     virtual_views: int | None = None,
     turntable: int | None = None,
     up: str | Sequence[float] | None = None,
     size: int | None = None,
     output: str | os.PathLike[str] | None = None,
-    device: DeviceSource = None,
+    device: DevicesSource = None,
+    cluster: ClusterSource = None,
     rules: RasterRules | str = "inria",
     background: ColourSource = "black",
     trust: bool = False,
@@ -185,7 +188,9 @@ def compare(
         split: "train", "test" or "all"; by default the test views, or all if there are none.
         virtual_views, turntable, up, size: of the views that are placed, see :func:`potr_cl.render`.
         output: a PNG file to write: the worst view of A, of B, and their difference, labelled.
-        device: to render on, or what it is called.
+        device: to render on, or what it is called. Several share the views out: a list, "all", or "0,1".
+        cluster: a Dask cluster whose workers share the views out: its scheduler's address, or a client. With
+            photographs, or with LPIPS installed, the device of this computer does all.
         rules: of the rasterizer to follow: inria or gsplat.
         background: R, G, B from 0 to 1, or a colour's name.
         trust, antialiased: as of :func:`potr_cl.load_scene`.
@@ -207,21 +212,23 @@ def compare(
     source_a = a if given is not None else scene_of(a, trust, antialiased)
     there = given or points.placed(scene_of(source_a))
     chosen = chosen_views(there, views, split)
-    opened = device_of(device)
     with (
-        drawable_of(source_a, opened, trust, antialiased) as scene_a,
-        drawable_of(b, opened, trust, antialiased) as scene_b,
+        open_workers(device, cluster) as workers,
+        drawable_of(source_a, workers.device, trust, antialiased) as scene_a,
+        drawable_of(b, workers.device, trust, antialiased) as scene_b,
     ):
         comparison = compare_scenes(
             (named(a, scene_a), scene_a),
             (named(b, scene_b), scene_b),
             chosen,
-            device=opened,
+            workers=workers,
             rules=wanted,
             background=colour,
             truth=None if truth is None else Path(truth),
             progress=progress,
             notes=[] if given else [f"no cameras: {told(there)}"],
+            files=None if antialiased is not None else (source_a, b),
+            trust=trust,
         )
     if output is not None:
         comparison.save(output)
@@ -240,14 +247,20 @@ def compare_scenes(
     b: tuple[SceneFile, Drawable],
     views: Sequence[Camera],
     *,
-    device: DeviceSource,
+    workers: Workers,
     rules: RasterRules,
     background: Colour,
     truth: Path | None = None,
     progress: Callable[[str, float], None] | None = None,
     notes: Sequence[str] = (),
+    files: Sequence[SceneSource | None] | None = None,
+    trust: bool = False,
 ) -> SceneComparison:
     """The same for scenes that have been read and views that have been chosen.
+
+    Args:
+        workers: that do it.
+        files: what both scenes have been read from as they are, for other computers; None: they are sent themselves.
 
     Raises:
         As :func:`compare`.
@@ -268,13 +281,18 @@ def compare_scenes(
         lpips = Lpips()
     except UsageError as missing:
         told_of.append(str(missing))
-    opened = device_of(device)
-    with Rasterizer(opened, a[1], rules, background) as of_a, Rasterizer(opened, b[1], rules, background) as of_b:
-        figures = compare_pictures(of_a, of_b, views, ground_truth, lpips, progress or (lambda _stage, _done: None))
+    opened, tell, stage = workers.device, progress or (lambda _stage, _done: None), comparing(len(views))
+    looks = Looks(background, rules, ground_truth, lpips)
+    far = workers.pool is not None and not workers.pool.in_process
+    coded = [coded_scene(each, trust) if far and each is not None else None for each in files or (None, None)]
+    tell(stage, 0.0)
+    with SharedJudging(opened, a[1], views, looks, workers.pool, anyway=True, coded=coded[0]) as judging:
+        found = judging.figures(b[1], views, coded[1], lambda done: tell(stage, done / len(views)))
+        figures = comparison_of(found)
         worst = figures.views[figures.worst]
-        pictures = [each.render(views[figures.worst])[0] for each in (of_a, of_b)]
+        ((picture_a, picture_b),) = judging.pictures(b[1], [views[figures.worst]])
     psnr = None if worst.identical else worst.figures["b_against_a"].psnr
-    picture, factor = comparison_picture(pictures[0], pictures[1], worst.name, psnr, (a[0].path.name, b[0].path.name))
+    picture, factor = comparison_picture(picture_a, picture_b, worst.name, psnr, (a[0].path.name, b[0].path.name))
     called = next((name for name, known in RULES.items() if known == rules), "own")
     settings = {"device": opened.info.name, "rules": called, "background": background}
     shown = {

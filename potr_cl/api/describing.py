@@ -72,7 +72,7 @@ def info(file: SceneSource, trust: bool = False) -> SceneInfo:
     if data is not None:
         opened = open_file(data, trust)
     elif not isinstance(file, (str, os.PathLike)):
-        scene, mended = _as_it_would_be_read(scene_of(file))
+        scene, mended = _as_it_would_be_read(file if isinstance(file, Scene) else scene_of(file))
         return SceneInfo({**own, **scene_report(scene, mended)})
     else:
         # A gzipped file is unpacked once, for both to tell its format and to read it.

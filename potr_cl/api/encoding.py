@@ -6,7 +6,7 @@ import contextlib
 import os
 import time
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,16 +34,17 @@ from potr_cl.outputs.output import Output
 from potr_cl.outputs.registry import OUTPUTS, output_of, output_of_suffix
 from potr_cl.pipeline.amounts import as_bytes, size_in_bytes
 from potr_cl.pipeline.encode import encode as run_stages
-from potr_cl.pipeline.encoded import Encoded
+from potr_cl.pipeline.encoded import Encoded, SharedOut
 from potr_cl.pipeline.keywords import stage_changes
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.presets import DEFAULT
-from potr_cl.pipeline.proof import proved
+from potr_cl.pipeline.proof import Proved, proved
 from potr_cl.pipeline.search import encode_to_target
 from potr_cl.pipeline.stopwatch import Stopwatch
 from potr_cl.pipeline.target import Found, Target
+from potr_cl.quality.by_photographs import judge_by_photographs
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
-from potr_cl.quality.ground_truth import GroundTruth, judge_by_photographs
+from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.report.html import PicturePair, html_report, views_to_show
@@ -52,6 +53,7 @@ from potr_cl.stages.code import Code
 from potr_cl.stages.refit import Refit
 from potr_cl.stages.stage import Progress, Stage, flags
 from potr_cl.workers.opening import ClusterSource, DevicesSource, open_workers
+from potr_cl.workers.pool import Pool, Traffic
 
 
 def encode(
@@ -147,6 +149,7 @@ def encode(
         if device is not None or cluster is not None or several_are_named():
             workers = stack.enter_context(open_workers(device, cluster))
         opened, pool = (None, None) if workers is None else (workers.device, workers.pool)
+        before = Traffic() if pool is None else replace(pool.traffic)
         file = stack.enter_context(replacing(output)) if output is not None else None
         page = stack.enter_context(replacing(report)) if report is not None else None
         found: Found | None = None
@@ -162,7 +165,6 @@ def encode(
             return encoded
         judged_on = None if judging is None else encoded.device or opened
         written = stack.enter_context(proved(encoded, trust, judged_on))
-        candidate = written.scene
         if file is not None:
             file.write(written.data)
         if page is not None:
@@ -177,10 +179,13 @@ def encode(
                 if folder is not None and views is not None:
                     ground_truth = GroundTruth(folder, views, encoded.options.background)
                     photographs = by_photographs(
-                        ground_truth, views, encoded, (what, candidate), used_device, encoded.options.background
-                    )
-                judge = Judge(judging, used_device, encoded.options.background, ground_truth, kept)
-                quality, pictures = judge(what, candidate, watch, report_view, pictures=True)
+                        ground_truth, views, encoded, (kept or what, written.scene), used_device,
+                        encoded.options.background, pool,
+                    )  # fmt: skip
+                judge = Judge(judging, used_device, encoded.options.background, ground_truth, kept, pool)
+                quality, pictures = judge(what, written, watch, report_view, pictures=True)
+                if pool is not None:
+                    encoded = replace(encoded, shared=SharedOut.by(pool, before))
             seconds = encoded.seconds | watch.seconds | {"total": time.perf_counter() - began}
             source = name_of(scene)
             used = encoded.options.changed(source_bytes=settings.source_bytes)
@@ -233,6 +238,8 @@ def encode_options(
     changes = {name: value for name, value in changes.items() if value is not None} | stage_changes(choices, stages)
     if options is None:
         options = EncodeOptions.for_preset(preset or DEFAULT, **changes)
+    elif not isinstance(options, EncodeOptions):
+        raise UsageError(f"the options are an EncodeOptions, not {type(options).__name__}: give a quality as q=0.5")
     elif preset is not None:
         raise UsageError("give either options or a preset: the options have one")
     else:
@@ -304,12 +311,13 @@ def by_photographs(
     ground_truth: GroundTruth,
     cameras: Sequence[Camera],
     encoded: Encoded,
-    scenes: tuple[Scene, Drawable],
+    scenes: tuple[Scene | KeptScene, Drawable],
     device: Device,
     background: Colour,
+    pool: Pool | None = None,
 ) -> dict[str, Any]:
     """What photographs say of an encode that was asked to fit to them; see :func:`judge_by_photographs`."""
-    figures = judge_by_photographs(ground_truth, cameras, scenes, device, background)
+    figures = judge_by_photographs(ground_truth, cameras, scenes, device, background, pool)
     return photographs_report(encoded, ground_truth.missing, figures)
 
 
@@ -323,6 +331,7 @@ class Judge:
         background: behind the scene.
         ground_truth: photographs to show beside the pictures, if there are any.
         kept: the uncompressed scene, if it lies on the device already.
+        pool: workers that views are shared out to, as long as ``device`` is the pool's first; None: it does all.
     """
 
     views: EvaluationViews
@@ -330,15 +339,16 @@ class Judge:
     background: Colour
     ground_truth: GroundTruth | None = None
     kept: KeptScene | None = None
+    pool: Pool | None = None
 
     def __call__(
-        self, scene: Scene, candidate: Drawable, watch: Stopwatch, chosen: str | None = None, pictures: bool = False
+        self, scene: Scene, written: Proved, watch: Stopwatch, chosen: str | None = None, pictures: bool = False
     ) -> tuple[dict[str, Any], list[PicturePair]]:
         """The figures, and pictures for a report.
 
         Args:
             scene: uncompressed.
-            candidate: as a decoder sees it; where it is on a device, that is the judge's.
+            written: the file; where its scene is on a device, that is the judge's.
             watch: told how far the stage "evaluate" is.
             chosen: a view to show besides the worst and the median one.
             pictures: whether to make any.
@@ -347,13 +357,14 @@ class Judge:
             DeviceError: a view does not fit the device, or the device failed.
         """
         watch("evaluate", 0.0)
-        original = scene if self.kept is None else self.kept.drawable(self.device, scene)
-        with Evaluator(self.device, original, self.views, self.background) as evaluator:
-            comparison = evaluator.compare(candidate, lambda _, done: watch("evaluate", done))
-            beside = evaluator.psnr_of(self.views.beside, candidate) if self.views.beside else None
-            quality = quality_report(self.views, comparison, beside)
+        reference = self.kept if self.kept is not None and self.kept.is_of(scene) else scene
+        with Evaluator(self.device, reference, self.views, self.background, self.pool, remember=False) as evaluator:
+            # The end is told when all is there.
+            found = evaluator.judge(written.scene, lambda _, done: watch("evaluate", min(done, 0.99)), written.coded)
+            quality = quality_report(self.views, *found)
             shown = views_to_show(quality, chosen) if pictures else []
-            pairs = evaluator.pictures(candidate, [view["name"] for _, view in shown])
+            pairs = evaluator.pictures(written.scene, [view["name"] for _, view in shown]) if shown else []
+        watch("evaluate", 1.0)
         return quality, [
             PicturePair(title, view["name"], view["psnr"], *pair, self._photograph(view["name"]))
             for (title, view), pair in zip(shown, pairs, strict=True)

@@ -22,7 +22,7 @@ from potr_cl.api.inputs import (
 from potr_cl.codec.blocks.file import BlockedFile
 from potr_cl.codec.decoder import decode as decode_file
 from potr_cl.codec.decoder import open_file
-from potr_cl.errors import DataError
+from potr_cl.errors import DataError, UsageError
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.box import Box
 from potr_cl.model.scene import Scene
@@ -115,6 +115,8 @@ def decode(
 
         write = scene_writer(output)
     data = encoded_bytes(file)
+    if data is None and not isinstance(file, (str, os.PathLike)):
+        raise UsageError(f"a .potr file is wanted, its bytes or an encode to one, not {type(file).__name__}")
     within = None if box is None else Box.of(box)
     scene = decode_file(file if data is None else data, trust, sh_degree, within)  # type: ignore[arg-type]
     if write is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from potr_cl.ondevice.decode import Beside
     from potr_cl.opencl.device import Device
     from potr_cl.opencl.discovery import DeviceInfo
+    from potr_cl.outputs.coded_scene import CodedScene
     from potr_cl.pipeline.encoded import Encoded
     from potr_cl.raster.rules import RasterRules
     from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
@@ -45,10 +46,11 @@ def scene_of(source: SceneSource, trust: bool = False, antialiased: bool | None 
         trust, antialiased: as of :func:`potr_cl.formats.load_scene`.
 
     Raises:
-        UsageError, DataError: as :func:`potr_cl.formats.load_scene`.
+        UsageError, DataError: as :func:`potr_cl.formats.load_scene`; and a scene in memory has no splats, or some with
+            non-finite values.
     """
     if isinstance(source, Scene):
-        return source.rendered(antialiased)
+        return _usable(source).rendered(antialiased)
     data = encoded_bytes(source)
     if data is not None:
         return decode(data, **_trusting(trust)).rendered(antialiased)
@@ -60,6 +62,17 @@ def scene_of(source: SceneSource, trust: bool = False, antialiased: bool | None 
 
         return load_scene(source, **_trusting(trust)).rendered(antialiased)
     raise UsageError(f"a scene is wanted, or the path of its file, not {type(source).__name__}")
+
+
+def _usable(scene: Scene) -> Scene:
+    """A scene in memory, which nobody may have cleaned; mended where no splat has to go, so that numbers stay right."""
+    if not len(scene):
+        raise DataError("the scene holds no splat")
+    clean, report = scene.cleaned()
+    if report.non_finite:
+        many = f"{report.non_finite:,} splats" if report.non_finite > 1 else "a splat"
+        raise DataError(f"the scene holds {many} with non-finite values: give scene.cleaned()[0], which is without")
+    return clean
 
 
 @contextmanager
@@ -112,6 +125,27 @@ def drawable_to_judge(
         yield buffers, joined([each.scene for each in samples])
 
 
+def coded_scene(source: SceneSource, trust: bool = False) -> CodedScene | None:
+    """The .potr file that a source stands for, for other computers to decode; None for anything else.
+
+    Raises:
+        UsageError: it cannot be read.
+    """
+    if not _is_potr(source):
+        return None
+    from potr_cl.outputs.coded_scene import CodedScene
+    from potr_cl.outputs.potr import Potr
+
+    data = encoded_bytes(source)
+    if data is None:
+        assert isinstance(source, (str, os.PathLike))
+        try:
+            data = Path(source).read_bytes()
+        except OSError as error:
+            raise UsageError(f"cannot read '{source}': {error.strerror}") from None
+    return CodedScene(Potr(), data, trust)
+
+
 def _is_potr(source: SceneSource) -> bool:
     if encoded_bytes(source) is not None:
         return True
@@ -162,8 +196,8 @@ def encoded_bytes(source: object) -> bytes | None:
 
 def encoded_file(source: object) -> tuple[str, bytes] | None:
     """The usual suffix and the bytes of what an encode has made, or of a .potr file's bytes; None for anything else."""
-    if isinstance(source, bytes):
-        return ".potr", source
+    if isinstance(source, (bytes, bytearray, memoryview)):
+        return ".potr", bytes(source)
     # Asked by name: what makes an encode's result takes long to import, and is there if there is one.
     pieces = getattr(source, "pieces", None)
     if not isinstance(pieces, list):
@@ -191,10 +225,14 @@ def cameras_of(source: CamerasSource | None, virtual_views: int | None = None) -
         from potr_cl.formats import load_cameras
 
         return load_cameras(source)
-    cameras = list(source)
+    given: object = source  # in notebooks it may be anything
+    cameras = list(given) if isinstance(given, Iterable) else [given]
     if not cameras:
         raise UsageError("the list of cameras is empty: leave it out, and virtual ones are placed")
-    return cameras
+    for camera in cameras:
+        if not isinstance(camera, Camera):
+            raise UsageError(f"cameras are wanted, or the path of their file, not {type(camera).__name__}")
+    return [camera for camera in cameras if isinstance(camera, Camera)]
 
 
 def placed_beside_cameras(option: str) -> UsageError:
@@ -262,12 +300,13 @@ def name_of(source: SceneSource) -> Path:
 
 
 def chosen_views(
-    cameras: Sequence[Camera], views: Sequence[str | int] | None = None, split: str | None = None
+    cameras: Sequence[Camera], views: Sequence[str | int] | str | int | None = None, split: str | None = None
 ) -> list[Camera]:
     """The views that are asked for by name or by split; without either the test views, or all if there are none.
 
     Args:
-        views: names, or indices from 0 in the cameras' order; a view that is named like a number is that view.
+        views: names, or indices from 0 in the cameras' order, or one of these; a view that is named like a number is
+            that view.
         split: "train", "test" or "all".
 
     Raises:
@@ -276,6 +315,7 @@ def chosen_views(
     if views is not None and split is not None:
         raise UsageError("give either views or a split")
     if views is not None:
+        views = [views] if isinstance(views, (str, int)) else views
         by_name = {camera.name: camera for camera in cameras}
         by_name = {str(index): camera for index, camera in enumerate(cameras)} | by_name
         for name in map(str, views):

@@ -159,7 +159,8 @@ def make_ladder(
             with replacing(file) as opened:
                 opened.write(written.data)
             if views is not None and judged_on is not None:
-                quality, _ = Judge(views, judged_on, options.background)(scene, written.scene, Stopwatch(progress))
+                judge = Judge(views, judged_on, options.background, pool=pool)
+                quality, _ = judge(scene, written, Stopwatch(progress))
                 psnr, ssim = quality["psnr"], quality["ssim"]
         rungs.append(Rung(q, file.name, nbytes, splats, psnr, ssim))
         if tell is not None:

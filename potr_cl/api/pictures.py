@@ -28,8 +28,10 @@ from potr_cl.formats.images import to_8_bits, write_png
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
+from potr_cl.quality.pictures import Renderer
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import RasterRules
+from potr_cl.raster.seen_rasterizer import rasterizer_for
 from potr_cl.report.labels import U8, contact_sheet
 
 #: Pixels along a side of each of a preview's pictures.
@@ -148,7 +150,7 @@ def render(
     rules: RasterRules | str = "inria",
     background: ColourSource = "black",
     *,
-    views: Sequence[str | int] | None = None,
+    views: Sequence[str | int] | str | int | None = None,
     split: str | None = None,
     virtual_views: int | None = None,
     turntable: int | None = None,
@@ -165,7 +167,7 @@ def render(
     rules: RasterRules | str = "inria",
     background: ColourSource = "black",
     *,
-    views: Sequence[str | int] | None = None,
+    views: Sequence[str | int] | str | int | None = None,
     split: str | None = None,
     virtual_views: int | None = None,
     turntable: int | None = None,
@@ -224,7 +226,7 @@ def render(
     opened = device_of(device)
     with (
         drawable_of(source, opened, trust, antialiased) as drawable,
-        Rasterizer(opened, drawable, wanted, colour) as rasterizer,
+        rasterizer_for(opened, drawable, chosen, wanted, colour) as rasterizer,
     ):
         pictures = [Rendering(*rasterizer.render(camera)) for camera in chosen]
     result = Renderings(chosen, pictures, note)
@@ -270,7 +272,7 @@ def make_folder(folder: Path) -> None:
         raise UsageError(f"cannot make the folder '{folder}': {error.strerror}") from None
 
 
-def written_pictures(rasterizer: Rasterizer, cameras: Sequence[Camera], paths: Sequence[Path]) -> Iterator[Path]:
+def written_pictures(rasterizer: Renderer, cameras: Sequence[Camera], paths: Sequence[Path]) -> Iterator[Path]:
     """Render views and write them one after another, so that no more than one is in memory; yields what is written.
 
     Raises:

@@ -6,7 +6,7 @@ import argparse
 import contextlib
 import time
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from potr_cl.api.encoding import (
@@ -20,7 +20,7 @@ from potr_cl.cli.batch import add_to_option, for_each_scene, jobs
 from potr_cl.cli.forecasts import tell_what_is_ahead
 from potr_cl.cli.guard import StandardOutput, read_file
 from potr_cl.cli.ladder import encode_ladder
-from potr_cl.cli.options import Commands, add_device_options, add_memory_option
+from potr_cl.cli.options import SEVERAL, Commands, add_cluster_option, add_device_options, add_memory_option
 from potr_cl.cli.outputs import WrittenEncoded, WrittenPage, place, writing
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
@@ -47,11 +47,11 @@ from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import Output
 from potr_cl.outputs.registry import OUTPUTS, encoded_suffix, output_of, output_of_suffix, suffixes_encoded
 from potr_cl.pipeline.encode import encode
-from potr_cl.pipeline.encoded import Encoded
+from potr_cl.pipeline.encoded import Encoded, SharedOut
 from potr_cl.pipeline.frame import frame_checked_beside
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.presets import DEFAULT, PRESETS, PURPOSE
-from potr_cl.pipeline.proof import proved
+from potr_cl.pipeline.proof import Proved, proved
 from potr_cl.pipeline.search import encode_to_target
 from potr_cl.pipeline.stopwatch import Stopwatch
 from potr_cl.pipeline.target import Target
@@ -63,6 +63,7 @@ from potr_cl.report.html import PicturePair, html_report
 from potr_cl.report.summary import encode_report, format_encode_report, search_report
 from potr_cl.stages.refit import Refit
 from potr_cl.workers.opening import Workers, open_workers
+from potr_cl.workers.pool import Pool, Traffic
 
 
 def _options(args: argparse.Namespace, source_bytes: int | None = None, output: Output | None = None) -> EncodeOptions:
@@ -137,9 +138,10 @@ def _encode(args: argparse.Namespace) -> None:
 
 
 def _opened(args: argparse.Namespace) -> Workers:
-    """What computes; the device begins to load what the last encode with this preset has needed."""
+    """What computes; the devices begin to load what the last encode with this preset has needed."""
     workers = open_workers(args.device, args.cluster)
-    workers.device.prepare_for(f"encode {args.preset}")
+    for device in workers.devices:
+        device.prepare_for(f"encode {args.preset}")
     return workers
 
 
@@ -158,6 +160,7 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Non
         with frame_checked_beside(scene, cameras, options.cameras_anyway):
             workers = opened.result() if opened is not None and options.look_at_views(scene) else None
             device, pool = (None, None) if workers is None else (workers.device, workers.pool)
+            before = Traffic() if pool is None else replace(pool.traffic)
             kept = (
                 None
                 if device is None or target is not None
@@ -183,23 +186,28 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Non
                 found = encode_to_target(scene, cameras, target, options, progress, device, progress.tell, pool=pool)
                 encoded, options, search = found.encoded, found.options, search_report(target, found)
             judged_on = None if views is None else encoded.device
+            watch = Stopwatch(progress)
+            if views is not None:
+                watch("evaluate", 0.0)  # what is judged is what is read
             # What cannot be decoded must not replace what can.
             written = stack.enter_context(proved(encoded, args.trust, judged_on))
             file.write(written.data)
-        candidate = written.scene
-        watch = Stopwatch(progress)
         pictures: list[PicturePair] = []
         quality: dict[str, Any] | str = "not judged, as asked"
         if views is not None:
             quality, pictures = _evaluate(
-                args, scene, candidate, views, encoded.device, opened, watch, shared.ground_truth, kept
+                args, scene, written, views, encoded.device, opened, watch, shared.ground_truth, kept
             )
         elif cameras is None:
             quality = "not judged: there are no cameras to look from"
         seconds = placing.seconds | encoded.seconds | watch.seconds | {"total": time.perf_counter() - began}
         photographs = None
         if shared.ground_truth is not None and cameras is not None:
-            photographs = _photographs(args, shared.ground_truth, cameras, (scene, candidate), encoded, device)
+            photographs = _photographs(
+                args, shared.ground_truth, cameras, (kept or scene, written.scene), encoded, device, pool
+            )
+        if pool is not None:
+            encoded = replace(encoded, shared=SharedOut.by(pool, before))  # with what judging has added
         report = encode_report(
             args.scene, scene, args.output, written, encoded, options, search, quality, seconds, photographs,
             args.typed,
@@ -215,7 +223,7 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Non
 def _evaluate(
     args: argparse.Namespace,
     scene: Scene,
-    candidate: Drawable,
+    written: Proved,
     views: EvaluationViews,
     device: Device | None,
     opened: Future[Workers] | None,
@@ -229,14 +237,16 @@ def _evaluate(
     """
     watch("evaluate", 0.0)
     try:
+        workers = None if opened is None else opened.result()
         judge = Judge(
             views,
-            device or (Device(args.device) if opened is None else opened.result().device),
+            device or (Device(args.device) if workers is None else workers.device),
             parse_colour(args.background),
             ground_truth,
             kept,
+            None if workers is None else workers.pool,
         )
-        return judge(scene, candidate, watch, args.report_view, pictures=args.report is not None)
+        return judge(scene, written, watch, args.report_view, pictures=args.report is not None)
     except DeviceError as error:
         return f"not judged: {error}", []
 
@@ -245,15 +255,16 @@ def _photographs(
     args: argparse.Namespace,
     ground_truth: GroundTruth,
     cameras: list[Camera],
-    scenes: tuple[Scene, Drawable],
+    scenes: tuple[Scene | KeptScene, Drawable],
     encoded: Encoded,
     device: Device | None,
+    pool: Pool | None,
 ) -> dict[str, Any] | None:
     """What photographs say; a device that fails now must not take the finished file with it."""
     try:
         found = by_photographs(
             ground_truth, cameras, encoded, scenes, encoded.device or device or Device(args.device),
-            parse_colour(args.background),
+            parse_colour(args.background), pool,
         )  # fmt: skip
     except DeviceError as error:
         note(f"not judged by photographs: {error}")
@@ -333,12 +344,6 @@ def add_encode(commands: Commands) -> None:
     add_trust_option(p)
     add_antialiased_option(p)
     add_memory_option(p, ", and for the re-fit; the host's arrays of a scene too large for it lie in temporary files")
-    add_device_options(
-        p, "; of several the views are shared out: all (of the best one's kind), or indices with commas, 0,1"
-    )
-    p.add_argument(
-        "--cluster",
-        metavar="ADDRESS",
-        help="a Dask cluster whose workers do the views: its scheduler's address, tcp://HOST:8786",
-    )
+    add_device_options(p, SEVERAL)
+    add_cluster_option(p)
     p.set_defaults(run=_encode, checked_suffix=encoded_suffix)

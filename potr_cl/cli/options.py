@@ -26,6 +26,18 @@ def add_memory_option(p: argparse._ActionsContainer, besides: str = "") -> None:
     )
 
 
+#: What the help of ``--device`` says besides, where a command takes several.
+SEVERAL = "; of several the views are shared out: all (of the best one's kind), or indices with commas, 0,1"
+
+
+def add_cluster_option(p: argparse._ActionsContainer) -> None:
+    p.add_argument(
+        "--cluster",
+        metavar="ADDRESS",
+        help="a Dask cluster whose workers do the views: its scheduler's address, tcp://HOST:8786",
+    )
+
+
 def add_device_options(p: argparse._ActionsContainer, several: str = "") -> None:
     """
     Args:
@@ -45,9 +57,9 @@ def add_device_options(p: argparse._ActionsContainer, several: str = "") -> None
     )
 
 
-def add_rendering_options(p: argparse.ArgumentParser) -> None:
-    """What every command that renders understands."""
-    add_device_options(p)
+def add_rendering_options(p: argparse.ArgumentParser, several: str = "") -> None:
+    """What every command that renders understands; ``several``: as of :func:`add_device_options`."""
+    add_device_options(p, several)
     p.add_argument(
         "--rules",
         choices=tuple(RULES),

@@ -102,6 +102,8 @@ class CommandParser(argparse.ArgumentParser):
             return super()._match_argument(action, arg_strings_pattern)
         except argparse.ArgumentError:
             wanted = f"{action.nargs} values" if isinstance(action.nargs, int) and action.nargs > 1 else "a value"
+            if isinstance(action.metavar, tuple):
+                wanted += f", {' '.join(action.metavar)}"
             self.error(f"{_name(action)} needs {wanted}: {_described(action)}")
 
     def _print_message(self, message: str, file: Any = None) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+from pathlib import Path
 
 from potr_cl.api.comparing import compare_scenes, named
 from potr_cl.api.inputs import chosen_views
@@ -13,15 +14,23 @@ from potr_cl.cli.guard import (
     ReadCameras,
     ReadFile,
     ReadPhotographs,
+    StandardInput,
     WrittenFolder,
     check_files,
     check_photographs,
 )
-from potr_cl.cli.options import CAMERAS_HELP, Commands, add_rendering_options, add_view_options
+from potr_cl.cli.options import (
+    CAMERAS_HELP,
+    SEVERAL,
+    Commands,
+    add_cluster_option,
+    add_rendering_options,
+    add_view_options,
+)
 from potr_cl.cli.outputs import WrittenPicture
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
-from potr_cl.cli.scenes import add_antialiased_option, add_trust_option, read_scene, read_to_draw
+from potr_cl.cli.scenes import ANTIALIASED, add_antialiased_option, add_trust_option, read_scene, read_to_draw
 from potr_cl.cli.terminal import note, say, say_document, say_done
 from potr_cl.cli.views import read_cameras, warn_of_frame
 from potr_cl.errors import UsageError
@@ -34,9 +43,10 @@ from potr_cl.model.viewpoints import AXES, SIZE, VIEWS
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import list_devices
 from potr_cl.quality.compare import format_sizes, size_report
-from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import RULES
 from potr_cl.raster.scene_buffers import Drawable
+from potr_cl.raster.seen_rasterizer import rasterizer_for
+from potr_cl.workers.opening import open_workers
 
 
 def _add_viewpoints(p: argparse.ArgumentParser) -> None:
@@ -99,7 +109,8 @@ def _render(args: argparse.Namespace) -> None:
         else:
             drawable, judged = stack.enter_context(read_to_draw(args, args.scene, device))
             warn_of_frame(args.scene, judged, views)
-        rasterizer = stack.enter_context(Rasterizer(device, drawable, RULES[args.rules], background))
+        rasterizer = rasterizer_for(device, drawable, views, RULES[args.rules], background)
+        stack.callback(rasterizer.close)
         progress = stack.enter_context(contextlib.closing(Progress()))
         progress(stage, 0.0)
         for done, _ in enumerate(written_pictures(rasterizer, views, written), 1):
@@ -127,7 +138,8 @@ def _compare(args: argparse.Namespace) -> None:
     points = _viewpoints(args)
     if args.cameras is None and args.truth is not None:
         raise UsageError("--truth needs --cameras, the views that the photographs show")
-    pictures_asked_for = [args.views, args.split, args.output, args.device] != [None] * 4 or points.asked_for
+    given = [args.views, args.split, args.output, args.device, args.cluster]
+    pictures_asked_for = any(each is not None for each in given) or points.asked_for
     cameras = None if args.cameras is None else read_cameras(args)
     if cameras is None and not pictures_asked_for and not list_devices():
         # Sizes need no device, and may be all that is wanted of a machine without one.
@@ -142,12 +154,12 @@ def _compare(args: argparse.Namespace) -> None:
             cameras = _cameras(args, points, scenes[0], "; a scene encoded with cameras looks best from those")
             drawables += scenes
             views = chosen_views(cameras, args.views, args.split)
-            device = Device(args.device)
+            workers = stack.enter_context(open_workers(args.device, args.cluster))
         else:
             views = chosen_views(cameras, args.views, args.split)
-            device = Device(args.device)
+            workers = stack.enter_context(open_workers(args.device, args.cluster))
             for path in (args.a, args.b):
-                drawable, judged = stack.enter_context(read_to_draw(args, path, device))
+                drawable, judged = stack.enter_context(read_to_draw(args, path, workers.device))
                 warn_of_frame(path, judged, views)
                 drawables.append(drawable)
         a, b = drawables
@@ -155,12 +167,19 @@ def _compare(args: argparse.Namespace) -> None:
         progress = stack.enter_context(contextlib.closing(Progress()))
         comparison = compare_scenes(
             (named(args.a, a), a), (named(args.b, b), b), views,
-            device=device, rules=RULES[args.rules], background=background, truth=args.truth, progress=progress,
+            workers=workers, rules=RULES[args.rules], background=background, truth=args.truth, progress=progress,
+            files=_files(args), trust=args.trust,
         )  # fmt: skip
         if picture is not None:
             comparison.write_picture(picture)
             comparison.notes.append(f"{args.output}: {comparison.caption}")
     _tell(args, comparison.report(), str(comparison))
+
+
+def _files(args: argparse.Namespace) -> list[Path | None]:
+    """What may be sent to other computers as it is."""
+    as_they_say = ANTIALIASED[args.antialiased] is None
+    return [path if as_they_say and not isinstance(path, StandardInput) else None for path in (args.a, args.b)]
 
 
 def _tell(args: argparse.Namespace, report: dict[str, object], text: str) -> None:
@@ -195,5 +214,6 @@ def add_compare(commands: Commands) -> None:
     p.add_argument("--json", action="store_true", help="for programs")
     add_trust_option(p)
     add_antialiased_option(p)
-    add_rendering_options(p)
+    add_rendering_options(p, SEVERAL)
+    add_cluster_option(p)
     p.set_defaults(run=_compare)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,17 +32,18 @@ class Geometry:
     Attributes:
         asked: the parameters that it was quantised with.
         parameters: those in world units.
-        tree: the centres.
+        written: returns the centres as a file's streams have them, once they are written; several may ask.
         order: (N,) index in the scene of each splat of the file.
         scales, rotations: levels of the three axes, (N,) each.
         opacities: (N,) levels.
         antialiased, low_pass: as of the scene.
         steps: what fits the steps of each splat's colours to it, where something is known of what it shows.
+        centres: (N, 3) as a decoder finds them, in the order of the file, where they are known without.
     """
 
     asked: quantize.HyperParameters
     parameters: quantize.HyperParameters
-    tree: octree.OctreeStreams
+    written: Callable[[], octree.OctreeStreams]
     order: NDArray[np.int64]
     scales: list[quantize.Integers]
     rotations: list[quantize.Integers]
@@ -49,6 +51,12 @@ class Geometry:
     antialiased: bool
     low_pass: float
     steps: ColourSteps | None = None
+    centres: NDArray[np.float32] | None = None
+
+    @property
+    def tree(self) -> octree.OctreeStreams:
+        """The centres, as a file's streams have them."""
+        return self.written()
 
     def decoded(self, sh: NDArray[np.float32], run: Run = map) -> Scene:
         """What a decoder makes of it, bit for bit, in the order of the scene.
@@ -66,15 +74,12 @@ class Geometry:
         parameters, n = self.parameters, len(order)
         version = VERSIONS[parameters.version]
 
-        def parsed() -> NDArray[np.float32]:
-            return octree.parse(self.tree, n, run, -(-n // BLOCK))
-
-        # A part of it is one thread's work, and the others have enough to do meanwhile.
-        centres = parsed if run is map else in_background(parsed).result
+        found = octree.parse(self.tree, n, run, -(-n // BLOCK)) if self.centres is None else self.centres
 
         def fill(start: int) -> None:
             part = slice(start, min(start + BLOCK, n))
             rows, scales = order[part], [axis[part] for axis in self.scales]
+            scene.means[rows] = found[part]
             log_scales = [version.dequantize_scales(levels, parameters.sf_scale) for levels in scales]
             scene.log_scales[rows] = np.stack(log_scales, axis=1)
             turned = np.empty((len(rows), 4), np.float32)
@@ -84,12 +89,6 @@ class Geometry:
             scene.opacity_logits[rows] = version.dequantize_opacities(self.opacities[part], parameters.sf_opacity)
 
         list(run(fill, range(0, n, BLOCK)))
-        found = centres()
-
-        def place(start: int) -> None:
-            scene.means[order[start : start + BLOCK]] = found[start : start + BLOCK]
-
-        list(run(place, range(0, n, BLOCK)))
 
     def colour_classes(self) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
         """(N,) classes of the steps of DC and of AC, in the order of the file: :class:`ColourSteps`; 0 without any."""
@@ -128,10 +127,11 @@ class Geometry:
         place[self.order] = np.arange(len(order))
         was = place[order]
         moved = replace(
-            self, tree=tree, order=order, scales=[levels[was] for levels in self.scales],
+            self, written=partial(_itself, tree), order=order, scales=[levels[was] for levels in self.scales],
             rotations=[levels[was] for levels in self.rotations], opacities=self.opacities[was], steps=None,
+            centres=None,
         )  # fmt: skip
-        if may_be_coarse(tree):
+        if may_be_coarse(tree.depth):
             log_scales = moved.decoded(np.empty((len(order), 1, 3), np.float32)).log_scales
             check_positions(means, log_scales, tolerance, tree, order)
         return moved
@@ -207,43 +207,44 @@ def quantise_in_world_units(
     """
     absolute = VERSIONS[parameters.version].absolute_leaf_levels
 
-    def begun(
-        numbers: NDArray[np.int64] | None, run: Run = map
-    ) -> tuple[NDArray[np.int64], Callable[[], octree.OctreeStreams]]:
+    def begun(numbers: NDArray[np.int64] | None, run: Run = map) -> octree.Begun:
         own = slice(None) if numbers is None else numbers
         tolerance = np.maximum(world.gamma, world.beta * nearest[own])
-        order, finish = octree.begin(scene.means[own], tolerance, absolute, run)
+        tree = octree.begin(scene.means[own], tolerance, absolute, run)
+        if may_be_coarse(tree.depth):
+            check_positions(scene.means[own], scene.log_scales[own], tolerance, tree.streams(), tree.order)
+        return tree
 
-        def tree() -> octree.OctreeStreams:
-            streams = finish()
-            if may_be_coarse(streams):
-                check_positions(scene.means[own], scene.log_scales[own], tolerance, streams, order)
-            return streams
-
-        return order, tree
-
-    def made(streams: octree.OctreeStreams, order: NDArray[np.int64], levels: SplatLevels) -> Geometry:
+    def made(
+        order: NDArray[np.int64],
+        levels: SplatLevels,
+        written: Callable[[], octree.OctreeStreams],
+        centres: NDArray[np.float32] | None = None,
+    ) -> Geometry:
         return Geometry(
-            parameters, world, streams, order, levels.scales, levels.rotations, levels.opacities,
-            scene.antialiased, scene.low_pass,
+            parameters, world, written, order, levels.scales, levels.rotations, levels.opacities,
+            scene.antialiased, scene.low_pass, centres=centres,
         )  # fmt: skip
 
     if rows is None:
-        order, tree = begun(None, run)
-        # One thread writes the tree while the others find the levels.
-        tree = tree if run is map else in_background(tree).result
-        levels = splat_levels(scene, order, world, run)
-        return [made(tree(), order, levels)]
+        tree = begun(None, run)
+        # Nobody needs the streams before the file is written.
+        written = in_background(tree.streams).result
+        return [made(tree.order, splat_levels(scene, tree.order, world, run), written, tree.decoded(run))]
 
     def built(numbers: NDArray[np.int64]) -> tuple[NDArray[np.int64], octree.OctreeStreams]:
-        order, tree = begun(numbers)
-        return order, tree()
+        tree = begun(numbers)
+        return tree.order, tree.streams()
 
     # Threads share out the parts here, and each part's splats there.
     return [
-        made(streams, order, splat_levels(scene, own[order], world, run))
+        made(order, splat_levels(scene, own[order], world, run), partial(_itself, streams))
         for own, (order, streams) in zip(rows, run(built, rows), strict=True)
     ]
+
+
+def _itself(streams: octree.OctreeStreams) -> octree.OctreeStreams:
+    return streams
 
 
 def distances_to_views(means: NDArray[np.float32], views: Sequence[Camera], run: Run) -> NDArray[np.float64]:

@@ -16,9 +16,9 @@ _PART_OF_A_SPLAT, _PART_OF_THE_SCENE = 2.0**-20, 2.0**-32
 _NAMED = 3
 
 
-def may_be_coarse(tree: octree.OctreeStreams) -> bool:
-    """Whether there is something to check for :func:`check_positions`."""
-    return tree.depth > _SAFE_DEPTH
+def may_be_coarse(depth: int) -> bool:
+    """Whether there is something to check for :func:`check_positions` in an octree of so many levels."""
+    return depth > _SAFE_DEPTH
 
 
 def check_positions(

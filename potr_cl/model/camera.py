@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +51,12 @@ class Camera:
 
     def __post_init__(self) -> None:
         where = f"camera '{self.name}'"
+        self._take("rotation", lambda value: np.asarray(value, np.float64), "an array of numbers")
+        self._take("translation", lambda value: np.asarray(value, np.float64), "an array of numbers")
+        for name in ("width", "height"):
+            self._take(name, _whole, "a whole number of pixels")
+        for name in ("fx", "fy", "cx", "cy"):
+            self._take(name, float, "a number of pixels")
         if self.width < 1 or self.height < 1:
             raise DataError(f"{where}: image size {self.width} x {self.height} is not positive")
         intrinsics = (self.fx, self.fy, self.cx, self.cy)
@@ -67,6 +74,14 @@ class Camera:
         if self.split not in ("train", "test"):
             raise DataError(f"{where}: split '{self.split}' is neither 'train' nor 'test'")
 
+    def _take(self, name: str, made: Callable[[Any], Any], kind: str) -> None:
+        """Make an attribute what it should be, of what stands for it as well."""
+        value = getattr(self, name)
+        try:
+            object.__setattr__(self, name, made(value))
+        except (TypeError, ValueError, OverflowError) as error:
+            raise DataError(f"camera '{self.name}': {name} is {type(value).__name__}, not {kind}") from error
+
     def __repr__(self) -> str:
         at = ", ".join(f"{x:.3g}" for x in self.centre)
         view = 2 * math.degrees(math.atan(self.width / 2 / self.fx))
@@ -81,6 +96,12 @@ class Camera:
     def centre(self) -> NDArray[np.float64]:
         """(3,) position of the camera centre in world units."""
         return -self.rotation.T @ self.translation
+
+
+def _whole(value: Any) -> int:
+    if int(value) != value:
+        raise ValueError
+    return int(value)
 
 
 def resized(camera: Camera, width: int, height: int) -> Camera:

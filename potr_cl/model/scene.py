@@ -93,7 +93,11 @@ class Scene:
     low_pass: float = LOW_PASS
 
     def __post_init__(self) -> None:
-        n = len(self.means)
+        for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
+            if not isinstance(getattr(self, name), np.ndarray):
+                kind = type(getattr(self, name)).__name__
+                raise DataError(f"scene: {name} is of type {kind}, expected a NumPy array of float32")
+        n = len(self.means) if self.means.ndim else 0
         wanted = {
             "means": (n, 3),
             "log_scales": (n, 3),
@@ -110,7 +114,7 @@ class Scene:
             raise DataError(f"scene: {self.sh.shape[1]} SH coefficients a channel, expected one of {SH_COEFFICIENTS}")
         for name in (*wanted, "sh"):
             if getattr(self, name).dtype != np.float32:
-                raise DataError(f"scene: {name} is {getattr(self, name).dtype}, expected float32")
+                raise DataError(f"scene: {name} is {getattr(self, name).dtype}, expected float32 (astype)")
         if self.low_pass != LOW_PASS and not (self.antialiased and self.low_pass == MIP_SPLATTING_LOW_PASS):
             raise DataError(
                 f"scene: a low-pass filter of {self.low_pass:g} square pixels, expected {LOW_PASS:g}, or for an "

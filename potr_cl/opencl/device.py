@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
+import os
 import threading
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
@@ -15,9 +15,10 @@ import numpy as np
 import pyopencl as cl
 
 from potr_cl.errors import DeviceError, DeviceMemoryError
-from potr_cl.host.threads import in_background
+from potr_cl.host.threads import in_background, thread_pool
 from potr_cl.opencl import compiler, program_cache, quirks
 from potr_cl.opencl.ahead import context_of
+from potr_cl.opencl.building import building
 from potr_cl.opencl.discovery import DeviceInfo, Family, choose_device, compiler_fault, compiles_nothing
 from potr_cl.opencl.foresight import Foresight, Wanted
 from potr_cl.opencl.kernel import Kernel, declared_parameters
@@ -25,8 +26,8 @@ from potr_cl.opencl.source import kernel_source
 
 logger = logging.getLogger("potr_cl")
 
-#: Held while a program is built or loaded.
-_BUILDING = threading.RLock()
+#: Threads that build programs at a time.
+_BUILDERS = 8
 
 #: Bytes that the driver fills; more are filled by a kernel, with work-groups of so many work-items.
 _FILLED, _FILLING = 1 << 30, 256
@@ -158,23 +159,25 @@ class Device:
         about = (purpose, self.info.name, self.info.platform, self.info.version, self.family)
         self._foresight = Foresight(Path(folder), repr(about))
 
-        def load(wanted: Sequence[Wanted]) -> None:
-            for program in wanted:
-                with suppress(DeviceError, OSError):
-                    self._built(program)
+        def load(program: Wanted) -> None:
+            with suppress(DeviceError, OSError):
+                self._built(program)
 
-        return in_background(load, list(self._foresight.programs))
+        def load_all(wanted: Sequence[Wanted]) -> None:
+            with thread_pool(1 if self.info.kind == "cpu" else min(os.cpu_count() or 1, _BUILDERS)) as threads:
+                list(threads.map(load, wanted))
+
+        return in_background(load_all, list(self._foresight.programs))
 
     def _built(self, wanted: Wanted) -> cl.Program:
         source, macros = wanted
-        # pyopencl sleeps where two threads want its cache at a time.
-        with _BUILDING:
-            if wanted not in self._programs:
-                options = ["-cl-std=CL1.2", *self._build_options, *(f"-D{name}={value}" for name, value in macros)]
-                with self.errors(f"failed to build {source}"), warnings.catch_warnings():
-                    warnings.simplefilter("ignore")  # some drivers chat unasked, and a full disk stops no build
-                    program = cl.Program(self.context, kernel_source(source, self._variants))
-                    self._programs[wanted] = program.build(options, cache_dir=program_cache.folder())
+        if wanted not in self._programs:
+            with building(wanted, alone=self.info.kind == "cpu"):
+                if wanted not in self._programs:
+                    options = ["-cl-std=CL1.2", *self._build_options, *(f"-D{name}={value}" for name, value in macros)]
+                    with self.errors(f"failed to build {source}"):
+                        program = cl.Program(self.context, kernel_source(source, self._variants))
+                        self._programs[wanted] = program.build(options, cache_dir=program_cache.folder(repr(wanted)))
         return self._programs[wanted]
 
     def kernel(self, source: str, name: str, **defines: str | int | float) -> Kernel:

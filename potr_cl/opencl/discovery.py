@@ -271,7 +271,7 @@ def fitting_devices(spec: str | None = None) -> list[DeviceInfo]:
         return devices
     wanted = spec.strip().lower()
     if wanted == "all" or re.fullmatch(r"\d+(\s*,\s*\d+)+", wanted):
-        raise DeviceError(f"'{spec}' names several devices, but only encode shares its work out: name one")
+        raise DeviceError(f"'{spec}' names several devices, but only encode and compare share their work out: name one")
     if wanted.isdecimal() and len(wanted) < 9:
         matches = [d for d in devices if d.index == int(wanted)]
     elif wanted in ("cpu", "gpu"):

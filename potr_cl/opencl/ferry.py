@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -57,6 +58,9 @@ class Ferry(Owner):
         #: By so many pieces the threads are ahead of the device, or behind it.
         self._lag = self._places // 2
         self._staging = [Staging(device) for _ in range(self._places)]
+        #: What was sent from each place last, if that may still be on its way.
+        self._sent: list[cl.Event | None] = [None] * self._places
+        self._turn = 0
         self._threads: ThreadPoolExecutor | None = None
 
     def to_device(self, buffer: cl.Buffer, cargo: Sequence[Cargo], pitch: int = 0) -> None:
@@ -75,18 +79,18 @@ class Ferry(Owner):
                 self._copy_at_once(buffer, each, pitch, to_device=True)
             return
         pieces = [piece for each in cargo for piece in _pieces(each.part, each.start, pitch)]
-        filled: list[Future[NDArray[np.float32]]] = []
-        sent: list[cl.Event] = []
+        filling: deque[tuple[int, Future[NDArray[np.float32]]]] = deque()
         for number in range(len(pieces) + self._lag):
             if number < len(pieces):
-                if number >= self._places:
-                    sent[number - self._places].wait()
-                filled.append(self._in_thread(self._fill, number % self._places, pieces[number][0]))
+                place = self._place()
+                event, self._sent[place] = self._sent[place], None
+                if event is not None:
+                    event.wait()
+                filling.append((place, self._in_thread(self._fill, place, pieces[number][0])))
             if number >= self._lag:
-                done = number - self._lag
-                sent.append(self._copy(buffer, filled[done].result(), pieces[done][1], pitch, to_device=True))
-        for event in sent[-self._places :]:
-            event.wait()
+                place, filled = filling.popleft()
+                start = pieces[number - self._lag][1]
+                self._sent[place] = self._copy(buffer, filled.result(), start, pitch, to_device=True)
 
     def to_host(self, cargo: Sequence[Cargo], buffer: cl.Buffer, pitch: int = 0) -> None:
         """Copy from a buffer: :meth:`to_device` the other way round. The arrays have it when it returns."""
@@ -102,7 +106,8 @@ class Ferry(Owner):
                 if number >= self._places:
                     taken[number - self._places].result()
                 own, start = pieces[number]
-                array = self._staging[number % self._places].array(own.shape, np.float32)
+                # What is still sent from there comes before, in the queue.
+                array = self._staging[self._place()].array(own.shape, np.float32)
                 arriving.append((array, self._copy(buffer, array, start, pitch, to_device=False)))
             if number >= self._lag:
                 array, event = arriving[number - self._lag]
@@ -110,6 +115,10 @@ class Ferry(Owner):
                 taken.append(self._in_thread(np.copyto, pieces[number - self._lag][0], array))
         for future in taken:
             future.result()
+
+    def _place(self) -> int:
+        self._turn = (self._turn + 1) % self._places
+        return self._turn
 
     def _few(self, cargo: Sequence[Cargo]) -> bool:
         return self._direct or sum(each.part.nbytes for each in cargo) < LEAST
@@ -157,6 +166,10 @@ class Ferry(Owner):
         if self._threads is not None:
             self._threads.shutdown()
             self._threads = None
+        for event in self._sent:
+            if event is not None:
+                event.wait()
+        self._sent = [None] * self._places
         for staging in self._staging:
             staging.close()
 

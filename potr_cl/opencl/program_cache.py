@@ -6,6 +6,7 @@ and then fail. And where its caches cannot be written, as in a container without
 
 from __future__ import annotations
 
+import hashlib
 import os
 import sys
 import time
@@ -22,10 +23,17 @@ os.environ.setdefault("PYOPENCL_CACHE_FAILURE_FATAL", "")
 PATIENCE, OLD = 5.0, 60.0
 
 
-def folder() -> str | bool:
-    """The folder to give to pyopencl, without a lock that was left; False, for none, where it cannot be written."""
+def folder(program: str = "") -> str | bool:
+    """The folder to give to pyopencl, without a lock that was left; False, for none, where it cannot be written.
+
+    Args:
+        program: what names one program: it has a folder of its own, so that nobody waits for who loads or builds
+            another one. None is named: the folder of all these.
+    """
     version = ".".join(map(str, sys.version_info[:2]))
     name = os.path.join(platformdirs.user_cache_dir("potr_cl", "potr_cl"), f"programs-py{version}")
+    if program:
+        name = os.path.join(name, hashlib.sha256(program.encode()).hexdigest()[:16])
     if not _can_be_written(name):
         return False
     _remove_left_lock(os.path.join(name, "lock"))

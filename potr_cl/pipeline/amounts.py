@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
+from numbers import Real
 
 from potr_cl.errors import UsageError
 
@@ -21,6 +22,8 @@ def as_bytes(gigabytes: float | None) -> int | None:
     """
     if gigabytes is None:
         return None
+    if not isinstance(gigabytes, Real):
+        raise UsageError(f"--memory is {gigabytes!r}: give a number of GiB")
     if not 0 <= gigabytes <= _MOST_GIGABYTES:
         raise UsageError(f"--memory is {gigabytes:g}, it must lie between 0 and {_MOST_GIGABYTES:g} GiB")
     return int(gigabytes * 2**30)

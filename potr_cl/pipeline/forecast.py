@@ -1,8 +1,8 @@
 """What an encode will take, before it begins (:func:`forecast`): seconds and bytes, roughly.
 
 Nearly all of the time goes into projecting, sorting and compositing splats, view by view. So a few views are rendered,
-and their mean time, as a unit, is multiplied by what each stage was measured to take in such units. This sees the
-device, the scene and the size of the pictures, and whatever else the machine is doing.
+and the mean of their times, as a unit, is multiplied by what each stage was measured to take in such units. This sees
+the device, the scene and the size of the pictures, and what the machine is doing besides, unless that lasts a moment.
 ``python -m tools.bench.forecast`` measures the units, and how far off a forecast is (docs/benchmarks/forecast.md).
 """
 
@@ -32,8 +32,9 @@ from potr_cl.stages.pruning.sweep_options import default_memory
 from potr_cl.stages.refit import Refit
 from potr_cl.stages.views_between import Between
 
-#: Views that are rendered to see how long one takes.
-_SAMPLE = 4
+#: Views that are rendered to see how long one takes; and how often each is at the most, where that takes no longer than
+#: so many seconds: other work comes and goes, and may take a device away for longer than a view does.
+_SAMPLE, _MOST_OFTEN, _ENOUGH = 4, 9, 0.1
 #: Plain encodes that a search takes the time of.
 _SEARCH = 3
 #: Of the time of a view of a step of the fit at q = 0.5, what is left at q = 0: with q, the splats that it moves become
@@ -158,16 +159,21 @@ def forecast(
 def _view(drawable: Drawable, cameras: Sequence[Camera], options: EncodeOptions, device: Device) -> tuple[float, float]:
     """Seconds that a picture takes, and bytes of what can be kept of a view: means of a few."""
     chosen = [cameras[round(place)] for place in np.linspace(0, len(cameras) - 1, min(_SAMPLE, len(cameras)))]
-    seconds, nbytes = [], []
+    seconds: list[list[float]] = []
+    nbytes = []
     with Rasterizer(device, drawable, background=options.background) as rasterizer:
-        for number, camera in enumerate([chosen[0], *chosen]):
+
+        def rendered(camera: Camera) -> float:
             began = time.perf_counter()
             rasterizer.render_device(camera)
             device.queue.finish()
-            if number:  # the first time buffers are made
-                seconds.append(time.perf_counter() - began)
+            return time.perf_counter() - began
+
+        rendered(chosen[0])  # the first time buffers are made
+        while len(seconds) < _MOST_OFTEN and (not seconds or np.size(seconds) * np.median(seconds) < _ENOUGH):
+            seconds.append([rendered(camera) for camera in chosen])
         for camera in chosen:
             before = device.allocated
             with rasterizer.prepare_set([camera]):
                 nbytes.append(device.allocated - before + _PIXEL * camera.width * camera.height)
-    return float(np.mean(seconds)), float(np.mean(nbytes))
+    return float(np.median(seconds, axis=0).mean()), float(np.mean(nbytes))

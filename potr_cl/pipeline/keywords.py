@@ -15,6 +15,8 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from potr_cl.errors import UsageError
 from potr_cl.pipeline.presets import DEFAULT, stages_of
 from potr_cl.stages.stage import Flag, Stage, flags
@@ -94,6 +96,12 @@ def _value(kind: type[Stage], field: str, flag: Flag, name: str, value: Any) -> 
             return field, flag.kind(value)
         except ValueError:
             raise UsageError(f"{name} is {value!r}: that is no value for it") from None
+    if isinstance(value, np.generic):
+        value = value.item()  # NumPy has numbers of its own, which JSON does not know
+    if flag.kind is int and isinstance(value, float):
+        if not value.is_integer():
+            raise UsageError(f"{name} is {value:g}: give a whole number")
+        value = int(value)
     if flag.many and not isinstance(value, (list, tuple)):
         return field, (value,)
     return field, value

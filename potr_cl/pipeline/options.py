@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from numbers import Real
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -52,6 +53,10 @@ class EncodeOptions:
     def __post_init__(self) -> None:
         if self.preset not in PRESETS:
             raise UsageError(f"preset '{self.preset}' is unknown: choose one of {', '.join(PRESETS)}")
+        if not isinstance(self.q, Real) or isinstance(self.q, bool):
+            raise UsageError(f"the quality q is {self.q!r}: give a number from 0 to 1")
+        # NumPy has numbers of its own, which JSON does not know.
+        object.__setattr__(self, "q", float(self.q))
         if not self.stages:
             object.__setattr__(self, "stages", PRESETS[self.preset])
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from potr_cl.errors import DataError, PotrError
 from potr_cl.opencl.device import Device
+from potr_cl.outputs.coded_scene import CodedScene
 from potr_cl.pipeline.encoded import Encoded
 from potr_cl.raster.scene_buffers import Drawable
 
@@ -19,10 +20,12 @@ class Proved:
     Attributes:
         data: the whole file.
         scene: what readers see; in a device's memory, where it will be looked at there.
+        coded: the file, for other computers' devices to make the scene of.
     """
 
     data: bytes
     scene: Drawable
+    coded: CodedScene
 
 
 @contextmanager
@@ -48,4 +51,4 @@ def proved(encoded: Encoded, trust: bool = False, device: Device | None = None) 
                 f"the encoded file cannot be decoded ({error}): nothing was written. If the scene has splats that are "
                 "very far away or very large, leave them out"
             ) from error
-        yield Proved(data, scene)
+        yield Proved(data, scene, CodedScene(output, data, trust))

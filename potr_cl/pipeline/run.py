@@ -11,6 +11,7 @@ from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encoded import Encoded, SharedOut
 from potr_cl.pipeline.fallback import on_device
+from potr_cl.pipeline.fit_trial import Trial, only_if_it_pays
 from potr_cl.pipeline.host_memory import for_views
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.stopwatch import Stopwatch
@@ -62,7 +63,27 @@ class Run:
         """
         for stage in self._options.stages:
             if only is None or type(stage) in only:
-                state = self._one(stage, state)
+                before, state = state, self._one(stage, state)
+                if isinstance(stage, Fit):
+                    state = self._fit_that_pays(before, state)
+        return state
+
+    def _fit_that_pays(self, before: State, after: State) -> State:
+        """The state after a fit, or the one before it if a file says so."""
+        device = self.device
+        if device is None or Fit.name not in after.learnt or not self._options.stage(Fit).compared:
+            return after
+        names = [type(stage) for stage in self._options.stages]
+        remaining = names[names.index(Fit) + 1 :]
+        source = before.source if self._kept is None else self._kept.drawable(device, before.source)
+
+        def made(state: State) -> State:
+            self._watch(Fit.name, 0.99)
+            return Run(self._options, Stopwatch(), device, self._kept, self._pool).stages(state, remaining)
+
+        trial = Trial(made, self._options.output, device, source, self._options.background)
+        state = only_if_it_pays(before, after, trial)
+        self._watch(Fit.name, 1.0)
         return state
 
     def _one(self, stage: Stage, state: State) -> State:
@@ -129,12 +150,15 @@ class Run:
 
 
 def as_done(options: EncodeOptions, state: State) -> EncodeOptions:
-    """The options as a state has followed them: only a fit that made up for splats has the others round finer."""
+    """The options as a state has followed them: only a fit that made up for splats has the others round finer.
+
+    Whether a fit pays is known then, and not asked again where other qualities follow.
+    """
     fitted = state.learnt.get(Fit.name)
     if isinstance(fitted, LeftOut):
         return options.changed(fit=False)
-    if isinstance(fitted, Fitted) and not fitted.spared:
-        return options.changed(fit={"finer": 0.0})
+    if isinstance(fitted, Fitted):
+        return options.changed(fit={"compared": False, **({} if fitted.spared else {"finer": 0.0})})
     return options
 
 

@@ -20,7 +20,9 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from types import TracebackType
 
 from potr_cl.codec.blocks.geometry import GeometryOfBlocks
 from potr_cl.codec.geometry import Geometry
@@ -28,6 +30,7 @@ from potr_cl.errors import UnreachableError, UsageError
 from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
+from potr_cl.outputs.coded_scene import CodedScene
 from potr_cl.pipeline.encode import cameras_or_virtual, tell_left_out, tell_losses
 from potr_cl.pipeline.encoded import Encoded
 from potr_cl.pipeline.fallback import on_device
@@ -109,14 +112,11 @@ def encode_to_target(
         raise UsageError("a PSNR can be reached with cameras only: without them there is no view to judge by")
 
     def work(device: Device, memory: int | None) -> Found:
-        search = _Search(
+        with _Search(
             scene, cameras or [], target, options.changed(memory=memory), watch, device, tell or (lambda _line: None),
             pool,
-        )  # fmt: skip
-        try:
+        ) as search:  # fmt: skip
             return search.run()
-        finally:
-            search.close()
 
     found, _ = on_device(device or (Device() if pool is None else pool.first), options.memory, work)
     tell_left_out(scene, found.encoded)
@@ -151,7 +151,7 @@ def _with_short_fit(options: EncodeOptions) -> EncodeOptions:
     return options
 
 
-class _Search:
+class _Search(AbstractContextManager["_Search"]):
     def __init__(
         self,
         scene: Scene,
@@ -193,7 +193,7 @@ class _Search:
         target = self._target
         if target.min_psnr is not None:
             self._evaluator = Evaluator(
-                self._device, self._scene, EvaluationViews.of(self._cameras), self._options.background
+                self._device, self._scene, EvaluationViews.of(self._cameras), self._options.background, self._pool
             )
         q = self._scout(self._typical.quality(target.aim))
         reduces = bool(self._views) and self._options.look_at_views(self._scene)
@@ -397,10 +397,15 @@ class _Search:
         else:
             encoded = None
             pieces = self._code(reduced, options.changed(code=_QUICK_CODER)).pieces
-            self._watch("evaluate tries", 0.0)
-            with options.output.seen(b"".join(pieces), self._evaluator.device, trust=True) as candidate:
-                value = min(self._evaluator.psnr(candidate), _IDENTICAL)
-            self._watch("evaluate tries", 1.0)
+            what = "evaluate tries"
+            self._watch(what, 0.0)
+            coded = CodedScene(options.output, b"".join(pieces), trust=True)
+            with coded.on(self._evaluator.device) as candidate:
+                psnr = self._evaluator.psnr(
+                    candidate, coded=coded, progress=lambda done: self._watch(what, min(done, 0.99))
+                )
+            value = min(psnr, _IDENTICAL)
+            self._watch(what, 1.0)
         self._tries.append(Try(kind, q, value))
         self._tell(f"{KINDS[kind].format(f'{q:g}')} {self._target.describe(value)}")
         return _Candidate(thinned, reduced, options, value, encoded)
@@ -416,7 +421,8 @@ class _Search:
         low, high = map(self._target.describe, values)
         return f"quality 0 gives {low}, quality 1 gives {high}"
 
-    def close(self) -> None:
-        """Give all device memory back."""
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         if self._evaluator is not None:
-            self._evaluator.close()
+            self._evaluator.__exit__(kind, error, trace)

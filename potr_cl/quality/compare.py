@@ -6,10 +6,9 @@ A is the reference scene (uncompressed), B the candidate. With photographs, both
 from __future__ import annotations
 
 import math
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +17,12 @@ from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
 from potr_cl.formats.cameras.view_files import IMAGE_SUFFIXES, stem
-from potr_cl.formats.images import Colour, image_size, to_8_bits
-from potr_cl.host.threads import thread_pool
+from potr_cl.formats.images import image_size, to_8_bits
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
+from potr_cl.quality.figures import Against, Figures, ViewFigures
 from potr_cl.quality.metrics import Lpips
-from potr_cl.quality.metrics_device import Similarity, in_batches
-from potr_cl.quality.photographs import read_photograph
-from potr_cl.quality.pictures import Picture, place_pictures, rendered
-from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.quality.pictures import Renderer, rendered
 
 _TITLES = {
     "b_against_a": "B against A",
@@ -34,9 +30,6 @@ _TITLES = {
     "b_against_truth": "B against photo",
     "loss": "loss by photo",
 }
-
-#: Photographs read before they are needed.
-_READ_AHEAD = 32
 
 #: Factors by which an error map may be amplified.
 _FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
@@ -51,35 +44,6 @@ class SceneFile:
     splats: int
     sh_degree: int
     antialiased: bool = False
-
-
-@dataclass(frozen=True)
-class Figures:
-    """How close two pictures are; ``psnr`` is infinite for identical ones, ``lpips`` None where it was not computed."""
-
-    psnr: float
-    ssim: float
-    lpips: float | None
-
-
-@dataclass(frozen=True)
-class ViewFigures:
-    """The figures of one view, or their means.
-
-    Attributes:
-        name: of the view.
-        figures: by what was compared: "b_against_a" always; with photographs also "a_against_truth",
-            "b_against_truth" and "loss", what B loses to A against the photograph (A's PSNR and SSIM minus B's,
-            B's LPIPS minus A's: positive where B is worse).
-    """
-
-    name: str
-    figures: dict[str, Figures]
-
-    @property
-    def identical(self) -> bool:
-        """Whether A's and B's pictures are the same in every pixel."""
-        return math.isinf(self.figures["b_against_a"].psnr)
 
 
 @dataclass(frozen=True)
@@ -165,8 +129,8 @@ def _images_by_name(folder: Path) -> dict[str, list[Path]]:
 
 
 def compare(
-    a: Rasterizer,
-    b: Rasterizer,
+    a: Renderer,
+    b: Renderer,
     cameras: Sequence[Camera],
     ground_truth: Mapping[str, Path] | None = None,
     lpips: Lpips | None = None,
@@ -187,62 +151,31 @@ def compare(
         DataError: a photograph is damaged.
         DeviceError: a view does not fit the device.
     """
-
-    stage = f"comparing {len(cameras)} view{'s' if len(cameras) > 1 else ''}"
-    device, similarity = a.device, Similarity(a.device)
+    stage = comparing(len(cameras))
     views: list[ViewFigures] = []
-
-    def figures(pairs: list[tuple[Picture, Picture]]) -> list[Figures]:
-        distances = [lpips(*(picture.download(device) for picture in pair)) if lpips else None for pair in pairs]
-        return [Figures(*found, distance) for found, distance in zip(similarity(pairs), distances, strict=True)]
-
-    def compared(some: Sequence[Camera], of_a: list[Picture], of_b: list[Picture]) -> Iterator[ViewFigures]:
-        found = [figures(list(zip(of_b, of_a, strict=True)))]
-        names = ["b_against_a"]
-        if ground_truth is not None:
-            buffer = device.upload(np.concatenate([next(read).reshape(-1) for _ in some]), "the photographs")
-            try:
-                truths = place_pictures(buffer, some)
-                found += [figures(list(zip(of, truths, strict=True))) for of in (of_a, of_b)]
-            finally:
-                device.free(buffer)
-            found.append([_loss(*losses) for losses in zip(*found[1:], strict=True)])
-            names += ["a_against_truth", "b_against_truth", "loss"]
-        for camera, of_view in zip(some, zip(*found, strict=True), strict=True):
-            yield ViewFigures(camera.name, dict(zip(names, of_view, strict=True)))
-
     progress(stage, 0.0)
-    with thread_pool() as pool:
-        read = _ground_truth(
-            pool, [(ground_truth[camera.name], camera) for camera in cameras] if ground_truth else [], a.background
-        )
-        for some in in_batches(device, cameras):
-            with rendered(a, some) as of_a, rendered(b, some) as of_b:
-                for view in compared(some, of_a, of_b):
-                    views.append(view)
-                    progress(stage, len(views) / len(cameras))
+    against = Against(a.device, a.background, ground_truth, lpips)
+    for view in against.figures(partial(rendered, a), partial(rendered, b), cameras):
+        views.append(view)
+        progress(stage, len(views) / len(cameras))
+    return comparison_of(views)
+
+
+def comparing(views: int) -> str:
+    """What the comparison of so many views is called in the progress."""
+    return f"comparing {views} view{'s' if views > 1 else ''}"
+
+
+def comparison_of(views: list[ViewFigures]) -> Comparison:
+    """The comparison that some views' figures make.
+
+    Raises:
+        UsageError: there is none.
+    """
     if not views:
         raise UsageError("there is no view to compare")
     worst = min(range(len(views)), key=lambda number: views[number].figures["b_against_a"].psnr)
     return Comparison(views, worst)
-
-
-def _ground_truth(
-    pool: ThreadPoolExecutor, photographs: Sequence[tuple[Path, Camera]], background: Colour
-) -> Iterator[FloatArray]:
-    """The photographs in order, some read ahead."""
-    pending: deque[Future[FloatArray]] = deque()
-    for path, camera in photographs:
-        pending.append(pool.submit(read_photograph, path, camera, background))
-        if len(pending) > _READ_AHEAD:
-            yield pending.popleft().result()
-    while pending:
-        yield pending.popleft().result()
-
-
-def _loss(a: Figures, b: Figures) -> Figures:
-    lpips = b.lpips - a.lpips if a.lpips is not None and b.lpips is not None else None
-    return Figures(0.0 if a.psnr == b.psnr else a.psnr - b.psnr, a.ssim - b.ssim, lpips)
 
 
 def mean_view(views: Sequence[ViewFigures]) -> ViewFigures:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from types import TracebackType
 from typing import Literal
 
 import numpy as np
@@ -17,18 +16,19 @@ from potr_cl.model.scene import FloatArray
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
-from potr_cl.quality.compare import Comparison, compare
-from potr_cl.quality.metrics_device import Similarity, in_batches
-from potr_cl.quality.pictures import Picture, rendered
-from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.quality.compare import Comparison, comparing, comparison_of, mean_view
+from potr_cl.quality.figures import ViewFigures
+from potr_cl.quality.judging import Looks
+from potr_cl.quality.shared_judging import SharedJudging
+from potr_cl.raster.carried import Carried
+from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.scene_buffers import Drawable
+from potr_cl.workers.pool import Pool
 
 #: So many training views, spread evenly, stand for all of them where there are no test views.
 _MOST_TRAINING_VIEWS = 32
 #: Beside held-out views so many training views are judged, as a part of them, and at least, and at most.
 _BESIDE, _LEAST_BESIDE, _MOST_BESIDE = 1 / 8, 4, 16
-#: Bytes of the uncompressed scene's pictures that are kept from one candidate to the next; others are rendered again.
-CACHED_PICTURES = 1 << 30
 
 
 @dataclass(frozen=True)
@@ -95,30 +95,48 @@ class Evaluator(Owner):
         scene: the uncompressed one.
         views: to judge by.
         background: behind both.
+        pool: workers that the views are shared out to, of which ``device`` is the first; None: the device does all.
+        remember: whether the scene's pictures are kept for the next candidate.
 
     Attributes:
-        device: as given.
+        device, views: as given.
 
     Raises:
-        DeviceError: the scene does not fit the device.
+        DeviceError: the kernels cannot be built.
     """
 
-    def __init__(self, device: Device, scene: Drawable, views: EvaluationViews, background: Colour) -> None:
+    def __init__(
+        self,
+        device: Device,
+        scene: Drawable | KeptScene,
+        views: EvaluationViews,
+        background: Colour,
+        pool: Pool | None = None,
+        remember: bool = True,
+    ) -> None:
         self.views = views
         self.device = device
-        self._background = background
-        self._reference = Rasterizer(device, scene, background=background)
-        self._similarity = Similarity(device)
-        self._pictures: dict[str, Picture] = {}
-        self._kept = ExitStack()
-        self._room = min(CACHED_PICTURES, device.info.memory // 16)
+        looks = Looks(background, remember=remember)
+        self._judging = SharedJudging(device, scene, [*views.views, *views.beside], looks, pool)
 
-    def psnr(self, candidate: Drawable, most: int | None = None) -> float:
+    def psnr(
+        self,
+        candidate: Drawable,
+        most: int | None = None,
+        coded: Carried | None = None,
+        progress: Callable[[float], None] = lambda done: None,
+    ) -> float:
         """:meth:`psnr_of` the views, or of so many of them, spread evenly."""
         views = self.views.views
-        return self.psnr_of(views if most is None else _evenly(views, most), candidate)
+        return self.psnr_of(views if most is None else _evenly(views, most), candidate, coded, progress)
 
-    def psnr_of(self, views: Sequence[Camera], candidate: Drawable) -> float:
+    def psnr_of(
+        self,
+        views: Sequence[Camera],
+        candidate: Drawable,
+        coded: Carried | None = None,
+        progress: Callable[[float], None] = lambda done: None,
+    ) -> float:
         """Mean over some views of the PSNR against the uncompressed scene's pictures, in decibels.
 
         Identical pictures are left out of the mean; it is infinite if all are identical.
@@ -126,35 +144,25 @@ class Evaluator(Owner):
         Args:
             views: any.
             candidate: to judge; where it is on a device, that is the evaluator's.
+            coded: what the pool's workers on other computers are sent in its place.
+            progress: called with the part of the views that is done.
         """
-        values: list[float] = []
-        with Rasterizer(self.device, candidate, background=self._background) as rasterizer:
-            for some in in_batches(self.device, views):
-                with self._references(some) as references, rendered(rasterizer, some) as pictures:
-                    values += [psnr for psnr, _ in self._similarity(list(zip(pictures, references, strict=True)))]
-        finite = [value for value in values if math.isfinite(value)]
-        return sum(finite) / len(finite) if finite else math.inf
+        return _mean_psnr(self._judging.figures(candidate, views, coded, lambda done: progress(done / len(views))))
 
-    @contextmanager
-    def _references(self, cameras: Sequence[Camera]) -> Iterator[list[Picture]]:
-        """The uncompressed scene's pictures; kept from one candidate to the next while there is room."""
-        missing = [camera for camera in cameras if camera.name not in self._pictures]
-        with ExitStack() as stack:
-            new: list[Picture] = []
-            if missing:
-                nbytes = sum(12 * camera.width * camera.height for camera in missing)
-                keep = nbytes <= self._room
-                new = (self._kept if keep else stack).enter_context(rendered(self._reference, missing))
-                if keep:
-                    self._room -= nbytes
-                    self._pictures |= {camera.name: picture for camera, picture in zip(missing, new, strict=True)}
-            rest = iter(new)
-            yield [self._pictures.get(camera.name) or next(rest) for camera in cameras]
+    def judge(
+        self, candidate: Drawable, progress: Callable[[str, float], None], coded: Carried | None = None
+    ) -> tuple[Comparison, float | None]:
+        """PSNR and SSIM from every view, and the mean PSNR from the training views beside them, if there are any.
 
-    def compare(self, candidate: Drawable, progress: Callable[[str, float], None]) -> Comparison:
-        """PSNR and SSIM from every view; see :func:`potr_cl.quality.compare.compare`."""
-        with Rasterizer(self.device, candidate, background=self._background) as rasterizer:
-            return compare(self._reference, rasterizer, self.views.views, progress=progress)
+        Args:
+            candidate, coded: as of :meth:`psnr_of`.
+            progress: called with the stage and the part of it that is done.
+        """
+        views, beside = self.views.views, self.views.beside
+        stage, together = comparing(len(views)), [*views, *beside]
+        progress(stage, 0.0)
+        found = self._judging.figures(candidate, together, coded, lambda done: progress(stage, done / len(together)))
+        return comparison_of(found[: len(views)]), _mean_psnr(found[len(views) :]) if beside else None
 
     def pictures(self, candidate: Drawable, names: Sequence[str]) -> list[tuple[FloatArray, FloatArray]]:
         """(H, W, 3) float32 pictures of both scenes from the named views.
@@ -162,12 +170,17 @@ class Evaluator(Owner):
         Raises:
             UsageError: there is no such view.
         """
-        cameras = [self.views.named(name) for name in names]
-        with Rasterizer(self.device, candidate, background=self._background) as rasterizer:
-            return [(self._reference.render(camera)[0], rasterizer.render(camera)[0]) for camera in cameras]
+        return self._judging.pictures(candidate, [self.views.named(name) for name in names])
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._judging.__exit__(kind, error, trace)
 
     def close(self) -> None:
         """Give all device memory back."""
-        self._kept.close()
-        self._pictures = {}
-        self._reference.close()
+        self._judging.close()
+
+
+def _mean_psnr(views: Sequence[ViewFigures]) -> float:
+    return mean_view(views).figures["b_against_a"].psnr

@@ -9,14 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from potr_cl.formats.images import Colour
-from potr_cl.model.camera import Camera, test_views, train_views
-from potr_cl.model.scene import FloatArray, Scene
-from potr_cl.opencl.device import Device
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import FloatArray
 from potr_cl.quality.compare import find_ground_truth, missing_photographs
 from potr_cl.quality.metrics import psnr
 from potr_cl.quality.photographs import read_photograph
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.scene_buffers import Drawable
 
 
 class GroundTruth:
@@ -88,33 +86,3 @@ class PhotographFigures:
     def means(self) -> tuple[float, float]:
         """Mean over the views, of the uncompressed scene and of the file."""
         return float(np.mean(self.uncompressed)), float(np.mean(self.file))
-
-
-def judge_by_photographs(
-    ground_truth: GroundTruth,
-    cameras: Sequence[Camera],
-    scenes: tuple[Scene, Drawable],
-    device: Device,
-    background: Colour = (0.0, 0.0, 0.0),
-) -> PhotographFigures:
-    """Judge a scene and its file by photographs of test views; where no test view has one, of training views.
-
-    Args:
-        ground_truth: the photographs.
-        cameras: all of the scene's.
-        scenes: uncompressed, and as a decoder sees the file.
-        device: to render on.
-        background: behind both.
-
-    Raises:
-        UsageError, DataError: a photograph cannot be read.
-        DeviceError: a view does not fit the device.
-    """
-    views, kind = ground_truth.of(test_views(cameras)), "test"
-    if not views:
-        views, kind = ground_truth.of(train_views(cameras)), "train"
-    psnrs = []
-    for scene in scenes:
-        with Rasterizer(device, scene, background=background) as rasterizer:
-            psnrs.append(ground_truth.psnrs(rasterizer, views))
-    return PhotographFigures([camera.name for camera in views], kind, psnrs[0], psnrs[1])

@@ -5,14 +5,31 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import pyopencl as cl
 
 from potr_cl.model.camera import Camera
+from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory
-from potr_cl.raster.rasterizer import Rasterizer
+
+
+class Renderer(Protocol):
+    """What renders a scene: a :class:`~potr_cl.raster.rasterizer.Rasterizer`, or a
+    :class:`~potr_cl.raster.seen_rasterizer.SeenRasterizer`, whose attributes and methods these are.
+    """
+
+    @property
+    def device(self) -> Device: ...
+
+    @property
+    def background(self) -> tuple[float, float, float]: ...
+
+    def render_into(self, cameras: Sequence[Camera], target: cl.Buffer, start: int = 0) -> None: ...
+
+    def render(self, camera: Camera) -> tuple[FloatArray, FloatArray]: ...
 
 
 @dataclass(frozen=True)
@@ -48,7 +65,7 @@ def place_pictures(buffer: cl.Buffer, cameras: Sequence[Camera]) -> list[Picture
 
 
 @contextmanager
-def rendered(rasterizer: Rasterizer, cameras: Sequence[Camera]) -> Iterator[list[Picture]]:
+def rendered(rasterizer: Renderer, cameras: Sequence[Camera]) -> Iterator[list[Picture]]:
     """Pictures of a scene from some views, on the device until the end.
 
     Raises:

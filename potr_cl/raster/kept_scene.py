@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 from potr_cl.errors import DeviceError, DeviceMemoryError
 from potr_cl.host.threads import in_background
 from potr_cl.model.scene import Scene
+from potr_cl.model.splat_groups import SplatGroups
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
+from potr_cl.raster.carried import Carried
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers, gathered, uploaded
 from potr_cl.raster.view_shares import Excerpt
 
@@ -34,6 +36,9 @@ class KeptScene(Owner):
         scene: whose arrays do not change meanwhile.
         memory: bytes that the user would have taken; None: as much as there is. Where a device's memory is the host's,
             a scene that is a large part of it is not kept: it is there already.
+
+    Attributes:
+        groups: of the scene's splats, once somebody has found that views see little of it.
     """
 
     def __init__(self, device: Device, scene: Scene, memory: int | None = None) -> None:
@@ -41,6 +46,7 @@ class KeptScene(Owner):
         self._buffers = self._uploaded(device)
         self._elsewhere: dict[Device, Future[SceneBuffers | None]] = {}
         self._lock = threading.Lock()
+        self.groups: SplatGroups | None = None
 
     def _uploaded(self, device: Device) -> SceneBuffers | None:
         most = device.info.memory
@@ -50,6 +56,11 @@ class KeptScene(Owner):
             with suppress(DeviceMemoryError):
                 return uploaded(device, self._scene)
         return None
+
+    @property
+    def scene(self) -> Scene:
+        """The scene on the host."""
+        return self._scene
 
     def is_of(self, scene: Scene) -> bool:
         """Whether it is this scene."""
@@ -112,7 +123,7 @@ class PartOfKept:
 
 
 @contextmanager
-def lying_on(device: Device, scene: Scene | KeptScene | PartOfKept | Excerpt) -> Iterator[Drawable]:
+def lying_on(device: Device, scene: Drawable | KeptScene | PartOfKept | Excerpt | Carried) -> Iterator[Drawable]:
     """What to give to a rasterizer on a device for a scene, as long as the context lasts.
 
     Raises:
@@ -130,6 +141,9 @@ def lying_on(device: Device, scene: Scene | KeptScene | PartOfKept | Excerpt) ->
         yield scene.on(device)
     elif isinstance(scene, Excerpt):
         yield scene.gathered()
+    elif isinstance(scene, Carried):
+        with scene.on(device) as carried:
+            yield carried
     else:
         yield scene
 

@@ -97,6 +97,12 @@ class SceneBuffers(Owner):
         return self._memory.nbytes
 
     @property
+    def parameters(self) -> dict[str, cl.Buffer]:
+        """All parameters by their names; of devices of all kinds they have the same size."""
+        names = ("means", "scales", "quaternions", "log2_opacities", "sh")
+        return {name: getattr(self, name) for name in names}
+
+    @property
     def geometry(self) -> dict[str, Any]:
         """All parameters but the SH coefficients, and the stride, by the names that the projection's arguments have."""
         return {
@@ -124,6 +130,7 @@ class SceneBuffers(Owner):
         what: str,
         pending: list[cl.Event] | None = None,
         start: int = 0,
+        room: cl.Buffer | None = None,
     ) -> None:
         """Set a parameter to rows, one for each splat, which are turned to columns on the device.
 
@@ -133,6 +140,8 @@ class SceneBuffers(Owner):
             what: they are, for errors.
             pending: as of :meth:`potr_cl.opencl.device.Device.upload`.
             start: number of the first of these splats.
+            room: on the device for all rows, float32; None: it is taken, which drivers may have wait for what else they
+                do.
 
         Raises:
             DeviceError: there is no room for them beside the scene.
@@ -154,16 +163,16 @@ class SceneBuffers(Owner):
                     turn.bind(rows=sent, first=start + first, width=width, stride=self.stride, result=parameter)
                     turn.launch((min(height, len(rows) - first),))
             return
-        for first in range(0, len(rows), _UPLOADED):
-            some = np.ascontiguousarray(rows[first : first + _UPLOADED], np.float32)
-            with Memory(device) as memory:
-                turn.bind(
-                    rows=memory.upload(some, what, pending),
-                    first=start + first,
-                    width=width,
-                    stride=self.stride,
-                    result=parameter,
-                )
+        with Memory(device) as memory:
+            if room is None:
+                room = memory.allocate(4 * width * min(len(rows), _UPLOADED), what)
+            for first in range(0, len(rows), _UPLOADED):
+                some = np.ascontiguousarray(rows[first : first + _UPLOADED], np.float32)
+                with device.errors(f"cannot hold {what}"):
+                    event = cl.enqueue_copy(device.queue, room, some, is_blocking=pending is None)
+                if pending is not None:
+                    pending.append(event)
+                turn.bind(rows=room, first=start + first, width=width, stride=self.stride, result=parameter)
                 turn.launch((len(some),))
 
     def write_columns(
@@ -256,8 +265,12 @@ class SceneBuffers(Owner):
             with device.errors("cannot take a part of a scene"):
                 device.queue.finish()
 
-    def write(self, scene: Scene) -> None:
+    def write(self, scene: Scene, colours: bool = True) -> None:
         """Set all parameters to those of a scene of the host, of the same SH degree.
+
+        Args:
+            scene: the scene.
+            colours: whether to set its colours too.
 
         Raises:
             DeviceError: there is no room for them beside the scene.
@@ -278,12 +291,14 @@ class SceneBuffers(Owner):
             (self.log2_opacities, "the opacities"),
         )
         # While threads activate the first splats, the others' own values are sent.
-        with Ahead(activated, range(0, self.splats, _ACTIVATED)) as made:
+        with Memory(self.device) as memory, Ahead(activated, range(0, self.splats, _ACTIVATED)) as made:
+            room = memory.allocate(16 * min(self.splats, _ACTIVATED), "a scene's parameters")
             self.write_rows(self.means, scene.means, "the centres")
-            self.write_sh(self.sh, scene.sh)
+            if colours:
+                self.write_sh(self.sh, scene.sh)
             for start, found in made:
                 for (parameter, what), rows in zip(parameters, found, strict=True):
-                    self.write_rows(parameter, rows, what, start=start)
+                    self.write_rows(parameter, rows, what, start=start, room=room)
 
     def write_sh(self, parameter: cl.Buffer, sh: FloatArray) -> None:
         """Set SH coefficients, (N, M, 3) float32 of any strides.
@@ -367,7 +382,7 @@ def uploaded(device: Device, scene: Scene) -> SceneBuffers:
     """
     buffers = SceneBuffers(device, len(scene), scene.sh.shape[1], scene.antialiased, scene.low_pass)
     try:
-        buffers.write(scene)
+        buffers.write(scene, colours=bool(scene.sh.any()))  # new ones are black
     except BaseException:
         buffers.close()
         raise

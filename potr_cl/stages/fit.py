@@ -21,6 +21,7 @@ from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Rates
 from potr_cl.stages.fitting.at_photographs import FittedToPhotographs
+from potr_cl.stages.fitting.files import TwoFiles
 from potr_cl.stages.fitting.fit import (
     FitOptions,
     FitProgress,
@@ -30,7 +31,7 @@ from potr_cl.stages.fitting.fit import (
     held_out_error,
     kept_pictures,
 )
-from potr_cl.stages.fitting.photographs import fit_to_photographs, times
+from potr_cl.stages.fitting.photographs import fit_to_photographs, longer, times
 from potr_cl.stages.fitting.pictures import TargetPictures
 from potr_cl.stages.fitting.settling import Looking, Settling, settle
 from potr_cl.stages.prune import Prune
@@ -51,8 +52,8 @@ BETWEEN: dict[Family, float] = {"cpu": 1.0, "gpu": 3.0}
 #: are followed too closely soon; and the most.
 _SQUARE = 10
 _MOST_STEPS: dict[Family, int] = {"cpu": 250, "gpu": 1000}
-#: Part of the steps in each cycle but the last.
-_FIRST = 0.25
+#: Part of the steps in each cycle but the last; and of a fit without removed splats, where one with these does not pay.
+_FIRST, _ALONE = 0.25, 0.5
 #: What a splat costs as a multiple of the error for which pruning would have let it go: what it adds to the error when
 #: it is rounded comes on top.
 _WORTH = 1.25
@@ -76,20 +77,23 @@ class LeftOut:
         why: as people are told it.
         ended_early: whether someone has asked it to end.
         photographs: what a fit to photographs did; None if there were none.
+        files: that were made to see whether it pays; None if it was left out before.
     """
 
     why: str
     ended_early: bool = False
     photographs: FittedToPhotographs | None = None
+    files: TwoFiles | None = None
 
     @property
     def facts(self) -> dict[str, Any]:
         """All by name."""
         photographs = None if self.photographs is None else self.photographs.facts
-        return {"left_out": self.why, "ended_early": self.ended_early, "photographs": photographs}
+        files = None if self.files is None else self.files.facts
+        return {"left_out": self.why, "ended_early": self.ended_early, "photographs": photographs, "files": files}
 
     def __str__(self) -> str:
-        more = "" if self.photographs is None else f"; {self.photographs}"
+        more = "".join(f"; {each}" for each in (self.files, self.photographs) if each is not None)
         return f"the fit was left out: {self.why}{more}"
 
 
@@ -114,8 +118,7 @@ class Fit(Stage):
         further: times the ΔMSE_MAX of the pruning before it up to which splats are removed for the fit to make up for,
             where that is 10^-9.3; with its root more for a larger one. 0: none are removed.
         finer: by how much of its way to 1 the q is higher whose hyper-parameters the re-fit and the coder take.
-        cycles: how often splats are removed and a fit follows, each time up to a higher threshold; before the first of
-            several, none are.
+        cycles: how often splats are removed and a fit follows, each time up to a higher threshold.
         iterations: of the pruning in each of them.
         between: views between that the fit looks at, for each given view, unless there are more already. "auto": as
             many as pay on the device.
@@ -124,6 +127,7 @@ class Fit(Stage):
         photograph_rate: by what the rates are multiplied for photographs.
         choosing, rounding, gentle, through: how far what is left is fitted once more after the choice of coefficients
             and the rounding of geometry (:class:`potr_cl.stages.fitting.settling.Settling`).
+        compared: whether two files say if it pays, where its gain is small (potr_cl/pipeline/fit_trial.py).
         batch, rounds, patience, rates, last, seed: see :class:`potr_cl.stages.fitting.fit.FitOptions`.
 
     Raises:
@@ -147,7 +151,7 @@ class Fit(Stage):
     )
     further: float = option(FURTHER)
     finer: float = option(FINER)
-    cycles: int = option(2)
+    cycles: int = option(1)
     iterations: int = option(16)
     between: float | Literal["auto"] = option("auto")
     photograph_steps: int | Literal["auto"] = option("auto")
@@ -161,6 +165,7 @@ class Fit(Stage):
     rounding: float = option(0.15)
     gentle: float = option(0.1)
     through: float = option(0.3)
+    compared: bool = option(True)
     seed: int = option(FitOptions.seed)
 
     def __post_init__(self) -> None:
@@ -269,37 +274,50 @@ class Fit(Stage):
         return dataclasses.replace(state, views=(*given, *added), added=len(added))
 
     def _cycles(self, state: State, bench: Workbench, targets: Targets | TargetPictures, asked: SupportsBool) -> State:
-        """Remove splats and fit by turns, each time up to a higher threshold, and keep what costs least."""
+        """Remove splats and fit by turns, each time up to a higher threshold, and keep what costs least.
+
+        Where none of that pays, what pruning has left is fitted as it is.
+        """
         price: float | None = state.learnt.get("price")
         worth = 0.0 if price is None else _WORTH * price
         without = held_out_error(bench.opened, state.scene, state.views, targets, state.added, bench.background)
-        least = without + worth * len(state.scene)
+        least = plain = without + worth * len(state.scene)
         further = 1.0
         if price is not None:
             least *= _LESS
             further = self.limit(price) / price
-        last = best = state
+        best = state
         taken: Fitted | None = None
-        steps_of = self._steps_of_cycles(bench.opened.family, price is not None and further > 1)
+        steps_of = self._steps_of_cycles(bench.opened.family, further > 1)
         total, done = sum(steps_of) + self.further_steps_on(bench.opened.family), 0
-        for number, steps in enumerate(steps_of):
-            part = number / (len(steps_of) - 1) if len(steps_of) > 1 else 1.0
-            if price is not None and further > 1 and part > 0:
-                last = self._pruned(last, price * further**part, bench)
+
+        def tried(start: State, steps: int) -> State:
+            """The state after a fit, whether or not it is the best one."""
+            nonlocal best, least, taken, done
 
             def progress(now: int, _steps: int, before: int = done) -> None:
-                bench.progress("fit", 0.99 * (before + now) / total)
+                bench.progress("fit", 0.99 * min((before + now) / total, 1.0))
 
-            fitted = self._fitted(last, bench, targets, steps, progress, asked)
-            last, done = dataclasses.replace(last, scene=fitted.scene, geometry=None), done + steps
+            fitted = self._fitted(start, bench, targets, steps, progress, asked)
+            then, done = dataclasses.replace(start, scene=fitted.scene, geometry=None), done + steps
             cost = fitted.error + worth * len(fitted.scene)
             spared = len(state.scene) - len(fitted.scene)
             if cost < least and (spared or fitted.error < _LESS_ALONE * without):
-                best, least, taken = last, cost, dataclasses.replace(fitted, spared=spared, without=without)
+                best, least = then, cost
+                taken = dataclasses.replace(fitted, spared=spared, without=without, cost=cost / plain)
+            return then
+
+        last = state
+        for number, steps in enumerate(steps_of, start=1):
+            if price is not None and further > 1:
+                last = self._pruned(last, price * further ** (number / len(steps_of)), bench)
+            last = tried(last, steps)
             if asked:
                 break
+        if taken is None and further > 1 and not asked:
+            tried(state, max(round(_ALONE * sum(steps_of)), 1))
         if taken is None:
-            why = _INTERRUPTED if asked else _NO_GAIN if len(steps_of) > 1 else _LITTLE_GAIN
+            why = _INTERRUPTED if asked else _NO_GAIN if further > 1 else _LITTLE_GAIN
             return state.having_learnt(self.name, LeftOut(why, bool(asked)))
         return best.having_learnt(self.name, taken)
 
@@ -334,7 +352,7 @@ class Fit(Stage):
         options = dataclasses.replace(
             self._options(family, bench.memory),
             steps=self.photograph_steps_on(family, len(views)),
-            rates=times(self._sparse(self.rates, state), self.photograph_rate),
+            rates=times(self._sparse(longer(self.rates), state), self.photograph_rate),
         )
         bench.progress("fit to photographs", 0.0)
         found = fit_to_photographs(

@@ -171,6 +171,8 @@ class Prune(Stage):
         told = state.having_learnt("unseen", Unseen(splats, len(state.scene), kept, area))
         if state.scene is state.source:
             told = replace(told, sights=sights)
+            if sights is not None and bench.kept is not None and bench.kept.is_of(state.source):
+                bench.kept.groups = sights.groups  # for who judges by pictures later
         if self.keep is None and self.count is None:
             told = told.having_learnt("price", bench.parameters.delta_mse_max)
         if not (kept and splats):
@@ -182,7 +184,7 @@ class Prune(Stage):
             and not bench.interludes
             and bench.parameters.delta_mse_max < LARGEST_LIMIT
         ):
-            return self._pruned(told, bench, sights, spared=hidden)
+            return self._pruned(told, bench, sights, hidden=hidden)
         seen = np.flatnonzero(~hidden)
         if not len(seen):
             everything = np.arange(splats)
@@ -191,7 +193,7 @@ class Prune(Stage):
             )
         if sights is not None:
             sights = sights_worth_it(state.scene.subset(seen), state.views, options)
-        return self._pruned(told, bench, sights, seen)
+        return self._pruned(told, bench, sights, seen, hidden)
 
     def _pruned(
         self,
@@ -199,17 +201,18 @@ class Prune(Stage):
         bench: Workbench,
         sights: Sights | None = None,
         seen: NDArray[np.int64] | None = None,
-        spared: NDArray[np.bool_] | None = None,
+        hidden: NDArray[np.bool_] | None = None,
     ) -> State:
         """The state after pruning.
 
         Args:
             state, bench: of the stage.
             sights: what the views see of the splats that are pruned.
-            seen: (n,) numbers of these, ascending; the others are kept, without what of their colours depends on the
-                direction. None: all may go, or the measurement spares some.
-            spared: (N,) which splats the measurement is to spare; these lose the same.
+            seen: (n,) numbers of these, ascending; None: all of the state's scene, where the measurement spares hidden
+                ones.
+            hidden: (N,) which splats are kept in any case, without what of their colours depends on the direction.
         """
+        spared = hidden if seen is None else None
         dealt = None
         if sights is not None and bench.pool is not None and not bench.pool.in_process:
             dealt = _dealt(state, seen, bench.pool, sights)
@@ -237,24 +240,24 @@ class Prune(Stage):
                 if interlude.always:
                     course.visit(interlude, pruned.survivors, bench)
             # While drivers give the measurement's memory back.
-            left = in_background(self._left, course, pruned, seen, spared)
+            left = in_background(self._left, course, pruned, seen, hidden)
         return left.result()
 
     def _left(
-        self, course: _Course, pruned: Pruned, seen: NDArray[np.int64] | None, spared: NDArray[np.bool_] | None
+        self, course: _Course, pruned: Pruned, seen: NDArray[np.int64] | None, hidden: NDArray[np.bool_] | None
     ) -> State:
-        """The state after pruning; ``seen`` and ``spared`` as of :meth:`_pruned`."""
-        if seen is None:
-            left = course.left(pruned.survivors).having_learnt(self.name, pruned)
-            return left if spared is None else without_directions(left, spared[pruned.survivors])
-        unseen = np.ones(course.splats, bool)
-        unseen[seen] = False
-        kept = unseen.copy()
-        kept[seen[pruned.survivors]] = True
+        """The state after pruning; ``seen`` and ``hidden`` as of :meth:`_pruned`."""
+        survivors = pruned.survivors
+        if hidden is None or seen is None:
+            left = course.left(survivors).having_learnt(self.name, pruned)
+            return left if hidden is None else without_directions(left, hidden[survivors])
+        of_whole = in_background(as_of_whole, seen, hidden, pruned)
+        kept = hidden.copy()
+        kept[seen[survivors]] = True
         numbers = np.flatnonzero(kept)
-        # Nobody looked at the unseen ones from any direction.
-        left = without_directions(course.having(numbers), unseen[numbers])
-        return left.having_learnt(self.name, as_of_whole(seen, np.flatnonzero(unseen), pruned))
+        # Nobody looked at the hidden ones from any direction.
+        left = without_directions(course.having(numbers), hidden[numbers])
+        return left.having_learnt(self.name, of_whole.result())
 
 
 def _dealt(state: State, seen: NDArray[np.int64] | None, pool: Pool, sights: Sights) -> ViewShares:
@@ -275,13 +278,12 @@ class _Course:
         seen: (n,) numbers in the state's scene of the splats that the removal has; None: it has all.
 
     Attributes:
-        splats: N, of the state's scene.
-        sh: (N, M, 3) the colours that these have by now.
+        sh: (N, M, 3) the colours that all splats of the state's scene have by now.
     """
 
     def __init__(self, state: State, removal: Removal, seen: NDArray[np.int64] | None = None) -> None:
         self._state, self._removal, self._seen = state, removal, seen
-        self.splats, self.sh = len(state.scene), state.scene.sh
+        self.sh = state.scene.sh
 
     @property
     def measured_sh(self) -> FloatArray:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
@@ -30,7 +31,7 @@ from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import KeptScene, PartOfKept
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.raster.view_shares import ViewShares
-from potr_cl.workers.pool import Pool
+from potr_cl.workers.pool import Pool, Shared
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -169,11 +170,22 @@ class Workbench:
             return kept if some is None else PartOfKept(kept, some)
         return PartOfKept(kept, state.survivors if some is None else state.survivors[some])
 
-    def shared(self, state: State, some: NDArray[np.int64] | None = None) -> Scene | KeptScene | PartOfKept:
-        """The same for the pool's workers: threads of this process have it from what is kept on their devices."""
-        if self.pool is not None and self.pool.in_process:
-            return self.placed(state, some)
-        return state.scene if some is None else state.scene.subset(some)
+    @contextmanager
+    def shared(self, pool: Pool, state: State, some: NDArray[np.int64] | None = None) -> Iterator[Shared]:
+        """The same for a pool's workers, as long as the context lasts.
+
+        Threads of this process have it from what is kept on their devices. Others are sent the source, which later
+        stages need too, and numbers.
+        """
+        if pool.in_process:
+            with pool.shared(self.placed(state, some)) as placed:
+                yield placed
+            return
+        numbers = some
+        if state.is_cut and state.scene is not state.source:
+            numbers = state.survivors if some is None else state.survivors[some]
+        with pool.shared(state.source if state.is_cut else state.scene) as whole:
+            yield whole if numbers is None else Shared(whole.handle, numbers.astype(np.uint32))
 
     def shared_source(self, state: State) -> Scene | KeptScene | ViewShares:
         """A state's source for the pool's workers; where they have what their views see already, that."""

@@ -128,7 +128,7 @@ class Between(Stage):
                 if len(parts):
                     shown_by = views_where_few(parts)
                     each = needed(shown_by, given, slow)
-            added = views_between(state.source, state.views, each, self.spread, known=known)
+            added = views_between(state.source, state.views, each, self.spread, known=known, run=pool.map)
         if self.views == "auto":
             added = _evenly(added, room_for(added, state, bench))
         bench.progress("views between", 1.0)

@@ -1,8 +1,8 @@
 """A Dask cluster: :class:`ClusterPool`. Every worker of it is a worker here, with a device of its own.
 
 Dask brings the network, placing things on workers, and who is alive. A worker's parts, and what they share, live in an
-actor there (:class:`_Seat`). Dask's own way to share things (``scatter``) keeps only one copy of them in the long run,
-and that goes with its worker. The master only adds up what the workers find.
+actor there (:class:`potr_cl.workers.seat.Seat`). Dask's own way to share things (``scatter``) keeps only one copy of
+them in the long run, and that goes with its worker. The master only adds up what the workers find.
 """
 
 from __future__ import annotations
@@ -14,22 +14,23 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from potr_cl.errors import DeviceError, PotrError, UsageError
 from potr_cl.host.installation import install_command
 from potr_cl.opencl.device import Device
-from potr_cl.opencl.discovery import DeviceInfo, fitting_devices
 from potr_cl.workers.pool import Held, Part, Pool, Shared, Traffic, Worker, WorkerLost
+from potr_cl.workers.seat import Known, Seat
 
 if TYPE_CHECKING:
     from dask.distributed import Client
 
-#: Seconds to wait for a scheduler, and for a worker to say which device it has.
-_CONNECT, _HELLO = 10.0, 120.0
+#: Seconds to wait for a scheduler, for the first worker to come, and for a worker to say which device it has.
+_CONNECT, _COME, _HELLO = 5.0, 60.0, 120.0
 #: Seconds between two looks at whether a worker that has not answered yet is alive, and at whether to go on waiting.
 _ALIVE, _POLL = 3.0, 0.1
+#: Seconds between two looks at whether workers have come.
+_NEW = 2.0
 #: The second of them grows by this factor from look to look, up to so much: each look wakes the client's event loop.
 _POLL_GROWS, _MOST_POLL = 1.5, 1.0
 #: Seconds in which the handle of a part arrives once it is made.
@@ -37,9 +38,11 @@ _FETCH = 30.0
 #: Threads that wait for workers.
 _MOST_WAITING = 256
 
+_log = logging.getLogger("potr_cl")
+
 
 class ClusterPool(Pool):
-    """The workers of a Dask cluster.
+    """The workers of a Dask cluster. Those that come later do views from the next work on.
 
     Args:
         cluster: the scheduler's address, or a client of it, which stays the caller's.
@@ -47,7 +50,7 @@ class ClusterPool(Pool):
         patience: see :class:`potr_cl.workers.pool.Pool`.
 
     Raises:
-        UsageError: Dask is not installed, no scheduler answers there, or it has no worker that can do the work.
+        UsageError: Dask is not installed, no scheduler answers there, no worker comes, or one cannot do the work.
     """
 
     takes_part = False
@@ -59,17 +62,20 @@ class ClusterPool(Pool):
         self._closing = threading.Event()
         self._waiting = ThreadPoolExecutor(_MOST_WAITING, thread_name_prefix="potr_cl cluster")
         self._workers: list[_ClusterWorker] = []
+        self._refused: set[str] = set()
+        self._meeting = threading.Lock()
         self._owned = ExitStack()
         self.client, is_own = _client_of(cluster)
         if is_own:
             self._owned.callback(self._leave_cluster)
         try:
-            self._workers = self._met()
+            self._meet_first()
             from potr_cl.workers import seldom_looks  # Dask is not installed everywhere
 
             seldom_looks.look_seldom_for(self.client)
             if not is_own:
                 self._owned.callback(seldom_looks.look_as_before_for, self.client)
+            threading.Thread(target=self._meet_others, name="potr_cl newcomers", daemon=True).start()
         except BaseException:
             self.close()
             raise
@@ -93,8 +99,12 @@ class ClusterPool(Pool):
         """A worker is sent it when it first makes a part of it, and keeps it for the parts that follow."""
         yield Shared(thing)
 
+    def has(self, thing: Any) -> bool:
+        return all(worker.has(thing) for worker in self._workers if not worker.lost)
+
     def close(self) -> None:
-        self._closing.set()
+        with self._meeting:
+            self._closing.set()
         self._waiting.shutdown(wait=False, cancel_futures=True)
         for worker in self._workers:
             worker.leave()
@@ -148,7 +158,7 @@ class ClusterPool(Pool):
         except Exception as error:
             if self._closing.is_set() or address not in self._alive() or _is_of_transport(error):
                 raise WorkerLost(f"{address} is gone ({_first_line(error)})") from None
-            raise DeviceError(f"worker {address} failed ({_first_line(error)})") from error
+            raise _Failed(address, _first_line(error)) from error
 
     def _answered(self, answer: Any, seconds: float) -> bool:
         """Whether an answer is there, after waiting a little for it."""
@@ -171,18 +181,81 @@ class ClusterPool(Pool):
         except RuntimeError:  # closed
             raise WorkerLost("the cluster has been left") from None
 
-    def _met(self) -> list[_ClusterWorker]:
-        """All workers, each of which has said which device it takes."""
-        addresses = sorted(self._alive())
+    def _meet_first(self) -> None:
+        """Have each worker that is there say which device it takes.
+
+        Raises:
+            UsageError: no worker comes, one cannot do the work, or all of them go.
+        """
+        addresses = self._alive()
+        if not addresses:
+            _log.warning("the cluster has no worker yet: waiting %.0f seconds for one", _COME)
+            end = time.monotonic() + _COME
+            while not addresses and time.monotonic() < end:
+                time.sleep(_POLL)
+                addresses = self._alive()
         if not addresses:
             raise UsageError("the cluster has no worker: start some with `dask worker ADDRESS`, one for each device")
-        # Several workers of one computer take its devices in turn.
-        hosts = [address.rsplit(":", 1)[0] for address in addresses]
-        places = [hosts[:number].count(host) for number, host in enumerate(hosts)]
-        workers = [_ClusterWorker(self, address, place) for address, place in zip(addresses, places, strict=True)]
-        for worker in workers:
-            worker.meet()
-        return workers
+        workers = self._invited(addresses)
+        gone: list[WorkerLost] = []
+        for worker in list(workers):
+            try:
+                worker.meet()
+            except WorkerLost as error:
+                workers.remove(worker)
+                self._refused.add(worker.name)
+                gone.append(error)
+        if not workers:
+            raise UsageError(f"{gone[0]}, and no other worker is there")
+        for lost in gone:
+            _log.warning("%s; it does no views", lost)
+        self._take_in(workers)
+
+    def _meet_others(self) -> None:
+        """Meet those that come, until the cluster is left."""
+        while not self._closing.wait(_NEW):
+            with suppress(WorkerLost):  # whoever waits for an answer says so
+                known = {worker.name for worker in self._workers}
+                for worker in self._invited(self._alive() - known - self._refused):
+                    try:
+                        worker.meet()
+                    except UsageError as error:
+                        self._refused.add(worker.name)
+                        worker.leave()
+                        _log.warning("%s; it does no views", error)
+                    except WorkerLost:
+                        worker.leave()
+                    else:
+                        _log.warning("worker %s has come: it gets views from the next stage on", worker.name)
+                        self._take_in([worker])
+
+    def _invited(self, addresses: set[str]) -> list[_ClusterWorker]:
+        """Workers that have begun to say which device they take: those of one computer take its devices in turn."""
+        alive, invited = self._alive(), list[_ClusterWorker]()
+        for address in sorted(addresses):
+            there = [each for each in [*self._workers, *invited] if each.host == _host(address) and each.name in alive]
+            place = min(set(range(len(there) + 1)) - {each.place for each in there})
+            invited.append(_ClusterWorker(self, address, place))
+        return invited
+
+    def _take_in(self, workers: Sequence[_ClusterWorker]) -> None:
+        with self._meeting:
+            self._workers = [*self._workers, *workers]
+            if self._closing.is_set():
+                for worker in workers:
+                    worker.leave()
+                return
+        devices = sorted({str(self.first.info), *(worker.device for worker in self._workers)})
+        if any(worker.device != str(self.first.info) for worker in workers):
+            _log.warning(
+                "the cluster has devices of several kinds (%s), which round differently: the file can depend on who "
+                "gets which views",
+                ", ".join(devices),
+            )
+
+
+def _host(address: str) -> str:
+    return address.rsplit(":", 1)[0]
 
 
 class _ClusterWorker(Worker):
@@ -192,17 +265,23 @@ class _ClusterWorker(Worker):
         pool: that it is of.
         name: its address.
         place: its number among the workers of its computer.
+
+    Attributes:
+        host: the computer.
+        device: the name of its device, once it has been met.
     """
 
+    device = ""
+
     def __init__(self, pool: ClusterPool, name: str, place: int) -> None:
-        self.name = name
+        self.name, self.host, self.place = name, _host(name), place
         self._pool = pool
         self._known: list[tuple[int, Any]] = []  # what the seat has been sent
         self._next = 0
         self._sending = threading.Lock()
         options = {"actor": True, "workers": [name], "allow_other_workers": False, "pure": False}
         with _as_worker_lost(name):
-            self._future = pool.client.submit(_Seat, place, **options)
+            self._future = pool.client.submit(Seat, place, **options)
         self._seat: Any = None
 
     def meet(self) -> None:
@@ -210,20 +289,30 @@ class _ClusterWorker(Worker):
 
         Raises:
             UsageError: it cannot do the work.
+            WorkerLost: it has gone.
         """
         try:
             self._seat = self._pool.wait_for(self._future, self.name, _HELLO)
             version, name, family = self.ask("hello")
+        except WorkerLost:
+            # As those do that have no potr_cl.
+            raise WorkerLost(
+                f"worker {self.name} of the cluster has gone as it was asked for its device: see what it says itself, "
+                "and install potr_cl there as it is here"
+            ) from None
         except DeviceError as error:
             if "deserialization of the task graph" in str(error):  # which the scheduler does
                 raise UsageError(
                     "the scheduler of the cluster does not know potr_cl: install it there as it is here"
                 ) from None
+            if not isinstance(error, _Failed):
+                raise UsageError(f"worker {self.name} of the cluster cannot do the work: {error}") from None
             raise UsageError(
-                f"worker {self.name} of the cluster cannot do the work ({error}): install potr_cl there as it is here, "
-                "and an OpenCL driver"
+                f"worker {self.name} of the cluster cannot do the work ({error.said}): install potr_cl there as it is "
+                "here"
             ) from None
         _check(self.name, version, name, family, self._pool.first)
+        self.device = name
 
     def ask(self, method: str, *args: Any) -> Any:
         """What a method of the seat returns."""
@@ -234,13 +323,20 @@ class _ClusterWorker(Worker):
     def make(self, kind: type[Part], memory: int | None, given: Sequence[Any]) -> Future[Held]:
         def made() -> Held:
             with self._sending:
-                things = [_Known(self._sent(each.handle)) if isinstance(each, Shared) else each for each in given]
+                things = [
+                    Shared(Known(self._sent(each.handle)), each.part) if isinstance(each, Shared) else each
+                    for each in given
+                ]
                 self._next += 1
                 number = self._next
             self.ask("make", number, kind, memory, things)
             return _HeldThere(self._pool, self, number)
 
         return self._pool.begin(made)
+
+    def has(self, thing: Any) -> bool:
+        """Whether the seat has been sent a thing, and keeps it."""
+        return any(known is thing for _, known in self._known)
 
     def _sent(self, thing: Any) -> int:
         """The number by which the seat knows a thing, after sending it if need be."""
@@ -263,6 +359,18 @@ class _ClusterWorker(Worker):
             self._future.release()
 
 
+class _Failed(DeviceError):
+    """Something else than this package failed on a worker.
+
+    Attributes:
+        said: what it says.
+    """
+
+    def __init__(self, address: str, said: str) -> None:
+        super().__init__(f"worker {address} failed ({said})")
+        self.said = said
+
+
 class _HeldThere(Held):
     """A part on one of Dask's workers."""
 
@@ -280,78 +388,6 @@ class _HeldThere(Held):
     def close(self) -> None:
         with suppress(PotrError):
             self._pool.begin(lambda: self._worker.ask("drop", self._number)).result()
-
-
-@dataclass(frozen=True)
-class _Known:
-    """Stands for something that the seat has been sent."""
-
-    number: int
-
-
-class _Seat:
-    """Lives on a worker, and holds its parts and what they share.
-
-    Args:
-        place: the worker's number among those of its computer.
-    """
-
-    def __init__(self, place: int) -> None:
-        self._place = place
-        self._known: dict[int, Any] = {}
-        self._parts: dict[int, Part] = {}
-
-    def hello(self) -> tuple[str, str, str]:
-        """The version here, the device, and the family of its kernels."""
-        from potr_cl import __version__
-
-        device = _device(self._place)
-        return __version__, str(device.info), device.family
-
-    def keep(self, number: int, thing: Any, others: Sequence[int]) -> None:
-        """Keep a thing for parts, and of those that are known only the ones of these numbers."""
-        self._known = {each: self._known[each] for each in others} | {number: thing}
-
-    def make(self, number: int, kind: type[Part], memory: int | None, given: Sequence[Any]) -> None:
-        """Make a part."""
-        device = _device(self._place)
-        things = [self._known[each.number] if isinstance(each, _Known) else each for each in given]
-        # A failure may leave buffers behind that nobody owns any more.
-        with device.all_or_nothing(), device.errors("failed while encoding"):
-            self._parts[number] = kind(device, memory, *things)
-
-    def run(self, number: int, command: str, args: Sequence[Any]) -> Any:
-        """Give a part a command."""
-        with _device(self._place).errors("failed while encoding"):
-            return getattr(self._parts[number], command)(*args)
-
-    def drop(self, number: int) -> None:
-        """Give a part's memory back."""
-        part = self._parts.pop(number, None)
-        if part is not None:
-            part.close()
-
-    def __del__(self) -> None:
-        # The master has left, perhaps without a word.
-        for number in list(self.__dict__.get("_parts", ())):
-            with suppress(Exception):
-                self.drop(number)
-
-
-_opened: dict[int, Device] = {}
-
-
-def _device(place: int) -> Device:
-    """This worker's device: of the best ones, that of the worker's place among those of its computer."""
-    if place not in _opened:
-        best, *others = fitting_devices()
-        alike: list[DeviceInfo] = [best, *(info for info in others if _kind(info) == _kind(best))]
-        _opened[place] = Device(alike[place % len(alike)])
-    return _opened[place]
-
-
-def _kind(info: DeviceInfo) -> tuple[str, str]:
-    return info.kind, info.platform
 
 
 def _check(address: str, version: str, name: str, family: str, first: Device) -> None:
@@ -388,9 +424,10 @@ def _client_of(cluster: str | Client) -> tuple[Client, bool]:
     try:
         return Client(cluster, timeout=_CONNECT, set_as_default=False, direct_to_workers=True), True
     except Exception as error:
+        # Of another program's answer it takes the first bytes for a size.
+        said = "something else does" if isinstance(error, MemoryError) else _first_line(error)
         raise UsageError(
-            f"no Dask scheduler answers at '{cluster}' ({_first_line(error)}): give its address, such as "
-            "tcp://10.0.0.1:8786"
+            f"no Dask scheduler answers at '{cluster}' ({said}): give its address, such as tcp://10.0.0.1:8786"
         ) from None
 
 

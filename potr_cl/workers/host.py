@@ -79,7 +79,7 @@ class _Thread(Worker):
         def made() -> Held:
             # A failure may leave buffers behind that nobody owns any more.
             with self._device.all_or_nothing(), self._device.errors("failed while encoding"):
-                things = [each.handle if isinstance(each, Shared) else each for each in given]
+                things = [each.of(each.handle) if isinstance(each, Shared) else each for each in given]
                 return _HeldHere(self._thread, self._device, kind(self._device, memory, *things))
 
         return self._thread.submit(made)

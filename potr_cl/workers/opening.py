@@ -36,6 +36,11 @@ class Workers(AbstractContextManager["Workers"]):
     device: Device
     pool: Pool | None = None
 
+    @property
+    def devices(self) -> Sequence[Device]:
+        """All devices of this process, the first one first."""
+        return (self.device, *(self.pool.devices if self.pool is not None else ()))
+
     def close(self) -> None:
         """Leave the workers."""
         if self.pool is not None:

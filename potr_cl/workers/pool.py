@@ -100,9 +100,15 @@ class Shared:
 
     Attributes:
         handle: by which the pool knows it.
+        part: what of it a worker uses: its method ``subset`` is given this there. None: all of it.
     """
 
     handle: Any
+    part: Any = None
+
+    def of(self, thing: Any) -> Any:
+        """What a worker uses of the thing that this stands for."""
+        return thing if self.part is None else thing.subset(self.part)
 
 
 @dataclass
@@ -156,6 +162,10 @@ class Pool(ABC):
     @abstractmethod
     def shared(self, thing: Any) -> AbstractContextManager[Shared]:
         """Give something to all workers once, for parts that are made as long as the context lasts."""
+
+    def has(self, thing: Any) -> bool:
+        """Whether all workers have something that was shared with them, so that it is not sent again."""
+        return self.in_process
 
     @abstractmethod
     def close(self) -> None:

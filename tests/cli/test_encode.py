@@ -151,7 +151,7 @@ def test_encode_judges_by_training_views_if_there_are_no_others(tmp_path, scene_
 def test_a_device_that_fails_while_judging_leaves_the_file(tmp_path, scene_path, capsys, monkeypatch):
     potr, cameras = tmp_path / "a.potr", cameras_json(tmp_path / "cameras.json")
 
-    def fail(*_args):
+    def fail(*_args, **_named):
         raise DeviceError("device 'X' vanished")
 
     monkeypatch.setattr("potr_cl.api.encoding.Evaluator", fail)

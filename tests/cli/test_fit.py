@@ -103,7 +103,7 @@ def test_one_training_view_is_too_few(paths, capsys):
 def test_encode_with_a_fit(paths, capsys):
     words = ["encode", paths / "scene.ply", "--cameras", paths / "cameras.json", "--keep", "0.5", "--json"]
     reports = []
-    for steps in ("off", "100"):
+    for steps in ("off", "400"):
         out = paths / f"{steps}.potr"
         assert cli.main([str(word) for word in [*words, "-o", out, "--fit", steps]]) == 0
         reports.append(json.loads(capsys.readouterr().out))
@@ -113,9 +113,9 @@ def test_encode_with_a_fit(paths, capsys):
     assert "held out" in with_fit["fit"]["said"]
     assert with_fit["splats"] == without["splats"]
     assert with_fit["quality"]["psnr"] > without["quality"]["psnr"] + 0.5
-    assert cli.main([str(word) for word in [*words[:-1], "-o", paths / "a.potr", "--fit", "100"]]) == 0
+    assert cli.main([str(word) for word in [*words[:-1], "-o", paths / "a.potr", "--fit", "400"]]) == 0
     assert f"fit        {with_fit['fit']['said']}" in capsys.readouterr().out
-    assert (paths / "a.potr").read_bytes() == (paths / "100.potr").read_bytes()
+    assert (paths / "a.potr").read_bytes() == (paths / "400.potr").read_bytes()
 
 
 def interrupted(words, times):

@@ -53,3 +53,12 @@ def test_a_context_of_another_device_is_left_alone(contexts):
     with pytest.raises(AttributeError):  # an object is no device: it was asked all the same
         ahead.context_of(Other())
     assert contexts == [info.handle, Other.handle]
+
+
+def test_several_devices_are_begun_together(contexts, monkeypatch):
+    info = choose_device()
+    monkeypatch.setattr(ahead, "choose_devices", lambda spec: [info, info])
+    ahead.begin_to_open("all")
+    devices = [Device(info) for _ in range(3)]
+    assert contexts == [info.handle] * 3  # two that were begun, and one more
+    assert len({device.context.int_ptr for device in devices}) == 3

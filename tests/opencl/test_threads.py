@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
@@ -11,6 +12,7 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
+from potr_cl.opencl.building import building
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer, render
 from potr_cl.reference.scenes import random_scene, ring_of_cameras
@@ -118,3 +120,47 @@ def test_two_threads_render_on_one_device_while_others_are_cancelled(device: Dev
         for picture, expected in zip(pictures[number], wanted[number], strict=True):
             assert np.array_equal(picture, expected)
     assert device.allocated == before
+
+
+def test_programs_are_built_at_the_same_time_and_each_once() -> None:
+    """Two threads that want one program: the second waits; another program does not. Warnings come back afterwards."""
+    inside, done = threading.Event(), threading.Event()
+    order: list[str] = []
+    filters = list(warnings.filters)
+
+    def first() -> None:
+        with building("a", alone=False):
+            inside.set()
+            done.wait(20)
+            order.append("first")
+
+    def second() -> None:
+        with building("a", alone=False):
+            order.append("second")
+
+    threads = [threading.Thread(target=work) for work in (first, second)]
+    threads[0].start()
+    inside.wait(20)
+    threads[1].start()
+    with building("b", alone=False):
+        order.append("another")
+    done.set()
+    for thread in threads:
+        thread.join(20)
+    assert order == ["another", "first", "second"]
+    assert warnings.filters == filters
+
+
+def test_compilers_of_cpus_are_called_one_after_another() -> None:
+    begun = threading.Event()
+
+    def other() -> None:
+        with building("b", alone=True):
+            begun.set()
+
+    with building("a", alone=True):
+        thread = threading.Thread(target=other)
+        thread.start()
+        assert not begun.wait(0.3)
+    thread.join(20)
+    assert begun.is_set()

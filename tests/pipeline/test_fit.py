@@ -17,8 +17,8 @@ from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.stages.fit import LeftOut
 from potr_cl.stages.fitting.fit import Fitted
 
-#: Half of the splats, so that there is something to make up for.
-HALF = EncodeOptions(q=0.3).changed(prune={"keep": 0.5, "iterations": 8}, fit={"steps": 30, "rounds": 3})
+#: Half of the splats, so that there is something to make up for; with coarser steps files would not show it.
+HALF = EncodeOptions(q=0.5).changed(prune={"keep": 0.5, "iterations": 8}, fit={"steps": 30, "rounds": 3})
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +65,14 @@ def test_a_fit_pays(device, plush_excerpt, plush_excerpt_cameras):
     assert better > before + 0.5
 
 
+def test_time_is_told_only_of_a_fit_that_was_asked_for(device, plush_excerpt, plush_excerpt_cameras):
+    plain = encode(plush_excerpt, plush_excerpt_cameras, HALF.changed(fit=False), device=device)
+    assert "fit" not in plain.seconds
+    fitted = encode(plush_excerpt, plush_excerpt_cameras, HALF, device=device)
+    assert fitted.fitted.files is not None
+    assert fitted.seconds["fit"] > 0.3 * fitted.seconds["refit"], "that of the files that were made to see is the fit's"
+
+
 def test_what_makes_up_for_splats_rounds_finer(device, plush_excerpt, plush_excerpt_cameras):
     options = EncodeOptions(q=0.3).changed(
         prune={"delta_mse_max": 1e-7}, fit={"steps": 80, "further": 0.2, "cycles": 1}
@@ -85,9 +93,20 @@ def test_what_only_fits_rounds_as_q_says(device, plush_excerpt, plush_excerpt_ca
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("target", [Target(max_bytes=13_000), Target(min_psnr=46)], ids=str)
-def test_a_search_fits(device, plush_excerpt, plush_excerpt_cameras, target):
-    found = encode_to_target(plush_excerpt, plush_excerpt_cameras, target, HALF, device=device)
+@pytest.mark.parametrize(
+    ("target", "kept"),
+    [
+        (Target(max_bytes=13_000), 0.3),
+        (
+            Target(min_psnr=46),
+            0.5,
+        ),  # files say at the first q that the fit pays, and would not at the one that is found
+    ],
+    ids=str,
+)
+def test_a_search_fits(device, plush_excerpt, plush_excerpt_cameras, target, kept):
+    options = HALF.changed(prune={"keep": kept}, fit={"steps": 60 if kept == 0.3 else 30})
+    found = encode_to_target(plush_excerpt, plush_excerpt_cameras, target, options, device=device)
     assert isinstance(found.encoded.fitted, Fitted)
     low, high = target.window
     assert low <= found.value <= high

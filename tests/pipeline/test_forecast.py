@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 
 import pytest
 
@@ -10,6 +11,7 @@ from potr_cl.model.camera import train_views
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.forecast import forecast
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.raster.rasterizer import Rasterizer
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +49,38 @@ def test_a_fit_of_more_splats_takes_longer(ahead):
     fit = EncodeOptions.for_preset("best", fit={"steps": 1000})
     assert ahead(fit.changed(q=0.5)) > 1.3 * ahead(fit.changed(q=0.3))
     assert ahead(fit.changed(fit={"rounding": 1.0})) > 1.5 * ahead(fit), "steps after roundings count"
+
+
+@pytest.mark.parametrize("busy", [(3,), (2, 9, 17), (1, 2)], ids=str)
+def test_what_takes_the_device_away_for_a_moment_does_not_count(
+    device, plush_excerpt, plush_excerpt_cameras, monkeypatch, busy
+):
+    """Pictures of some milliseconds; before some of them the device is away for a quarter of a second."""
+    render, calls = Rasterizer.render_device, []
+
+    def delayed(self, camera):
+        calls.append(camera)
+        time.sleep(0.25 if len(calls) in busy else 0.002)
+        return render(self, camera)
+
+    monkeypatch.setattr(Rasterizer, "render_device", delayed)
+    ahead = forecast(plush_excerpt, train_views(plush_excerpt_cameras), EncodeOptions(), device)
+    assert ahead.sampled < 0.05
+    assert len(calls) > 9
+
+
+def test_pictures_that_take_long_are_rendered_once(device, plush_excerpt, plush_excerpt_cameras, monkeypatch):
+    render, calls = Rasterizer.render_device, []
+
+    def slow(self, camera):
+        calls.append(camera)
+        time.sleep(0.05)
+        return render(self, camera)
+
+    monkeypatch.setattr(Rasterizer, "render_device", slow)
+    ahead = forecast(plush_excerpt, train_views(plush_excerpt_cameras), EncodeOptions(), device)
+    assert ahead.sampled > 0.05
+    assert len(calls) == 5
 
 
 def test_memory_is_that_of_views_and_stays_within_the_budget(device, plush_excerpt, plush_excerpt_cameras):

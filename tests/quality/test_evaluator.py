@@ -85,14 +85,14 @@ def test_figures_are_those_of_the_pictures(evaluator):
     assert evaluator.psnr(WORSE, most=1) == pytest.approx(expected[0], abs=2e-6)
     assert evaluator.psnr(SCENE) == math.inf
     done = []
-    comparison = evaluator.compare(WORSE, lambda _stage, part: done.append(part))
+    comparison, _ = evaluator.judge(WORSE, lambda _stage, part: done.append(part))
     assert [view.figures["b_against_a"].psnr for view in comparison.views] == pytest.approx(expected, abs=2e-6)
     assert done[-1] == 1
 
 
 def test_pictures_that_are_not_kept_are_the_same(evaluator, monkeypatch):
     kept = evaluator.psnr(WORSE), evaluator.psnr(WORSE)
-    monkeypatch.setattr("potr_cl.quality.evaluator.CACHED_PICTURES", 0)
+    monkeypatch.setattr("potr_cl.quality.judging.CACHED_PICTURES", 0)
     with Evaluator(Device(), SCENE, evaluator.views, (0.2, 0.0, 0.0)) as other:
         assert (other.psnr(WORSE), other.psnr(WORSE)) == kept
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from potr_cl.codec.quantize import HyperParameters
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
@@ -16,6 +18,8 @@ from potr_cl.raster.kept_scene import KeptScene, PartOfKept, lying_on
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.reference.scenes import random_splats, straight_camera
+from potr_cl.stages.prune import Prune
+from potr_cl.stages.stage import State, Workbench
 from potr_cl.workers.host import HostPool
 from tests.devices import FAMILIES, open_device
 
@@ -169,3 +173,27 @@ def test_without_what_no_view_sees_the_scene_is_still_uploaded_once(
     assert splats == [len(scene)]
     monkeypatch.setattr(kept_scene, "_PART", 1 << 40)
     assert encode(scene, cameras, options, device=device).data == found.data
+
+
+def test_pruning_copies_no_more_of_a_scene_than_is_left(device):
+    """Splats that no view sees stay where they are, and those that are seen are gathered on the device."""
+    scene = random_splats(60_000, degree=3, seed=9)
+    scene.means[:] = scene.means * np.float32(0.1) + np.float32((0, 0, 4))
+    scene.log_scales[:] -= 4
+    scene.means[::20, 2] = -50  # behind the camera
+    state = State.of(scene, [replace(straight_camera(), name=f"{k}") for k in range(2)])
+    parameters = replace(HyperParameters.from_quality(0.1, "best"), delta_mse_max=1e-3)
+    with KeptScene(device, scene) as kept:
+        bench = Workbench(parameters, device=device, kept=kept)
+        Prune(iterations=2).run(state, bench)  # what is made once is made
+        tracemalloc.start()
+        try:
+            left = Prune(iterations=2).run(state, bench)
+            _, most = tracemalloc.get_traced_memory()
+        finally:
+            tracemalloc.stop()
+    assert left.learnt["unseen"].splats == 3000
+    assert not left.scene.sh[np.isin(left.survivors, np.arange(0, 60_000, 20)), 1:].any()
+    assert np.array_equal(left.scene.means, scene.means[left.survivors])
+    assert len(left.scene) < 20_000
+    assert most < 0.8 * scene.nbytes

@@ -9,6 +9,7 @@ from potr_cl.codec.quantize import HyperParameters
 from potr_cl.model import splat_groups
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
+from potr_cl.raster import culling
 from potr_cl.raster.culling import parts_of_views
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rules import INRIA
@@ -26,7 +27,7 @@ def _large(monkeypatch):
     """The street counts as a large scene."""
     monkeypatch.setattr(splat_groups, "LARGEST", 32)
     monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1)
-    monkeypatch.setattr(visible_parts, "_SAMPLED", 2)
+    monkeypatch.setattr(culling, "_SAMPLED", 2)
 
 
 def houses() -> tuple[Scene, list[Camera]]:

@@ -7,11 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 
+from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.reference.refit_cases import Case, Linearised
-from potr_cl.stages.refitting import colour_map, reached
+from potr_cl.stages.refitting import colour_map, placement, reached
 from potr_cl.stages.refitting.colour_refit import ColourRefit
 from potr_cl.stages.refitting.picked_views import PickedViews
 from potr_cl.stages.refitting.reached import reached_splats
@@ -74,8 +75,10 @@ def test_which_splats_are_reached(device, monkeypatch):
     monkeypatch.setattr(reached, "WORTH_IT", 1.0)
     scene, cameras = crowded()
     with Rasterizer(device, scene) as rasterizer:
-        found = reached_splats(rasterizer, cameras)
-        assert found is not None
+        reach = reached_splats(rasterizer, cameras, range(len(cameras)))
+        assert reach is not None
+        found = [reach.of[number] for number in range(len(cameras))]
+        assert (reach.total, reach.most) == (sum(map(len, found)), max(map(len, found)))
         drawn = []
         for camera, numbers in zip(cameras, found, strict=True):
             with rasterizer.prepare_set([camera]) as views:
@@ -94,14 +97,14 @@ def test_which_splats_are_reached(device, monkeypatch):
 def test_not_where_views_reach_much(device, monkeypatch):
     scene, cameras = crowded()
     with Rasterizer(device, scene) as rasterizer:
-        assert reached_splats(rasterizer, cameras) is None
+        assert reached_splats(rasterizer, cameras, range(5)) is None
         monkeypatch.setattr(reached, "LEAST_SPLATS", len(scene))
         monkeypatch.setattr(reached, "WORTH_IT", 1.0)
-        assert reached_splats(rasterizer, cameras) is not None
+        assert reached_splats(rasterizer, cameras, range(5)) is not None
         monkeypatch.setattr(reached, "WORTH_IT", 0.01)
-        assert reached_splats(rasterizer, cameras) is None
+        assert reached_splats(rasterizer, cameras, range(5)) is None
         monkeypatch.setattr(reached, "LEAST_SPLATS", len(scene) + 1)
-        assert reached_splats(rasterizer, cameras) is None
+        assert reached_splats(rasterizer, cameras, range(5)) is None
 
 
 #: Bytes that all lists fit and some geometry, that some views fit, and none.
@@ -180,6 +183,28 @@ def test_more_views_stay(device, picked):
             with ColourRefit(device, case.scene, case.cameras, memory=10**8) as refit:
                 room[on] = refit.colour_map.room
     assert 10**8 - room[True] < 0.6 * (10**8 - room[False])
+
+
+@pytest.mark.one_runtime
+@pytest.mark.parametrize("part", [0.3, 0.6])
+def test_little_memory_is_enough(device, picked, part, monkeypatch):
+    """What lies on the device keeps to what is given, as soon as that is more than the least."""
+    monkeypatch.setattr(placement, "_ANYWAY", 0)
+    monkeypatch.setattr(placement, "_LEAST_SLICE", 512)
+    device = Device(dataclasses.replace(device.info, kind="gpu", integrated=False), family=device.family)
+    scene, cameras = crowded(5000, degree=3)
+    one_piece = 3400 * len(scene)
+    memory = int(part * one_piece)
+    results = []
+    with Case(device, scene, dataclasses.replace(scene, sh=-scene.sh), cameras) as case:
+        free = device.allocated
+        for on, given in ((False, None), (True, memory)):
+            picked(on)
+            with ColourRefit(device, scene, cameras, memory=given) as refit:
+                results.append(refit.solve(scene.sh, case.targets, RefitOptions(steps=2, gain=0, drop=1e-7)))
+                taken = device.allocated - free
+    assert taken < memory
+    assert same(*results)
 
 
 def test_the_same_file(device, picked):

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import threading
 
 import numpy as np
 import pytest
 
-from potr_cl.errors import UsageError
+from potr_cl.errors import DataError, UsageError
+from potr_cl.model.scene import Scene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
 from potr_cl.reference.refit import LENGTHS, selection, to_rgb, to_ycocg
@@ -17,6 +19,7 @@ from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.colour_refit import ColourRefit
+from potr_cl.stages.refitting.coming_scene import ComingScene
 from potr_cl.stages.refitting.launcher import launcher_for
 from potr_cl.stages.refitting.refit import active_coefficients, refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
@@ -416,3 +419,38 @@ def test_nobody_waits_for_a_device_that_others_read_from(case, monkeypatch):
         assert error == linear.error
     assert waited
     assert not any(waited)
+
+
+def test_a_scene_that_is_still_to_come(case):
+    """Its colours are on the device before its geometry is there, and a second solution starts from its own."""
+    options, dark = RefitOptions(steps=3, gain=0, drop=1e-7), 0.5 * case.scene.sh
+    wanted = case.solve(options).sh
+    with ColourRefit(case.device, case.scene, case.cameras, background=case.background) as refit:
+        dimmed = refit.solve(dark, case.targets, options).sh
+    begun = threading.Event()
+
+    def make() -> Scene:
+        begun.wait(60)
+        return case.scene
+
+    threading.Timer(0.2, begun.set).start()
+    scene = ComingScene(case.scene.sh, make)
+    with ColourRefit(case.device, scene, case.cameras, background=case.background) as refit:
+        assert np.array_equal(refit.solve(case.scene.sh, case.targets, options).sh, wanted)
+        assert np.array_equal(refit.solve(dark, case.targets, options).sh, dimmed)
+        assert np.array_equal(refit.solve(case.scene.sh, case.targets, options).sh, wanted)
+    # What the device has already is of no account where a solution begins elsewhere.
+    with ColourRefit(case.device, scene, case.cameras, background=case.background) as refit:
+        assert np.array_equal(refit.solve(dark, case.targets, options).sh, dimmed)
+
+
+def test_a_scene_that_never_comes(case):
+    """What making it raised is told, and the device's memory is given back."""
+    before = case.device.allocated
+
+    def make() -> Scene:
+        raise DataError("a splat is too far away")
+
+    with pytest.raises(DataError, match="too far away"):
+        ColourRefit(case.device, ComingScene(case.scene.sh, make), case.cameras)
+    assert case.device.allocated == before

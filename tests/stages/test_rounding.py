@@ -17,7 +17,7 @@ from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.colour_refit import ColourRefit
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
-from potr_cl.stages.refitting.rounding import TURNS, Round, Rounding
+from potr_cl.stages.refitting.rounding import TURNS, Round, Rounding, Steps
 from tests.devices import KERNELS, open_device
 
 
@@ -48,7 +48,8 @@ class Rounded:
             vectors.activate(active)
             vectors.keep_active(x)
             vectors.zero(result)
-            with SplatBlocks(vectors) as blocks, Rounding(vectors, grid) as rounding:
+            steps = Steps.of(grid, vectors.layout.stride)
+            with SplatBlocks(vectors) as blocks, Rounding(vectors, steps) as rounding:
                 blocks.zero()
                 refit.colour_map.gradient(x, case.targets, result, blocks)
                 if noise:

@@ -8,8 +8,10 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -21,6 +23,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.stages.pruning import visible_parts
+from potr_cl.workers import pace
 from potr_cl.workers.cluster import ClusterPool
 from tests.cases.streets import street
 
@@ -187,27 +190,34 @@ def test_all_workers_are_killed(scene, cameras, device):
 
 
 @contextlib.contextmanager
-def processes_of_a_cluster(workers):
-    """A scheduler and workers as users start them; the address, and the processes."""
+def processes_of_a_cluster(workers, without=None, env=None, more=0):
+    """A scheduler and workers as users start them; the address, and the processes.
+
+    Args:
+        workers: how many.
+        without: a folder without the package, in which one more is started.
+        env: what is set in the environment of so many more.
+    """
     with contextlib.ExitStack() as stack:
 
-        def started(*words):
+        def started(*words, cwd=ROOT, **env):
             running = subprocess.Popen(
-                [sys.executable, "-m", *words, "--no-dashboard"], cwd=ROOT, stderr=subprocess.PIPE, text=True
-            )
+                [sys.executable, "-m", *words, "--no-dashboard"], cwd=cwd, stderr=subprocess.PIPE, text=True,
+                env={**os.environ, "PYTHONPATH": str(cwd), **env},
+            )  # fmt: skip
             stack.callback(running.communicate)
             stack.callback(running.kill)
             return running
 
         scheduler = started("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0")
         address = next(line for line in scheduler.stderr if "Scheduler at:" in line).split()[-1]
-        more = [
-            started("distributed.cli.dask_worker", address, "--nthreads", "1", "--memory-limit", "0", "--no-nanny")
-            for _ in range(workers)
-        ]
-        for each in more:
+        worker = ("distributed.cli.dask_worker", address, "--nthreads", "1", "--memory-limit", "0", "--no-nanny")
+        all_workers = [started(*worker) for _ in range(workers)] + [started(*worker, **env) for _ in range(more)]
+        if without is not None:
+            all_workers.append(started(*worker, cwd=without))
+        for each in all_workers:
             next(line for line in each.stderr if "Registered to:" in line)
-        yield address, [scheduler, *more]
+        yield address, [scheduler, *all_workers]
 
 
 @pytest.mark.slow
@@ -307,9 +317,9 @@ def test_ctrl_c_leaves_no_worker_busy(tmp_path, data, scene, cameras, device, ex
 
 def taken():
     """On a worker: bytes of its devices that somebody has."""
-    from potr_cl.workers import cluster
+    from potr_cl.workers import seat
 
-    return sum(device.allocated for device in cluster._opened.values())
+    return sum(device.allocated for device in seat.opened.values())
 
 
 @pytest.mark.parametrize(
@@ -329,9 +339,92 @@ def test_no_cluster_there(address, said, device, monkeypatch):
     assert "\n" not in str(error.value)
 
 
-def test_a_cluster_without_workers(device):
+def test_a_cluster_without_workers(device, monkeypatch, caplog):
+    monkeypatch.setattr("potr_cl.workers.cluster._COME", 0.5)
     with local_cluster(0) as cluster, pytest.raises(UsageError, match="has no worker"):
         ClusterPool(cluster.scheduler_address, device)
+    assert "the cluster has no worker yet: waiting" in caplog.text
+
+
+def test_workers_may_come_later(scene, cameras, device, expected, monkeypatch, caplog):
+    """The first one is waited for; another one gets views from the next stage on."""
+    monkeypatch.setattr("potr_cl.workers.cluster._NEW", 0.1)
+    with local_cluster(0) as cluster:
+        threading.Timer(1, cluster.scale, (1,)).start()
+        with ClusterPool(cluster.scheduler_address, device) as pool:
+            assert len(pool.workers()) == 1
+            cluster.scale(2)
+            eventually(lambda: len(pool.workers()) == 2)
+            assert "has come: it gets views" in caplog.text
+            assert encode(scene, cameras, OPTIONS, device=device, pool=pool).data == expected
+            assert all(worker.rate for worker in pool.workers())
+
+
+@pytest.mark.slow
+def test_a_slow_worker_does_not_hold_up_the_others(scene, cameras, device, expected, monkeypatch, caplog):
+    """Within a stage they wait for it once; the file is the same."""
+    monkeypatch.setattr(pace, "_AT_LEAST", 0.5)
+    monkeypatch.setattr(pace, "_AT_FIRST", 3.0)
+    options = OPTIONS.changed(prune={"iterations": 40})
+    same = encode(scene, cameras, options, device=device).data
+    with local_cluster(3) as cluster, ClusterPool(cluster.scheduler_address, device) as pool:
+        encode(scene, cameras, OPTIONS, device=device, pool=pool)  # builds kernels
+        for worker in pool.workers():
+            worker.rate = None
+        with distributed.Client(cluster, set_as_default=False) as client:
+            client.run(slow_down, workers=[pool.names[0]])
+        caplog.clear()
+        began = time.monotonic()
+        assert encode(scene, cameras, options, device=device, pool=pool).data == same
+        assert f"worker {pool.names[0]} is slow: its views go to" in caplog.text
+        # Every command of the slow worker takes a second; 80 are given in each round of pruning alone.
+        assert time.monotonic() - began < 40
+
+
+def slow_down():
+    """On a worker."""
+    from potr_cl.workers.seat import Seat
+
+    run = Seat.run
+
+    def slowly(self, *args):
+        time.sleep(1.0)
+        return run(self, *args)
+
+    Seat.run = slowly
+
+
+def test_devices_of_several_kinds_are_told(device, monkeypatch, caplog):
+    other = SimpleNamespace(family=device.family, info="another device")
+    with local_cluster(1) as cluster, ClusterPool(cluster.scheduler_address, other):
+        pass
+    assert "the cluster has devices of several kinds ('" in caplog.text
+    assert "another device" in caplog.text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("others", [0, 1])
+def test_a_worker_without_this_package(others, device, tmp_path, caplog):
+    """It does nothing if there are others, and says what to do if there are none."""
+    (tmp_path / "potr_cl").mkdir()
+    (tmp_path / "potr_cl" / "__init__.py").write_text("raise ModuleNotFoundError('there is none')")
+    with processes_of_a_cluster(others, without=tmp_path) as (address, _):
+        if others:
+            with ClusterPool(address, device) as pool:
+                assert len(pool.workers()) == 1
+            assert "it does no views" in caplog.text
+        else:
+            with pytest.raises(UsageError, match="install potr_cl there as it is here, and no other worker") as error:
+                ClusterPool(address, device)
+            assert "\n" not in str(error.value)
+
+
+@pytest.mark.slow
+def test_a_worker_without_a_device(device):
+    with processes_of_a_cluster(0, env={"POTR_CL_DEVICE": "nonsense"}, more=1) as (address, _):
+        with pytest.raises(UsageError, match="cannot do the work: no OpenCL device fits 'nonsense'") as error:
+            ClusterPool(address, device)
+        assert "\n" not in str(error.value)
 
 
 def test_several_devices_and_a_cluster(scene, cameras, device):

@@ -236,7 +236,7 @@ def test_devices_by_name():
     with pytest.raises(DeviceError, match="no OpenCL device fits '99'"):
         choose_devices(f"{best.index},99")
     for named in ("all", f"{best.index}, {best.index + 1}"):
-        with pytest.raises(DeviceError, match="only encode shares"):
+        with pytest.raises(DeviceError, match="only encode and compare share"):
             choose_device(named)
 
 

@@ -96,6 +96,21 @@ def test_the_same_bytes(family, options, monkeypatch):
     assert [device.allocated for device in devices] == [0] * 4
 
 
+def test_the_uncompressed_scene_travels_once(family, monkeypatch):
+    """Where workers get all of it: of what is pruned, once unseen splats are set aside, they get the numbers."""
+    monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1 << 40)
+    scene, cameras = street(5, 500, across=True)
+    scene = with_a_house_that_nobody_sees(scene)
+    options = OPTIONS.changed(prune={"keep": None}, refit={"at": ()})
+    devices = [open_device(family) for _ in range(3)]
+    expected = encode(scene, cameras, options, device=devices[0])
+    assert expected.unseen.splats > 100
+    with ElsewherePool(devices) as pool:
+        assert encode(scene, cameras, options, device=devices[0], pool=pool).data == expected.data
+        constant = 56 * len(scene)
+        assert pool.scenes < scene.nbytes + constant
+
+
 @pytest.mark.parametrize("keep", [0.4, None])
 def test_workers_with_gpus_look_at_each_view_with_what_it_may_draw(keep, monkeypatch):
     """As a GPU with memory of its own does: a CPU that runs its kernels has none."""

@@ -62,6 +62,7 @@ from potr_cl.stages.fitting.fit import FitOptions, fit_scene
 from potr_cl.stages.fitting.parameters import UNROUNDED, Factors, in_form_of_files
 from potr_cl.stages.fitting.tangents import PictureTangents
 from potr_cl.stages.pruning.alive_packing import AlivePacking
+from potr_cl.stages.pruning.changed_totals import AddedChanges, ChangedTotals
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions
@@ -233,7 +234,7 @@ def packing(device: Device) -> None:
 
 
 def marks(device: Device) -> None:
-    """The bits of splats that go, and back; the totals of those that are left, packed, and back."""
+    """The bits of splats that go, and back; totals of those that are left, and their changes, packed, and back."""
     with Survivors(device, 61, 64, device.queue.finish) as survivors, Memory(device) as memory:
         survivors.remove(np.arange(0, 61, 3))
         survivors.mark(survivors.just_marked())
@@ -243,6 +244,10 @@ def marks(device: Device) -> None:
             lent = packing.lend(totals)
             assert packing.are_packed(lent)
             packing.unpack(lent.buffer, totals, add=True)
+        with ChangedTotals(device, 61, survivors.buffer) as changed, AddedChanges(device) as added:
+            changes = changed.take(totals)
+            added.add(totals, changes, 61)
+            added.add(totals, changes, 61, memory.upload(np.arange(61, dtype=np.uint32), "numbers"))
 
 
 def derivatives(device: Device) -> None:

@@ -1,11 +1,14 @@
 """Is a file with the fit ever worse than one without? With few views, virtual ones, and thresholds set by hand.
 
-    python -m tools.study.fit_guards SCENE … [--cases CASE …] [--qualities Q …] [--limit SECONDS] [--json FILE]
+    python -m tools.study.fit_guards SCENE … [--cases CASE …] [--as KIND …] [--qualities Q …] [--limit SECONDS]
+        [--json FILE]
 
 A SCENE is a folder with point_cloud.ply and cameras.json with test views, or "excerpt": the tests' part of plush. A
 case is what the encoder has: "8" of the training views, evenly spread; "virtual": cameras that it places itself;
 "all"; or "all@3e-9": all of them, and that ΔMSE_MAX instead of q's. --fits are the steps that are asked for; what
-follows a "+" are options of the fit, as "auto+between=3".
+follows a "+" are options of the fit, as "auto+between=3". --as changes the scene before all else: "degree 1" or "degree
+0" cuts its SH, "antialiased" takes it for an antialiased one, "coloured background" puts one behind it, "huge splats"
+makes every hundredth ten times larger and a third as opaque, "off-centre cameras" look past their pictures' centres.
 
 For each case, a quality (or threshold) and those around it are encoded without a fit; bytes at equal PSNR are read
 from that curve, on test views, which neither has seen. A fit that was left out must leave the file as it was, byte by
@@ -14,8 +17,10 @@ byte: then there is nothing to compare, and the table says why.
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,6 +43,7 @@ from tools.workloads import read, scene_parser
 
 COLUMNS = (
     Column("scene"),
+    Column("as"),
     Column("views"),
     Column("q", format="g"),
     Column("ΔMSE_MAX by hand", format="g"),
@@ -52,6 +58,33 @@ COLUMNS = (
 #: Qualities of the curve around one, and factors of thresholds around one.
 _AROUND = (-0.2, -0.1, 0.0, 0.1, 0.2)
 _FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+
+
+_BLACK, _COLOURED = (0.0, 0.0, 0.0), (0.3, 0.7, 0.5)
+_AS_IT_IS = "it is"
+
+
+def _huge(scene: Scene) -> Scene:
+    log_scales, logits = scene.log_scales.copy(), scene.opacity_logits.copy()
+    log_scales[::100] += np.log(10)
+    logits[::100] -= np.log(3)
+    return dataclasses.replace(scene, log_scales=log_scales, opacity_logits=logits)
+
+
+def _off_centre(camera: Camera) -> Camera:
+    return dataclasses.replace(camera, cx=camera.cx + 0.2 * camera.width, cy=camera.cy - 0.1 * camera.height)
+
+
+#: Other scenes made of one, by what they are called.
+KINDS: dict[str, Callable[[Scene], Scene]] = {
+    _AS_IT_IS: lambda scene: scene,
+    "degree 0": lambda scene: dataclasses.replace(scene, sh=scene.sh[:, :1].copy()),
+    "degree 1": lambda scene: dataclasses.replace(scene, sh=scene.sh[:, :4].copy()),
+    "antialiased": lambda scene: dataclasses.replace(scene, antialiased=True),
+    "coloured background": lambda scene: scene,
+    "huge splats": _huge,
+    "off-centre cameras": lambda scene: scene,
+}
 
 
 @dataclass(frozen=True)
@@ -87,13 +120,26 @@ class Bench:
     Args:
         scene: the uncompressed one.
         cameras: all, with test views among them.
-        args: the command line.
+        device: to compute on.
+        preset: of the encodes.
+        kind: of :data:`KINDS`, which the scene is made.
     """
 
-    def __init__(self, name: str, scene: Scene, cameras: Sequence[Camera], device: Device, preset: Any) -> None:
-        self.name, self._scene, self._cameras, self._device = name, scene, cameras, device
-        self._options = EncodeOptions.for_preset(preset)
-        self._judge = Evaluator(device, scene, EvaluationViews.of(test_views(cameras)), (0.0, 0.0, 0.0))
+    def __init__(
+        self,
+        name: str,
+        scene: Scene,
+        cameras: Sequence[Camera],
+        device: Device,
+        preset: Any,
+        kind: str = _AS_IT_IS,
+    ) -> None:
+        self.name, self._kind, self._device = name, kind, device
+        self._scene = KINDS[kind](scene)
+        self._cameras = [_off_centre(each) for each in cameras] if kind == "off-centre cameras" else list(cameras)
+        background = _COLOURED if kind == "coloured background" else _BLACK
+        self._options = EncodeOptions.for_preset(preset, background=background)
+        self._judge = Evaluator(device, self._scene, EvaluationViews.of(test_views(self._cameras)), background)
 
     def _encode(self, views: Sequence[Camera], q: float, threshold: float | None, **fit: Any) -> tuple[Encoded, float]:
         options = self._options.changed(q=q, fit=fit)
@@ -128,7 +174,7 @@ class Bench:
                 text += f": left out ({getattr(fitted, 'why', 'off')}); " + ("same bytes" if same else "OTHER BYTES")
             same_psnr = size_at(curve, "psnr", psnr) if held_out else None
             table.add(
-                self.name, case.views, q, case.threshold, text, held_out, plain["bytes"], encoded.nbytes,
+                self.name, self._kind, case.views, q, case.threshold, text, held_out, plain["bytes"], encoded.nbytes,
                 plain["psnr"], psnr, 100 * (encoded.nbytes / same_psnr - 1) if same_psnr else None,
             )  # fmt: skip
 
@@ -157,6 +203,7 @@ def read_any(folder: Path) -> tuple[Scene, list[Camera]]:
 def main() -> None:
     parser = scene_parser(__doc__)
     parser.add_argument("--cases", nargs="+", type=Case.of, default=[Case.of(each) for each in ("8", "1", "virtual")])
+    parser.add_argument("--as", nargs="+", choices=KINDS, default=[_AS_IT_IS], dest="kinds", metavar="KIND")
     parser.add_argument("--qualities", nargs="+", type=float, default=[0.3, 0.5], metavar="Q")
     parser.add_argument("--fits", nargs="+", type=_fit, default=[_fit("auto")], metavar="STEPS")
     parser.add_argument("--preset", default="best")
@@ -166,8 +213,8 @@ def main() -> None:
     table = Results(device.info, args.json).table(
         "guards", "Files with a fit against files without, test views", *COLUMNS
     )
-    for folder in args.scenes:
-        bench = Bench(folder.resolve().name, *read_any(folder), device, args.preset)
+    for folder, kind in itertools.product(args.scenes, args.kinds):
+        bench = Bench(folder.resolve().name, *read_any(folder), device, args.preset, kind)
         for case in args.cases:
             for q in args.qualities:
                 if time.perf_counter() - began > args.limit:

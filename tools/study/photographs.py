@@ -56,6 +56,7 @@ from potr_cl.stages.fit import Fit
 from potr_cl.stages.fitting.adam import Adam, Limits, Rates
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from potr_cl.stages.fitting.fit import RATES
+from potr_cl.stages.fitting.photographs import longer
 from potr_cl.stages.fitting.pictures import TargetPictures
 from potr_cl.stages.fitting.views import batches
 from potr_cl.stages.prune import Prune
@@ -133,7 +134,7 @@ class Trial:
     @property
     def rates(self) -> Rates:
         """Of the first step."""
-        rates = {each.name: self.rate * getattr(RATES, each.name) for each in dataclasses.fields(Rates)}
+        rates = {each.name: self.rate * getattr(longer(RATES), each.name) for each in dataclasses.fields(Rates)}
         rates["ac"] *= self.ac
         moving = self.groups.split("+") if self.groups else list(rates)
         return Rates(**{name: rate if name in moving else 0.0 for name, rate in rates.items()})

@@ -7,7 +7,7 @@
 
 /* The splats' colours in each view of a set: of the coefficients themselves (direction == 0), cut at 0, w telling which
    channels are free (1, 2, 4: above 0); or their change along a direction, 0 where `free` says that the channel is cut,
-   and the same w.
+   and the same w. Views that have some splats have `free` in a byte each, `free_picks`, which colours leave there.
    What views have lies `apart`. Work-item i of the second dimension does views i, i + get_global_size(1), … */
 kernel void view_colours(
     global const float *coefficients,
@@ -20,6 +20,7 @@ kernel void view_colours(
     int direction,
     float unit,
     global const float4 *free,
+    global uchar *free_picks,
     global float4 *colours)
 {
     const size_t index = get_global_id(0);
@@ -47,7 +48,11 @@ kernel void view_colours(
         vfloat channels = (vfloat)(0.0f);
         const size_t place = number * apart / LANES + index;
         if (direction) {
+#if PICKED
+            const vint kept = free_picks[place];
+#else
             const vint kept = free_channels(free, place);
+#endif
             red = (kept & 1) != 0 ? red * unit : (vfloat)(0.0f);
             green = (kept & 2) != 0 ? green * unit : (vfloat)(0.0f);
             blue = (kept & 4) != 0 ? blue * unit : (vfloat)(0.0f);
@@ -59,6 +64,9 @@ kernel void view_colours(
             channels = (red > 0.0f ? (vfloat)(1.0f) : (vfloat)(0.0f)) +
                 (green > 0.0f ? (vfloat)(2.0f) : (vfloat)(0.0f)) +
                 (blue > 0.0f ? (vfloat)(4.0f) : (vfloat)(0.0f));
+#if PICKED
+            free_picks[place] = (uchar)channels;
+#endif
             red = fmax(red, (vfloat)(0.0f));
             green = fmax(green, (vfloat)(0.0f));
             blue = fmax(blue, (vfloat)(0.0f));

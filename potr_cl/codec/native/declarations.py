@@ -43,6 +43,10 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
     "potr_octree_sizes": (_SIZE, []),
     "potr_octree_survey": (None, [_POINTER, _SIZE, _SIZE, _NUMBER, *[_POINTER] * 3]),
     "potr_octree_streams": (None, [_POINTER, _SIZE, _SIZE, _NUMBER, *[_POINTER] * 8]),
+    "potr_octree_decoded": (
+        None,
+        [_POINTER, _SIZE, _SIZE, _NUMBER, *[_POINTER] * 4, _SIZE, _SIZE, _POINTER],
+    ),
     "potr_encode_recent": (None, [_POINTER, _SIZE, _SIZE, _POINTER]),
     "potr_encode_cells": (None, [_POINTER, _SIZE, _POINTER, _POINTER, _SIZE, ctypes.c_int32, _POINTER]),
     "potr_encode_count": (None, [_POINTER, _SIZE, _POINTER]),

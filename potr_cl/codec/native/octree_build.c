@@ -265,3 +265,30 @@ POTR_EXPORT void potr_octree_streams(
         above = below;
     }
 }
+
+/* Centres as a decoder finds them, of the splats from number `begin` of the order on to the one before `end`.
+ *
+ * What potr_octree_survey takes, and: sides: (depth + 1) edges of the cells of each level. origin: (3).
+ * means: (n, 3), filled from `begin` on to `end`, in the order of the leaves. */
+POTR_EXPORT void potr_octree_decoded(
+    const uint64_t *words, size_t n, size_t number, int depth, const int64_t *order, const int8_t *wanted,
+    const double *sides, const double *origin, size_t begin, size_t end, float *means)
+{
+    int above = begin < end ? common_levels(words, n, number, depth, begin) : -1;
+    for (size_t i = begin; i < end; i++) {
+        const int below = common_levels(words, n, number, depth, i + 1);
+        const int alone = (above > below ? above : below) + 1, asked = wanted[order[i]];
+        const int level = alone > depth ? depth : asked > alone ? asked : alone;
+        uint64_t cell[3] = { 0, 0, 0 };
+        for (int step = 0; step < level; step++) {
+            const unsigned octant = octant_of(words, n, i, (unsigned)step);
+            for (unsigned axis = 0; axis < 3; axis++)
+                cell[axis] = 2 * cell[axis] + (octant >> axis & 1);
+        }
+        for (size_t axis = 0; axis < 3; axis++) {
+            const double along = ((double)(int64_t)cell[axis] + 0.5) * sides[level];
+            means[3 * i + axis] = (float)(along + origin[axis]);
+        }
+        above = below;
+    }
+}

@@ -22,6 +22,8 @@ U64 = NDArray[np.uint64]
 _LEVELS_A_WORD = 21
 #: Centres whose words a thread finds at a time.
 _AT_A_TIME = 1 << 17
+#: The same of decoded ones.
+_DECODED = 1 << 15
 _LEVELS = 54  # of counts
 
 
@@ -132,10 +134,7 @@ class OctreeBuilding:
             order: (n,) number of each splat. wanted: (n,) levels by that number, 0 to ``depth``.
         """
         number, n = words.shape
-        if not 0 <= depth <= number * _LEVELS_A_WORD or depth > _LEVELS - 2:
-            raise TypeError("the native path was given words of too few levels")
-        if n and (int(order.min()) < 0 or int(order.max()) >= n or int(wanted.min()) < 0 or int(wanted.max()) > depth):
-            raise TypeError("the native path was given splats or levels that are not there")
+        _check(words, depth, order, wanted)
         sizes = np.empty(3 * _LEVELS + 2, np.uint64)
         if self._c["potr_octree_sizes"]() != sizes.nbytes:
             raise TypeError("the native path counts in another way")
@@ -158,3 +157,39 @@ class OctreeBuilding:
             *(address(each, np.uint8, each.size, True) for each in (lengths, planes)),
         )
         return occupancy, several, multiplicities, lengths, planes
+
+    def decoded(self, words: U64, depth: int, order: I64, wanted: I8, sides: F64, origin: F64, run: Run = map) -> F32:
+        """(n, 3) centres as a decoder of the streams finds them, in the order of the leaves.
+
+        Args:
+            words, depth, order, wanted: as of :meth:`streams`.
+            sides: (depth + 1,) edges of the cells of each level.
+            origin: (3,).
+            run: shares the work out.
+        """
+        number, n = words.shape
+        _check(words, depth, order, wanted)
+        means = np.empty((n, 3), np.float32)
+        given = (
+            address(words, np.uint64, number * n), n, number, depth,
+            address(order, np.int64, n), address(wanted, np.int8, n),
+            address(sides, np.float64, depth + 1), address(origin, np.float64, 3),
+        )  # fmt: skip
+        result = address(means, np.float32, 3 * n, True)
+
+        def find(first: int) -> None:
+            self._c["potr_octree_decoded"](*given, first, min(first + _DECODED, n), result)
+
+        for _ in run(find, range(0, n, _DECODED)):
+            pass
+        return means
+
+
+def _check(words: U64, depth: int, order: I64, wanted: I8) -> None:
+    number, n = words.shape
+    if not 0 <= depth <= number * _LEVELS_A_WORD or depth > _LEVELS - 2:
+        raise TypeError("the native path was given words of too few levels")
+    if len(order) != n or len(wanted) != n:
+        raise TypeError("the native path was given splats or levels that are not there")
+    if n and (int(order.min()) < 0 or int(order.max()) >= n or int(wanted.min()) < 0 or int(wanted.max()) > depth):
+        raise TypeError("the native path was given splats or levels that are not there")

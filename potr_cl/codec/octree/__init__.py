@@ -14,8 +14,8 @@ attribute streams is the depth-first (Morton) order of the leaves.
 :func:`build` and :func:`parse` are the two directions, :class:`OctreeStreams` is what stands between them.
 """
 
-from potr_cl.codec.octree.builder import begin, build, leaf_order
+from potr_cl.codec.octree.builder import Begun, begin, build, leaf_order
 from potr_cl.codec.octree.parser import parse
 from potr_cl.codec.octree.streams import DEEPEST_LEVEL, OctreeStreams
 
-__all__ = ["DEEPEST_LEVEL", "OctreeStreams", "begin", "build", "leaf_order", "parse"]
+__all__ = ["DEEPEST_LEVEL", "Begun", "OctreeStreams", "begin", "build", "leaf_order", "parse"]

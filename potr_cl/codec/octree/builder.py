@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.native.library import native
 from potr_cl.codec.native.octree_build import OctreeBuilding
-from potr_cl.codec.octree.streams import DEEPEST_LEVEL, U8, U64, OctreeStreams
+from potr_cl.codec.octree.parser import parse
+from potr_cl.codec.octree.streams import DEEPEST_LEVEL, U8, U64, OctreeStreams, check_centres
 from potr_cl.host.threads import Run
 from potr_cl.model.morton import spread
 
@@ -37,26 +39,40 @@ def build(
     Returns:
         The streams, and ``order`` (N,): the splats' indices in the order of the leaves.
     """
-    order, finish = begin(means, tolerance, absolute, run)
-    return finish(), order
+    begun = begin(means, tolerance, absolute, run)
+    return begun.streams(), begun.order
 
 
-def begin(
-    means: NDArray[np.float32], tolerance: F64 | float, absolute: bool = False, run: Run = map
-) -> tuple[NDArray[np.int64], Callable[[], OctreeStreams]]:
-    """The first part of :func:`build`, which other work may wait for.
+@dataclass(frozen=True)
+class Begun:
+    """An octree whose streams are still to be written.
+
+    Attributes:
+        order: (N,) the splats' indices in the order of the leaves.
+        depth: of the octree.
+        streams: returns the streams; another thread may call it.
+        decoded: takes what shares work out, and returns (N, 3) float32, the centres as
+            :func:`potr_cl.codec.octree.parse` finds them in the streams; it raises what that does.
+    """
+
+    order: NDArray[np.int64]
+    depth: int
+    streams: Callable[[], OctreeStreams]
+    decoded: Callable[[Run], NDArray[np.float32]]
+
+
+def begin(means: NDArray[np.float32], tolerance: F64 | float, absolute: bool = False, run: Run = map) -> Begun:
+    """:func:`build`, where what the streams are not needed for need not wait for them.
 
     Args:
         means, tolerance, absolute, run: as :func:`build` takes them.
-
-    Returns:
-        The order, and what returns the streams; another thread may call it.
     """
     functions = native()
     if absolute and functions is not None:
         return _begin_natively(functions.octree_build, means, tolerance, run)
     streams, order = _build_in_numpy(means, tolerance, absolute)
-    return order, lambda: streams
+    parts = -(-len(order) // _BLOCK)
+    return Begun(order, streams.depth, lambda: streams, lambda run: parse(streams, len(order), run, parts))
 
 
 def _build_in_numpy(
@@ -115,23 +131,27 @@ def leaf_order(means: NDArray[np.float32], tolerance: F64 | float) -> NDArray[np
     return _depth_first(_morton_words(grid, depth))
 
 
-def _begin_natively(
-    functions: OctreeBuilding, means: NDArray[np.float32], tolerance: F64 | float, run: Run
-) -> tuple[NDArray[np.int64], Callable[[], OctreeStreams]]:
+def _begin_natively(functions: OctreeBuilding, means: NDArray[np.float32], tolerance: F64 | float, run: Run) -> Begun:
     """:func:`begin` with ``absolute``."""
     low, side, limit, depth, words = _words_of(functions, means, tolerance, run)
-    order, ordered = functions.order(words, run)
+    order, words = functions.order(words, run)
+    half_diagonal = _half_diagonal(side)
+    wanted = functions.wanted(limit, half_diagonal, depth) if half_diagonal else np.zeros(len(limit), np.int8)
+    unclear = np.flatnonzero(wanted < 0)
+    wanted[unclear] = _levels_for(side, limit[unclear], depth)
+    origin = (float(low[0]), float(low[1]), float(low[2]))
 
-    def finish() -> OctreeStreams:
-        half_diagonal = _half_diagonal(side)
-        wanted = functions.wanted(limit, half_diagonal, depth) if half_diagonal else np.zeros(len(limit), np.int8)
-        unclear = np.flatnonzero(wanted < 0)
-        wanted[unclear] = _levels_for(side, limit[unclear], depth)
-        occupancy, several, multiplicities, lengths, tails = functions.streams(ordered, depth, order, wanted)
-        origin = (float(low[0]), float(low[1]), float(low[2]))
-        return OctreeStreams(origin, side, depth, occupancy, several, multiplicities, lengths, tails, absolute=True)
+    def streams() -> OctreeStreams:
+        found = functions.streams(words, depth, order, wanted)
+        return OctreeStreams(origin, side, depth, *found, absolute=True)
 
-    return order, finish
+    def decoded(run: Run) -> NDArray[np.float32]:
+        sides = np.ldexp(side, -np.arange(depth + 1))
+        centres = functions.decoded(words, depth, order, wanted, sides, np.array(origin), run)
+        check_centres(origin, side, centres)
+        return centres
+
+    return Begun(order, depth, streams, decoded)
 
 
 def _words_of(

@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 
 from potr_cl.codec.native.functions import Functions
 from potr_cl.codec.native.library import native
-from potr_cl.codec.octree.streams import DEEPEST_LEVEL, U8, OctreeStreams
+from potr_cl.codec.octree.streams import DEEPEST_LEVEL, U8, OctreeStreams, check_centres
 from potr_cl.errors import DataError
 from potr_cl.host.threads import Run
 
-_LARGEST_FLOAT32 = float(np.finfo(np.float32).max)
 #: Leaves worked on at a time where each stands for itself: the temporaries of a block stay in the cache.
 _BLOCK = 1 << 15
 #: Splats of a part that is worth a thread's while.
@@ -92,7 +91,7 @@ def parse(streams: OctreeStreams, splats: int, run: Run = map, parts: int = 1) -
             size = cell[level_of[block]]
             for axis, c in enumerate(coordinates):
                 means[block, axis] = (c[block].astype(np.float64) + 0.5) * size + streams.origin[axis]
-    _check_centres(streams, means)
+    check_centres(streams.origin, streams.side, means)
     if is_crowded is not None:
         counts = np.ones(leaves, np.int64)
         counts[is_crowded] = streams.multiplicities.astype(np.int64)
@@ -128,7 +127,7 @@ def _parse_natively(
         raise _padded_wrongly()
     sides, origin = np.ldexp(streams.side, -np.arange(depth + 1)), np.array(streams.origin, np.float64)
     list(run(lambda part: walk.centres(part, sides, origin), range(walk.parts)))
-    _check_centres(streams, walk.means)
+    check_centres(streams.origin, streams.side, walk.means)
     return walk.means
 
 
@@ -160,11 +159,6 @@ def _check_tail_size(reach: NDArray[np.int64], size: int) -> None:
     expected = sum(3 * ((int(k) + 7) // 8) for k in reach[1:])
     if expected != size:
         raise DataError(f"positions: {size} bytes of tails where their lengths ask for {expected}")
-
-
-def _check_centres(streams: OctreeStreams, means: NDArray[np.float32]) -> None:
-    if max(map(abs, streams.origin)) + streams.side > _LARGEST_FLOAT32 and not np.isfinite(means).all():
-        raise DataError("positions: a centre is beyond what single precision can hold")
 
 
 def _no_tree() -> DataError:

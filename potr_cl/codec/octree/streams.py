@@ -7,8 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.errors import DataError
+
 #: Levels that float64 arithmetic on the root cube can tell apart.
 DEEPEST_LEVEL = 52
+
+_LARGEST_FLOAT32 = float(np.finfo(np.float32).max)
 
 U8 = NDArray[np.uint8]
 U64 = NDArray[np.uint64]
@@ -42,3 +46,17 @@ class OctreeStreams:
     tail_lengths: U8
     tails: U8
     absolute: bool = False
+
+
+def check_centres(origin: tuple[float, float, float], side: float, means: NDArray[np.float32]) -> None:
+    """Refuse centres, (N, 3), that single precision cannot hold.
+
+    Args:
+        origin, side: as of :class:`OctreeStreams`.
+        means: the centres.
+
+    Raises:
+        DataError: there is one.
+    """
+    if max(map(abs, origin)) + side > _LARGEST_FLOAT32 and not np.isfinite(means).all():
+        raise DataError("positions: a centre is beyond what single precision can hold")

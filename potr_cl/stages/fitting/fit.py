@@ -25,9 +25,11 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.stages.fitting.adam import Adam, Limits, Rates
 from potr_cl.stages.fitting.at_photographs import FittedToPhotographs
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
+from potr_cl.stages.fitting.files import TwoFiles
 from potr_cl.stages.fitting.judges import Judges
 from potr_cl.stages.fitting.parameters import UNROUNDED, Factors
 from potr_cl.stages.fitting.pictures import TargetPictures
@@ -47,8 +49,11 @@ _LARGEST_UNIT = 2.0**20
 #: Of the first step, means in parts of a usual splat's size, for a scene whose mean squared error has this root. All
 #: rates go with the root, because a step in all parameters at once must not do more harm than it can mend; but no rate
 #: is larger than these, or smaller than a part of them.
-RATES = Rates(means=0.01, log_scales=1e-2, quaternions=4e-3, opacity_logits=4e-2, dc=5e-3, ac=5e-4)
+RATES = Rates(means=0.005, log_scales=1e-2, quaternions=2e-3, opacity_logits=4e-2, dc=5e-3, ac=5e-4)
 _USUAL_ERROR, _SLOWEST = 1 / 128, 0.02
+#: A fit has gained enough to be taken without a look at files if what it leaves of the cost is below the one part, and
+#: of the error, where it has made up for no splats, below the other (docs/benchmarks/fit.md).
+_MUCH_CHEAPER, _MUCH = 0.9, 0.4
 
 
 @dataclass(frozen=True)
@@ -106,6 +111,8 @@ class Fitted:
         without: the error of these views before those were removed; None where none were.
         settled: mean squared error of these views after each fit that followed a choice of coefficients or a rounding.
         photographs: what a further fit to photographs did; None if there were none.
+        cost: what the scene costs, error and splats together, as a part of what it cost before those were removed.
+        files: that were made to see whether the fit pays; None where there was no doubt.
     """
 
     scene: Scene
@@ -118,6 +125,14 @@ class Fitted:
     without: float | None = None
     settled: tuple[float, ...] = ()
     photographs: FittedToPhotographs | None = None
+    cost: float = 0.0
+    files: TwoFiles | None = None
+
+    @property
+    def in_doubt(self) -> bool:
+        """Whether what was gained is so little that the file may lose it again."""
+        little = self.without is not None and not self.spared and self.error > _MUCH * self.without
+        return little or self.cost > _MUCH_CHEAPER
 
     @property
     def error(self) -> float:
@@ -135,6 +150,7 @@ class Fitted:
         names = ("steps", "kept", "held_out", "ended_early", "spared", "without")
         facts = {name: getattr(self, name) for name in names}
         facts |= {"errors": list(self.errors), "settled": list(self.settled)}
+        facts |= {"cost": self.cost, "files": None if self.files is None else self.files.facts}
         return facts | {"photographs": None if self.photographs is None else self.photographs.facts}
 
     def __str__(self) -> str:
@@ -148,8 +164,8 @@ class Fitted:
             said += f"; {_decibels(self.without):.2f} dB with {self.spared:,} splats more, without it"
         if self.settled:
             said += f"; {_decibels(self.settled[-1]):.2f} dB with geometry and coefficients as in the file"
-        if self.photographs is not None:
-            said += f"; {self.photographs}"
+        for each in (self.files, self.photographs):
+            said += "" if each is None else f"; {each}"
         return said
 
 
@@ -227,7 +243,7 @@ def fit_scene(
 
 def held_out_error(
     device: Device,
-    scene: Scene,
+    scene: Drawable,
     cameras: Sequence[Camera],
     targets: Targets | TargetPictures,
     added: int = 0,

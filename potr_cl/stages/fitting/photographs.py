@@ -26,6 +26,8 @@ from potr_cl.stages.refitting.targets import GroundTruthTargets, Photographs
 _TRIAL_STEPS, _TRIAL_LOOKS, _TRIAL_RATES = 40, 4, 0.1
 #: Whole rounds of the fit, of which someone who ends it early keeps the last.
 _ROUNDS = 5
+#: Centres and rotations take longer steps than in a fit to a scene's own pictures, to which they come near in one go.
+_LONGER = 2.0
 
 
 def fit_to_photographs(
@@ -89,6 +91,11 @@ def fit_to_photographs(
         found.scene if found.kept else None, len(cameras), found.kept, len(judges), trial.errors, found.errors,
         found.ended_early,
     )  # fmt: skip
+
+
+def longer(rates: Rates) -> Rates:
+    """The rates for photographs, where these are those for pictures of a scene."""
+    return dataclasses.replace(rates, means=_LONGER * rates.means, quaternions=_LONGER * rates.quaternions)
 
 
 def times(rates: Rates, factor: float) -> Rates:

@@ -74,7 +74,6 @@ def measurement(
             rasterizer = stack.enter_context(Rasterizer(device, drawable, background=bench.background))
             yield stack.enter_context(RemovalSweep(rasterizer, views, options, progress))
             return
-        placed = bench.shared(state, seen) if dealt is None else None
         given: list[tuple[Any, ...]] = []
         if dealt is not None:
             share = Shares([], [each.numbers for each in dealt.shares], dealt.names)
@@ -82,7 +81,7 @@ def measurement(
                 excerpt = stack.enter_context(pool.shared(part.excerpt))
                 given.append((excerpt, views, options, bench.background, part.numbers, part.sights))
         else:
-            sent = stack.enter_context(pool.shared(placed))
+            sent = stack.enter_context(bench.shared(pool, state, seen))
             sights = sights if pool.in_process else None
             given = [(sent, views, options, bench.background, numbers, sights) for numbers in share.others]
         others = stack.enter_context(
@@ -91,8 +90,7 @@ def measurement(
         own: RemovalSweep | ViewByView | None = None
         stride = splats
         if share.own:
-            assert placed is not None, "who sends others excerpts does no views"
-            drawable = stack.enter_context(lying_on(device, placed))
+            drawable = stack.enter_context(lying_on(device, bench.placed(state, seen)))
             if sights is not None and can_go_by_view(drawable, device, options):
                 own = ViewByView(
                     device, drawable, views, sights, options, bench.background, progress, numbers=share.own

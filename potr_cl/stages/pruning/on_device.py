@@ -157,18 +157,21 @@ class _Controller(Owner):
     ) -> Course:
         """In which order splats went, and those that are left would go; what is known of each iteration.
 
-        One iteration after the other: what all of a large scene's splats need at once is as large as the scene.
+        In place, one iteration after the other: what all of a large scene's splats need at once is as large as the
+        scene.
         """
-        order = np.empty(len(iteration), np.int64)
+        # Small integers are put in order by counting; those that are left come last.
+        small = np.uint16 if done < 1 << 16 else np.uint32
+        order = np.argsort(np.where(iteration < 0, done, iteration).astype(small), kind="stable")
+        ends = np.cumsum(np.bincount(iteration[iteration >= 0], minlength=done)[:done])
         history = []
         gone = 0
-        for number in range(done):
-            own = np.flatnonzero(iteration == number)
-            if not len(own):
+        for end in ends.tolist():
+            if gone == end:
                 continue
-            own = own[ascending(removed["key"][own])]
-            order[gone : gone + len(own)] = own
-            gone += len(own)
+            own = order[gone:end]
+            own[:] = own[ascending(removed["key"][own])]
+            gone = end
             importance, effect = (removed[name][own].astype(np.float64) for name in ("importance", "effect"))
             weight, harm = (float(np.add.reduceat(values, [0])[0]) for values in (importance, effect))
             history.append(Iteration(self._splats - gone, weight, harm, float(effect.max())))

@@ -20,6 +20,7 @@ from potr_cl.raster.kept_scene import KeptScene, PartOfKept, lying_on, whole_on_
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.view_shares import Excerpt
 from potr_cl.stages.pruning.alive_packing import AlivePacking
+from potr_cl.stages.pruning.changed_totals import ChangedTotals, Changes, changes_on_host
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.survivors import Bits
 from potr_cl.stages.pruning.sweep_options import SweepOptions
@@ -81,6 +82,7 @@ class RemovalPart(Part):
                 if steering is None
                 else owned.enter_context(AlivePacking(device, self._sweep.splats, steering.marks))
             )
+            self._changed: ChangedTotals | None = None
             self._staging = owned.enter_context(Staging(device))
             self._totals = owned.enter_context(Scratch(device, "the removal effects"))
             self._owned = owned.pop_all()
@@ -120,14 +122,33 @@ class RemovalPart(Part):
             (n,) uint32 numbers of splats, and (n, 2) int64 by how much their totals have changed.
         """
         totals = self.measure().copy()
-        if self._sent is None:
-            self._sent = np.zeros_like(totals)
+        sent = self._before()
         # Column by column, and whole rows taken: five times as fast as "any" and indexing.
-        other = (totals[:, 0] != self._sent[:, 0]) | (totals[:, 1] != self._sent[:, 1])
+        other = (totals[:, 0] != sent[:, 0]) | (totals[:, 1] != sent[:, 1])
         changed = np.flatnonzero(other & self._sweep.alive)
-        changes = totals.take(changed, axis=0) - self._sent.take(changed, axis=0)
+        changes = totals.take(changed, axis=0) - sent.take(changed, axis=0)
         self._sent = totals
         return changed.astype(np.uint32), changes
+
+    def changes(self) -> Changes:
+        """The same as bits and a row (:mod:`potr_cl.stages.pruning.changed_totals`), for a master whose device adds up.
+
+        Valid until the next call. Of :meth:`measure_changes` and this, a master asks for one and the same all the time.
+        """
+        steering = self._sweep.steering
+        if steering is None:  # some views do not fit this device
+            totals = self.measure().copy()
+            found = changes_on_host(totals, self._before(), self._sweep.alive)
+            self._sent = totals
+            return found
+        if self._changed is None:
+            self._changed = self._owned.enter_context(ChangedTotals(self._device, self._sweep.splats, steering.marks))
+        steering.measure_on_device()
+        return self._changed.take(steering.totals)
+
+    def _before(self) -> NDArray[np.int64]:
+        """(N, 2) the totals that the master has."""
+        return np.zeros((self._sweep.splats, 2), np.int64) if self._sent is None else self._sent
 
     def lend_totals(self) -> Lent:
         """The totals of :meth:`measure`, for others of this process to read from the device until the next command.

@@ -22,6 +22,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner, Scratch
 from potr_cl.opencl.relay import Lent, Relay
 from potr_cl.stages.pruning.alive_packing import AlivePacking
+from potr_cl.stages.pruning.changed_totals import AddedChanges
 from potr_cl.stages.pruning.fixed_point import FixedPoint, zero_totals
 from potr_cl.stages.pruning.removal import F64, Indices, RemovalSweep
 from potr_cl.stages.pruning.steering import Steered, Steering
@@ -72,8 +73,7 @@ class SharedRemoval(Owner):
         self._numbers = numbers
         assert numbers is None or pool.sparse
         self._fixed_point = FixedPoint.of_views(cameras)
-        #: What the others have found; of removed splats anything.
-        self._found = np.zeros((splats, 2), np.int64)
+        self._found: NDArray[np.int64] | None = None
         self._alive = np.ones(splats, bool)
         self.steering: Steered | None = None
         with ExitStack() as owned:
@@ -154,6 +154,8 @@ class SharedRemoval(Owner):
     def found_by_others(self, pending: Pending) -> NDArray[np.int64]:
         """(N, 2) int64, what they found; valid until the next call."""
         if self._sparse:
+            if self._found is None:  # what the others have found; of removed splats anything
+                self._found = np.zeros((self.splats, 2), np.int64)
             for part, (splats, changes) in enumerate(pending.results()):
                 self._found[splats if self._numbers is None else self._numbers_of(part)[splats]] += changes
             return self._found
@@ -180,6 +182,8 @@ class _SharedSteering(Owner):
         self._memory = Memory(device)
         self._marks: Survivors | None = None
         self._relay = Relay(device) if shared._in_process else None
+        self._added: AddedChanges | None = None
+        self._numbers: dict[int, tuple[int, cl.Buffer]] = {}
         with device.all_or_nothing():
             self.totals: cl.Buffer = self._memory.upload(zero_totals(stride), "the removal effects")
             self._more = Scratch(device, "the removal effects")
@@ -190,6 +194,12 @@ class _SharedSteering(Owner):
                 self.marks = own.marks
             self._add = device.kernel("prune/add_totals.cl", "add_totals")
             self._alive = None if self._relay is None else AlivePacking(device, self.splats, self.marks)
+            if shared._sparse:
+                assert own is None, "changes are added to the totals, which therefore are those of the others alone"
+                self._added = AddedChanges(device)
+                for origin, numbers in enumerate(shared._numbers or ()):
+                    own = self._memory.upload(numbers.astype(np.uint32), "the splats of workers")
+                    self._numbers[origin] = len(numbers), own
 
     @property
     def alive(self) -> NDArray[np.bool_]:
@@ -199,15 +209,20 @@ class _SharedSteering(Owner):
 
     def measure_on_device(self) -> None:
         shared = self._shared
-        pending = shared.begin_measuring() if self._relay is None else shared._others.begin("lend_totals")
+        how = "lend_totals" if self._relay is not None else "changes" if self._added is not None else "measure"
+        pending = shared._others.begin(how)
         if self._own is not None:
             self._own.measure_on_device()
-        if self._relay is None:
+        if self._relay is not None:
+            self._fetch(pending.results())
+        elif self._added is not None:
+            for place, changes in enumerate(pending.results()):
+                splats, numbers = self._numbers.get(shared._others.origin(place), (self.splats, None))
+                self._added.add(self.totals, changes, splats, numbers)
+        else:
             found = shared.found_by_others(pending)
             with self.device.errors("failed while computing"):
                 cl.enqueue_copy(self.device.queue, self.totals, found, is_blocking=True)
-        else:
-            self._fetch(pending.results())
         if self._own is not None:
             self._add_to_totals(self._own.totals)
 
@@ -251,5 +266,7 @@ class _SharedSteering(Owner):
             self._relay.close()
         if self._alive is not None:
             self._alive.close()
+        if self._added is not None:
+            self._added.close()
         self._more.close()
         self._memory.close()

@@ -104,17 +104,19 @@ def without_directions(state: State, unseen: NDArray[np.bool_]) -> State:
         unseen: (n,) which of its scene's splats these are.
     """
     sh = state.scene.sh
-    sh[unseen, 1:] = 0
+    sh[np.flatnonzero(unseen), 1:] = 0
     return state.recoloured(sh)
 
 
-def as_of_whole(seen: NDArray[np.int64], unseen: NDArray[np.int64], pruned: Pruned) -> Pruned:
+def as_of_whole(seen: NDArray[np.int64], hidden: NDArray[np.bool_], pruned: Pruned) -> Pruned:
     """What pruning did to the splats that views see, as what it did to all: the others were kept, nobody misses them.
 
     Args:
-        seen, unseen: their numbers, ascending.
+        seen: (n,) their numbers, ascending.
+        hidden: (N,) which are the others.
         pruned: what was done to those that are seen.
     """
+    unseen = np.flatnonzero(hidden)
     removed = len(seen) - pruned.kept
     iteration_of = np.full(len(unseen) + len(seen), -1, np.int32)
     iteration_of[seen] = pruned.iteration_of

@@ -18,13 +18,12 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.host.threads import Run
-from potr_cl.model import splat_groups
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.model.splat_groups import SplatGroups
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
-from potr_cl.raster.culling import Sights, ViewPart, work
+from potr_cl.raster.culling import Sights, ViewPart, part_seen, work
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
 from potr_cl.raster.scene_buffers import SPLAT_GROUP, Drawable, SceneBuffers
@@ -38,9 +37,8 @@ from potr_cl.stages.pruning.sweep_options import SweepOptions, default_memory
 LEAST_SPLATS = 1 << 21
 #: Parts must save this much of the splats that views project, for their own copies and for what each part costs.
 WORTH_IT = 0.5
-#: Few of the splats, one in so many, and so many views tell whether it may be worth it. The boxes of few splats are
-#: smaller, so views seem to see a little less than they do.
-_SAMPLED, _VIEWS, LIKELY = 64, 48, WORTH_IT
+#: The part that views seem to see, told from few splats, up to which it may be worth it.
+LIKELY = WORTH_IT
 #: The parts' scenes stay on the device if they take no more than this part of the memory.
 SCENES = 1 / 2
 #: Bytes that a view takes for each splat of its part while it is measured, or prepared to be kept: room for one is set
@@ -57,10 +55,7 @@ def seen_part(scene: Scene, cameras: Sequence[Camera]) -> float:
     """Which part of a scene a view may draw on the average, told from few of both; 1 for a small scene."""
     if len(scene) < LEAST_SPLATS or not cameras:
         return 1.0
-    few = scene.subset(np.arange(0, len(scene), _SAMPLED))
-    groups = SplatGroups.of(few, max(splat_groups.LARGEST // _SAMPLED, 1))
-    some = [cameras[number] for number in range(0, len(cameras), -(-len(cameras) // _VIEWS))]
-    return float((groups.visible_by(some, INRIA.near) @ groups.counts).mean() / len(few))
+    return part_seen(scene, cameras, INRIA.near)
 
 
 def groups_of_large(scene: Scene, run: Run = map) -> SplatGroups | None:

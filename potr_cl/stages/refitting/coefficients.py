@@ -165,10 +165,13 @@ class Coefficients(VectorSpace):
             cl.enqueue_copy(device.queue, x, planar, is_blocking=True, **self._as_columns(planar))
         else:
             turn = device.shared_kernel("raster/columns.cl", "columns")
-            for first in range(0, len(sh), _TURNED):
-                rows = sh[first : first + _TURNED].reshape(-1, layout.columns)
-                with Memory(device) as memory:
-                    some = memory.upload(rows.astype(np.float32, copy=False), "the SH coefficients")
+            with Memory(device) as memory:
+                # Drivers may wait for all that a device does before they give memory back.
+                some = memory.allocate(4 * layout.columns * min(len(sh), _TURNED), "the SH coefficients")
+                for first in range(0, len(sh), _TURNED):
+                    rows = np.ascontiguousarray(sh[first : first + _TURNED], np.float32).reshape(-1, layout.columns)
+                    with device.errors("cannot hold the SH coefficients"):
+                        cl.enqueue_copy(device.queue, some, rows, is_blocking=True)
                     turn.bind(rows=some, first=first, width=layout.columns, stride=layout.stride, result=x)
                     turn.launch((len(rows),))
         self._to_ycocg.bind(columns=x, stride=layout.stride)

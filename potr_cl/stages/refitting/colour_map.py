@@ -35,11 +35,11 @@ from potr_cl.stages.refitting.gathering import Gathered, Gathering
 from potr_cl.stages.refitting.launcher import Launcher
 from potr_cl.stages.refitting.picked_views import PickedViews
 from potr_cl.stages.refitting.prepared_views import PreparedViews, SweptViews
-from potr_cl.stages.refitting.reached import reached_splats
+from potr_cl.stages.refitting.reached import Reach, reached_splats
 from potr_cl.stages.refitting.sliced_blocks import SlicedBlocks
 from potr_cl.stages.refitting.targets import TargetCache, Targets, nbytes
 from potr_cl.stages.refitting.vector_space import Vector, VectorSpace
-from potr_cl.stages.refitting.view_colours import ViewColours
+from potr_cl.stages.refitting.view_colours import Picks, ViewColours
 from potr_cl.stages.refitting.view_errors import ViewErrors
 
 #: Bytes a splat and view of a sweep's own buffers: the colours' change and the sums.
@@ -82,6 +82,7 @@ class ColourMap(Owner):
             what is free, or a quarter where that is the host's memory.
         numbers: of the views that are done here, ascending; None: all.
         helpers: do the others.
+        reach: of the views that are done here, if it is known.
 
     Attributes:
         sums: (3 M, stride) int64 in the device's memory, what the views have added to coefficients; 0 between products.
@@ -105,6 +106,7 @@ class ColourMap(Owner):
         memory: int | None = None,
         numbers: Sequence[int] | None = None,
         helpers: Helpers | None = None,
+        reach: Reach | None = None,
     ) -> None:
         if not cameras:
             raise UsageError("a re-fit needs at least one view")
@@ -121,12 +123,10 @@ class ColourMap(Owner):
         self._views_of_all = len(cameras)
         self.parts = parts_of(len(cameras))
         own_numbers = range(len(cameras)) if numbers is None else numbers
-        reached = reached_splats(rasterizer, [cameras[number] for number in own_numbers])
-        seen = dict(zip(own_numbers, reached, strict=True)) if reached else {}
+        reach = reach or reached_splats(rasterizer, cameras, own_numbers)
+        seen = {} if reach is None else {number: len(splats) for number, splats in reach.of.items()}
         # Launches, and what is gathered together, are of one part. Views of a launch have about as many splats.
-        self._numbers = sorted(
-            own_numbers, key=lambda number: (number % self.parts, -len(seen.get(number, ())), number)
-        )
+        self._numbers = sorted(own_numbers, key=lambda each: (each % self.parts, -seen.get(each, 0), each))
         of_parts = [sum(number % self.parts == part for number in own_numbers) for part in range(self.parts)]
         breaks = np.cumsum(of_parts).tolist()
         cameras = [cameras[number] for number in self._numbers]
@@ -143,9 +143,9 @@ class ColourMap(Owner):
             pictures = sum(nbytes(camera) for camera in cameras)
             own, most_views = _CHANGE + _TOTALS, launcher.most_views
             self._views: SweptViews
-            if reached:
-                some = [seen[number] for number in self._numbers]
-                self._views = PickedViews(rasterizer, cameras, some, most_views, own, memory, breaks, pictures)
+            if reach is not None:
+                splats = [reach.of[number] for number in self._numbers]
+                self._views = PickedViews(rasterizer, cameras, splats, most_views, own, memory, breaks, pictures)
             else:
                 own *= layout.stride
                 self._views = PreparedViews(rasterizer, cameras, most_views, own, memory, breaks, pictures)
@@ -163,6 +163,12 @@ class ColourMap(Owner):
             at_once = together * max((len(each) * self._views.stride(each) for each in launches), default=0)
             self._change = self._memory.allocate(_CHANGE * at_once, "the colours' change")
             self._totals = self._memory.allocate(_TOTALS * at_once, "the re-fit's sums")
+            #: Which channels of views' own splats are free: a byte a splat and view, which stays as the views may not.
+            self._free: dict[range, cl.Buffer] = {}
+            if reach is not None:
+                for each in launches:
+                    size = len(each) * self._views.stride(each)
+                    self._free[each] = self._memory.allocate(size, "the channels that are cut")
             self._slots = [
                 _Slot(*(_part(of, slot, together) for of in (self._change, self._totals))) for slot in range(together)
             ]
@@ -256,7 +262,7 @@ class ColourMap(Owner):
             for slot, numbers in zip(self._slots, group, strict=False):
                 with self._views.ready(numbers) as ready:
                     views = ready.views
-                    self._view_colours.enqueue(views, self._views.picks(numbers), x, views.colours, None)
+                    self._view_colours.enqueue(views, self._picks(numbers), x, views.colours, None)
                     pictures = self._targets.pictures(targets, numbers)
                     self._enqueue_sweep(numbers, views, views.colours, pictures, blocks is not None, slot)
                     # Which of them are cut, the gathering asks.
@@ -322,8 +328,8 @@ class ColourMap(Owner):
         for group in self._groups_of(part):
             for slot, numbers in zip(self._slots, group, strict=False):
                 with self._views.ready(numbers) as ready:
-                    views, picks = ready.views, self._views.picks(numbers)
-                    if ready.anew:  # which colours are cut is not known any more
+                    views, picks = ready.views, self._picks(numbers)
+                    if ready.anew and picks is None:  # which colours are cut is not known any more
                         at_here = self._coefficients.on_device(at, 1)
                         self._view_colours.enqueue(views, picks, at_here, views.colours, None)
                     self._view_colours.enqueue(views, picks, direction, slot.change, unit, constant)
@@ -343,6 +349,11 @@ class ColourMap(Owner):
         sums = memory.allocate(8 * triangle * splats, "the splats' normal equations")
         self._coefficients.clear(sums)
         return sums
+
+    def _picks(self, numbers: range) -> Picks | None:
+        """The splats of a launch's views, which are ready, and which of their channels are free."""
+        picks = self._views.picks(numbers)
+        return None if picks is None else Picks(picks, self._free[numbers])
 
     def _enqueue_sweep(
         self,

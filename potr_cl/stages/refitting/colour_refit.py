@@ -30,8 +30,9 @@ from potr_cl.stages.refitting.coming_scene import AnyScene, ComingScene, arrived
 from potr_cl.stages.refitting.launcher import launcher_for
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.stages.refitting.placement import blocks_of, left_for_views, placed, rounding_of, vectors_of
+from potr_cl.stages.refitting.reached import reached_splats
 from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
-from potr_cl.stages.refitting.rounding import ROUNDS
+from potr_cl.stages.refitting.rounding import ROUNDS, Steps
 from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts, colour_shares
 from potr_cl.stages.refitting.solver import ColourSolver, Descent, Selection, Solved
 from potr_cl.stages.refitting.targets import Targets
@@ -120,12 +121,16 @@ class ColourRefit(Owner):
             layout = Layout(len(scene), stride_of(len(scene)), scene.sh.shape[1], launcher.lanes)
             # The vectors come first: prepared views can do with less memory, and only take longer then.
             place = placed(device, layout.splats, layout.sh_count, memory, slices) if others is None else None
-            if place is not None:
-                memory = place.views
-            elif others is None:
+            if place is None and others is None:
                 memory = left_for_views(layout.splats, layout.sh_count, memory)
-            if place is not None:  # the host has no room for vectors beside what rounds the geometry
-                scene = arrived(scene)
+            reach = None
+            if place is not None:
+                scene = arrived(scene)  # the host has no room for vectors beside what rounds the geometry
+                rasterizer = owned.enter_context(Rasterizer(device, colourless(scene), rules))
+                reach = reached_splats(rasterizer, cameras, range(len(cameras)))
+                if reach is not None:
+                    place = placed(device, layout.splats, layout.sh_count, memory, slices, reach) or place
+                memory = place.views
             self.coefficients = owned.enter_context(vectors_of(device, layout, place))
             blocks = blocks_of(self.coefficients, place)
             owned.callback(blocks.close)
@@ -140,12 +145,14 @@ class ColourRefit(Owner):
                 in_process = help_from.pool.in_process
                 helpers = owned.enter_context(SharedViews(self.coefficients, others, in_process))
             here = arrived(scene)
-            rasterizer = owned.enter_context(Rasterizer(device, colourless(here), rules))
+            if place is None:
+                rasterizer = owned.enter_context(Rasterizer(device, colourless(here), rules))
             self.colour_map = owned.enter_context(
                 ColourMap(
-                    launcher, rasterizer, self.coefficients, here.means, cameras, background, memory, own, helpers
+                    launcher, rasterizer, self.coefficients, here.means, cameras, background, memory, own, helpers,
+                    reach,
                 )
-            )
+            )  # fmt: skip
             if others is not None:
                 owned.callback(others.begin_to_close)
             self._unrounded: Vector | None = None
@@ -242,13 +249,17 @@ class ColourRefit(Owner):
         """(N, M, 3) float32 R, G, B, the solution."""
         return self.coefficients.read_sh(self._solver.x)
 
-    def round_to(self, grid: ColourGrid, targets: Targets, options: RefitOptions) -> Solved:
+    def steps_of(self, grid: ColourGrid) -> Steps:
+        """A grid as :meth:`round_to` takes it. Another thread may ask for it."""
+        return Steps.of(grid, self.coefficients.layout.stride)
+
+    def round_to(self, steps_of_splats: Steps, targets: Targets, options: RefitOptions) -> Solved:
         """Make of the solution what a file can hold, but for the last constant coefficients.
 
         :meth:`error` still knows what it was.
 
         Args:
-            grid: what the file can hold.
+            steps_of_splats: what the file can hold.
             targets, options: that the solution was found with.
 
         Returns:
@@ -263,7 +274,7 @@ class ColourRefit(Owner):
         self.coefficients.copy(self._unrounded, solver.x)
         ridge = Ridge(options.lam, options.chroma_factor, options.prior)
         worth = _WORTH * options.drop * self.colour_map.total_weight
-        with rounding_of(self.coefficients, solver.blocks, grid) as round_some:
+        with rounding_of(self.coefficients, solver.blocks, steps_of_splats) as round_some:
             *first, last = ROUNDS
             for each in first:
                 round_some(solver.x, each, worth)

@@ -57,4 +57,4 @@ def arrived(scene: AnyScene) -> Scene:
 
 def colourless(scene: Scene) -> Scene:
     """The same splats in black: a re-fit's rasterizer is never asked for colours."""
-    return replace(scene, sh=np.zeros((len(scene), 1, 3), np.float32))
+    return replace(scene, sh=np.broadcast_to(np.float32(0), (len(scene), 1, 3)))

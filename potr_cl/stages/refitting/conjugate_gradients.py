@@ -57,7 +57,7 @@ class ConjugateGradients:
 
     def __init__(self, vectors: Vectors) -> None:
         self._vectors = vectors
-        self.direction, self.product, self.preconditioned = (vectors.vector(rank) for rank in (0, 1, 3))
+        self.direction, self.product, self.preconditioned = (vectors.vector(rank) for rank in (0, 1, 4))
 
     def descend(
         self,

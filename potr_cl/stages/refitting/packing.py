@@ -56,7 +56,8 @@ class Packing(Owner):
         self._packed = Scratch(device, "the packed coefficients")
         # What comes from others has a place of its own: it arrives while the device still computes.
         self._arrived = Scratch(device, "the packed coefficients")
-        self._free: cl.Event | None = None  # when that place is looked at no more
+        # When that place is looked at no more; None: what comes next waits for everything.
+        self._free: cl.Event | None = None
 
     def take_flags(self) -> None:
         """Pack by the flags as they are on the device from now on."""
@@ -107,7 +108,7 @@ class Packing(Owner):
         """Set a vector; coefficients that are not active become 0."""
         self._take(packed, 4)
         self._launch("unpack_floats", x, self._arrived)
-        self._free = done_so_far(self._coefficients.device)
+        self._looked_at(packed)
 
     def sums(self, columns: cl.Buffer) -> NDArray[np.int64]:
         """(count,) int64, sums over views of active coefficients; valid until something else is packed.
@@ -129,13 +130,14 @@ class Packing(Owner):
         """Add to sums over views."""
         self._take(packed, 8)
         self._launch("add_sums", columns, self._arrived)
-        self._free = done_so_far(self._coefficients.device)
+        self._looked_at(packed)
 
     def add_rows(self, sums: cl.Buffer, row: int, more: NDArray[np.int64]) -> None:
         """Add whole rows, (rows, stride) int64, to sums from a row on."""
         self._make_room(more.nbytes)
         self._copy_to(self._arrived, more)
         self._add_arrived(sums, row * more.shape[1], more.size)
+        self._looked_at(more)
 
     def add_lent(self, sums: cl.Buffer, more: Lent) -> None:
         """Add all of a device's sums, as many int64 as there are here, some at a time."""
@@ -144,12 +146,12 @@ class Packing(Owner):
             self._make_room(nbytes)
             self._relay.fetch(self._arrived.buffer, more, start, nbytes, self._free)
             self._add_arrived(sums, start // 8, nbytes // 8)
+            self._looked_at(more)
 
     def _add_arrived(self, sums: cl.Buffer, start: int, count: int) -> None:
         kernel = self._kernels["add_rows"]
         kernel.bind(sums=sums, start=start, more=self._arrived.buffer, count=count)
         kernel.launch((-(-count // _GROUP) * _GROUP,), (_GROUP,))
-        self._free = done_so_far(self._coefficients.device)
 
     def fetch(self, x: cl.Buffer, lent: Lent) -> None:
         """Take a whole vector from another device, which lays it out in the same way."""
@@ -168,7 +170,13 @@ class Packing(Owner):
     def _make_room(self, nbytes: int) -> None:
         """For what arrives."""
         if self._arrived.reserve(nbytes):
-            self._free = done_so_far(self._coefficients.device)
+            self._free = None
+
+    def _looked_at(self, packed: NDArray[np.generic] | Lent) -> None:
+        """The device looks no more at what has arrived, once it has done what it has been given by now."""
+        # What the host copies waits for the device anyway. And a marker costs: with one in the queue, Intel's CPU
+        # runtime leaves the thread idle that waits for a result, instead of computing on it.
+        self._free = done_so_far(self._coefficients.device) if isinstance(packed, Lent) else None
 
     def _copy_to(self, scratch: Scratch, array: NDArray[np.generic]) -> None:
         if array.nbytes:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 
 import numpy as np
 import pyopencl as cl
@@ -55,14 +56,16 @@ class PickedViews(Owner):
     ) -> None:
         self._rasterizer, self._cameras, self._reached = rasterizer, list(cameras), list(reached)
         device = rasterizer.device
-        self._memory, self._preparing = Memory(device), PreparingMemory(device)
+        self._preparing = PreparingMemory(device)
         self._passing = Reused(device)
         self.budget = ViewCache(rasterizer, budget_of(device, memory), others)
-        self._picked: dict[range, Rasterizer] = {}
-        self._numbers: dict[range, cl.Buffer] = {}
-        self._kept: dict[range, ViewSet] = {}
+        self.launches: list[range] = []
+        self._kept: dict[range, _Kept] = {}
+        #: What the last views that are not kept have picked.
+        self._passed: tuple[range, cl.Buffer] | None = None
         try:
-            most_splats = self.budget.room // (LEAST_SETS * (GEOMETRY + nbytes))
+            # The largest view has its room in any case.
+            most_splats = max(self.budget.room // (LEAST_SETS * (GEOMETRY + nbytes)), *map(_padded, self._reached), 0)
             to_do = self._dealt(most_views, most_splats, breaks)
             self.budget.largest = max((self.stride(numbers) * len(numbers) for numbers in to_do), default=0)
             while to_do:
@@ -77,8 +80,6 @@ class PickedViews(Owner):
         except BaseException:
             self.close()
             raise
-        self.launches = list(self._picked)
-        self._reached = [numbers[:0] for numbers in self._reached]  # they lie on the device
 
     def _dealt(self, most_views: int, most_splats: float, breaks: Sequence[int]) -> list[range]:
         launches: list[range] = []
@@ -92,58 +93,77 @@ class PickedViews(Owner):
 
     def stride(self, numbers: range) -> int:
         """Room for the splats of each view of a launch."""
-        picked = self._picked.get(numbers)
-        return max(map(_padded, self._reached[numbers.start : numbers.stop])) if picked is None else picked.stride
+        return _padded(self._reached[numbers.start])
 
     def picks(self, numbers: range) -> cl.Buffer:
-        """(views, stride) uint32, the numbers of the splats of each view of a launch."""
-        return self._numbers[numbers]
+        """(views, stride) uint32, the numbers of the splats of each view of a launch that is ready, or was last."""
+        if numbers in self._kept:
+            return self._kept[numbers].picks
+        assert self._passed is not None
+        assert self._passed[0] == numbers, "only valid while its views are"
+        return self._passed[1]
 
     def _prepare(self, numbers: range) -> None:
-        device, stride = self._rasterizer.device, self.stride(numbers)
+        with ExitStack() as stack:
+            memory = stack.enter_context(Memory(self._rasterizer.device))
+            rasterizer, picks = self._picked(numbers, memory)
+            stack.enter_context(rasterizer)
+            views = rasterizer.prepare_set([self._cameras[number] for number in numbers])
+            stack.enter_context(views)
+            if self.budget.keep(views, picks.size):
+                self._kept[numbers] = _Kept(views, rasterizer, picks, stack.pop_all())
+        self.launches.append(numbers)
+
+    def _picked(self, numbers: range, memory: Memory) -> tuple[Rasterizer, cl.Buffer]:
+        """What prepares a launch's views, and the numbers of their splats, which the memory owns."""
+        stride = self.stride(numbers)
         padded = np.full((len(numbers), stride), NO_SPLAT, np.uint32)
         for row, number in zip(padded, numbers, strict=True):
             row[: len(self._reached[number])] = self._reached[number]
-        picks = self._memory.upload(padded, "the numbers of views' splats")
-        try:
-            scene = PickedSplats(self._rasterizer.parameters, picks, stride, apart=stride)
-            rasterizer = Rasterizer(device, scene, self._rasterizer.rules, preparing=self._preparing)
-            views = rasterizer.prepare_set([self._cameras[number] for number in numbers])
-        except BaseException:
-            self._memory.free(picks)
-            raise
-        self._picked[numbers], self._numbers[numbers] = rasterizer, picks
-        self.budget.room -= picks.size
-        if self.budget.keep(views):
-            self._kept[numbers] = views
-        else:
-            views.close()
+        picks = memory.upload(padded, "the numbers of views' splats")
+        scene = PickedSplats(self._rasterizer.parameters, picks, stride, apart=stride)
+        return Rasterizer(self._rasterizer.device, scene, self._rasterizer.rules, preparing=self._preparing), picks
 
     @contextmanager
     def ready(self, numbers: range) -> Iterator[Ready]:
         """See :meth:`potr_cl.stages.refitting.prepared_views.PreparedViews.ready`."""
-        views, rasterizer = self._kept.get(numbers), self._picked[numbers]
-        if views is not None:
-            with self.budget.geometry(views, rasterizer) as projected:
-                yield Ready(views, projected)
+        kept = self._kept.get(numbers)
+        if kept is not None:
+            with self.budget.geometry(kept.views, kept.rasterizer) as projected:
+                yield Ready(kept.views, projected)
             return
         try:
-            cameras = [self._cameras[number] for number in numbers]
-            yield Ready(rasterizer.prepare_set(cameras, self._passing), True)
+            rasterizer, picks = self._picked(numbers, self._passing)
+            self._passed = numbers, picks
+            yield Ready(rasterizer.prepare_set([self._cameras[number] for number in numbers], self._passing), True)
         finally:
-            self._passing.close()
+            self._passing.close()  # what lies there stays until the next views come
 
     def close(self) -> None:
         """Give all device memory back."""
-        for views in self._kept.values():
-            views.close()
-        for rasterizer in self._picked.values():
-            rasterizer.close()
-        self._kept, self._picked, self._numbers = {}, {}, {}
+        for kept in self._kept.values():
+            kept.owned.close()
+        self._kept, self._passed = {}, None
         self._passing.give_back()
         self._preparing.close()
         self.budget.close()
-        self._memory.close()
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """The views of a launch that stay prepared.
+
+    Attributes:
+        views: the views.
+        rasterizer: has prepared them.
+        picks: (views, stride) uint32, the numbers of their splats.
+        owned: all of these.
+    """
+
+    views: ViewSet
+    rasterizer: Rasterizer
+    picks: cl.Buffer
+    owned: ExitStack
 
 
 def _padded(numbers: NDArray[np.uint32]) -> int:

@@ -13,10 +13,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from potr_cl.opencl.device import Device
-from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.coefficients import Coefficients
-from potr_cl.stages.refitting.rounding import Round, Rounding, SlicedRounding
+from potr_cl.stages.refitting.reached import Reach
+from potr_cl.stages.refitting.rounding import Round, Rounding, SlicedRounding, Steps
 from potr_cl.stages.refitting.sliced_blocks import SlicedBlocks
 from potr_cl.stages.refitting.sliced_coefficients import SlicedCoefficients
 from potr_cl.stages.refitting.vector_space import Layout, Vector, VectorSpace
@@ -29,7 +29,7 @@ _FEWEST, _MOST = 1, 6
 #: to prepare views that it leaves no room for; and of the host's, where a CPU computes: there it is the other way.
 _OF_VECTORS, _OF_HOST = 0.8, 0.5
 #: What a sweep has besides for each splat: geometry, the splats of a view as they are projected, and its sums.
-_SWEEP = 68 + 32 + 16 + 16 + 32 + 8
+_SWEEP = 68 + 32 + 16 + 16 + 32 + 8 + 8
 #: The vectors lie on the device if they take no more than this part of what is free, or of the memory that is given.
 _OF_FREE, _OF_GIVEN = 0.75, 0.5
 #: Of less nobody needs to be careful.
@@ -39,6 +39,11 @@ _SLICE, _BLOCKS = 1 / 32, 1 / 5
 _LEAST_SLICE, _MOST_SLICE = 1 << 14, 1 << 18
 #: For the blocks, all views are looked at so many times at most.
 _MOST_RANGES = 8
+#: Where views have splats of their own: what lies on the device of each splat; what those take of which a launch has as
+#: many as a view at most; and, of the memory, what is left for views in any case.
+_LYING, _LAUNCHED, _LEAST_VIEWS = 76, 160, 1 / 20
+#: With the coefficients on the device too, which have this rank, no other place is needed to look at views with them.
+_COEFFICIENTS = 3
 
 
 @dataclass(frozen=True)
@@ -58,7 +63,14 @@ class Place:
     resident: int = _FEWEST
 
 
-def placed(device: Device, splats: int, sh_count: int, memory: int | None, slices: int | None = None) -> Place | None:
+def placed(
+    device: Device,
+    splats: int,
+    sh_count: int,
+    memory: int | None,
+    slices: int | None = None,
+    reach: Reach | None = None,
+) -> Place | None:
     """How a re-fit has its vectors on the host; None: they lie on the device.
 
     Args:
@@ -67,6 +79,7 @@ def placed(device: Device, splats: int, sh_count: int, memory: int | None, slice
         sh_count: M, coefficients of a channel.
         memory: bytes of the device's memory that the user would have taken; None: as much as there is.
         slices: splats of a slice, if the vectors are to lie on the host in any case.
+        reach: of the views, if each has splats of its own.
     """
     vector, triangle = 12 * sh_count, sh_count * (sh_count + 1) // 2
     one_piece = _one_piece(splats, sh_count)
@@ -77,9 +90,20 @@ def placed(device: Device, splats: int, sh_count: int, memory: int | None, slice
     total = free if memory is None else min(memory, free)
     of_slice = 2 * vector + 4 * triangle + 8
     some = slices or min(max(int(_SLICE * total / of_slice), _LEAST_SLICE), _MOST_SLICE)
-    blocks = slices or max(int(_BLOCKS * total / (8 * triangle)), -(-splats // _MOST_RANGES))
+    # To look at views with splats of their own once more is cheap.
+    of_blocks = _BLOCKS if reach is None else _BLOCKS / 2
+    blocks = slices or max(int(of_blocks * total / (8 * triangle)), -(-splats // _MOST_RANGES))
     # A place for a vector that views are looked at with, the sums, and some vectors.
     of_host = device.info.kind == "cpu" or device.info.integrated
+    if slices is None and reach is not None:
+        own = splats * (2 * vector + _LYING) + _LAUNCHED * reach.most + reach.total
+        left = total - own - some * of_slice - 8 * triangle * min(blocks, splats)
+        share = _OF_HOST * total - own if of_host else left - _LEAST_VIEWS * total
+        resident = min(int(max(share, 0) / max(splats * vector, 1)), _MOST)
+        others = 0
+        if resident <= _COEFFICIENTS:
+            resident, others = max(resident - 1, _FEWEST), 1
+        return Place(some, blocks, max(int(left - (resident + others) * splats * vector), 0), resident)
     room = int(((_OF_HOST if of_host else _OF_VECTORS) * total / max(splats, 1) - _SWEEP) / vector) - 3
     besides = splats * (3 * vector + _SWEEP) + some * of_slice + 8 * triangle * min(blocks, splats)
     # Of few splats a slice, which has so many at least, takes more than its share.
@@ -128,9 +152,9 @@ def blocks_of(vectors: VectorSpace, place: Place | None) -> SplatBlocks | Sliced
 
 @contextmanager
 def rounding_of(
-    vectors: VectorSpace, blocks: SplatBlocks | SlicedBlocks, grid: ColourGrid
+    vectors: VectorSpace, blocks: SplatBlocks | SlicedBlocks, steps: Steps
 ) -> Iterator[Callable[[Vector, Round, float], None]]:
-    """The rounding of vectors where they lie, to the steps of a grid, as long as the context lasts.
+    """The rounding of vectors where they lie, to the splats' steps, as long as the context lasts.
 
     Yields:
         What rounds: called with a vector, what of it is due, and the squared error that it is worth to save an AC
@@ -140,11 +164,11 @@ def rounding_of(
         DeviceError: the device has no room, or the kernels cannot be built.
     """
     if isinstance(vectors, SlicedCoefficients) and isinstance(blocks, SlicedBlocks):
-        in_slices, its_blocks = SlicedRounding(vectors, grid), blocks
+        in_slices, its_blocks = SlicedRounding(vectors, steps), blocks
         yield lambda x, this, worth: in_slices.round(x, its_blocks, this, worth)
         return
     assert isinstance(vectors, Coefficients)
     assert isinstance(blocks, SplatBlocks)
     on_device = blocks
-    with Rounding(vectors, grid) as rounding:
+    with Rounding(vectors, steps) as rounding:
         yield lambda x, this, worth: rounding.round(x, on_device, this, worth)

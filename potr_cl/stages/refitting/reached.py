@@ -7,7 +7,8 @@ not there, since geometry and opacities stay as they are in a re-fit (cl/refit/r
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import pyopencl as cl
@@ -29,20 +30,42 @@ _SAMPLED = 12
 _GROUP = 128
 
 
-def reached_splats(rasterizer: Rasterizer, cameras: Sequence[Camera]) -> list[NDArray[np.uint32]] | None:
-    """The numbers of the splats that each view reaches, ascending.
+@dataclass(frozen=True)
+class Reach:
+    """What views reach.
+
+    Attributes:
+        of: (n,) uint32 for each view by its number, the numbers of the splats that it reaches, ascending.
+    """
+
+    of: Mapping[int, NDArray[np.uint32]]
+
+    @property
+    def total(self) -> int:
+        """Splats that all views reach, each view's counted for itself."""
+        return sum(map(len, self.of.values()))
+
+    @property
+    def most(self) -> int:
+        """Splats that the view reaches that reaches most."""
+        return max(map(len, self.of.values()))
+
+
+def reached_splats(rasterizer: Rasterizer, cameras: Sequence[Camera], numbers: Sequence[int]) -> Reach | None:
+    """The splats that each of some views reaches.
 
     Args:
-        rasterizer: of the scene, on a GPU.
-        cameras: the views.
+        rasterizer: of the scene.
+        cameras: all views.
+        numbers: of those that are meant.
 
     Returns:
-        None where views had better share all splats: there are few, or views reach many of them.
+        None where views had better share all splats: there are few, or views reach many of them, or it is no GPU.
 
     Raises:
         DeviceError: a view with all splats does not fit the device.
     """
-    if rasterizer.device.family != "gpu" or rasterizer.splats < LEAST_SPLATS or not cameras:
+    if rasterizer.device.family != "gpu" or rasterizer.splats < LEAST_SPLATS or not numbers:
         return None
     found: dict[int, NDArray[np.uint32]] = {}
     device = rasterizer.device
@@ -50,15 +73,15 @@ def reached_splats(rasterizer: Rasterizer, cameras: Sequence[Camera]) -> list[ND
     try:
         with Memory(device) as memory, Picker(device, np.zeros(rasterizer.splats, np.uint32)) as picker:
             marks = memory.allocate(rasterizer.stride, "the splats that a view reaches")
-            some = range(0, len(cameras), -(-len(cameras) // _SAMPLED))
-            for number in (*some, *sorted(set(range(len(cameras))) - set(some))):
+            some = numbers[:: -(-len(numbers) // _SAMPLED)]
+            for number in (*some, *sorted(set(numbers) - set(some))):
                 if len(found) == len(some) and not _worth_it(found, rasterizer.splats):
                     return None
                 found[number] = _reached(rasterizer, cameras[number], picker, marks, passing)
     finally:
         passing.give_back()
         rasterizer.rest()
-    return [found[number] for number in range(len(cameras))] if _worth_it(found, rasterizer.splats) else None
+    return Reach(found) if _worth_it(found, rasterizer.splats) else None
 
 
 def _worth_it(found: dict[int, NDArray[np.uint32]], splats: int) -> bool:

@@ -28,6 +28,7 @@ from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.stages.refitting.colour_refit import ColourRefit, HelpFrom
 from potr_cl.stages.refitting.coming_scene import AnyScene
 from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
+from potr_cl.stages.refitting.rounding import Steps
 from potr_cl.stages.refitting.solver import Solved
 from potr_cl.stages.refitting.targets import Targets
 
@@ -134,14 +135,17 @@ class _OnGrid:
     targets: Targets
     options: RefitOptions
     colour_grid: Callable[[FloatArray], ColourGrid]
-    _grid: Future[ColourGrid] | None = None
+    _steps: Future[Steps] | None = None
 
     def begin(self) -> None:
-        self._grid = in_background(self.colour_grid, self.refit.worth_of_constants())
+        def find(effects: FloatArray) -> Steps:
+            return self.refit.steps_of(self.colour_grid(effects))
+
+        self._steps = in_background(find, self.refit.worth_of_constants())
 
     def finish(self, solved: Solved) -> tuple[Refitted, float]:
-        assert self._grid is not None
-        rounded = self.refit.round_to(self._grid.result(), self.targets, self.options)
+        assert self._steps is not None
+        rounded = self.refit.round_to(self._steps.result(), self.targets, self.options)
         result = Refitted(self.refit.colours(), (solved.errors[0], rounded.errors[1]), solved.steps + rounded.steps)
         return result, rounded.errors[0]
 

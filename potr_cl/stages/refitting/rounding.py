@@ -91,19 +91,18 @@ class Rounding(Owner):
 
     Args:
         coefficients: whose vectors are rounded.
-        grid: the steps.
+        steps: of the splats.
 
     Raises:
         DeviceError: the device has no room, or the kernels cannot be built.
     """
 
-    def __init__(self, coefficients: Coefficients, grid: ColourGrid | Steps) -> None:
+    def __init__(self, coefficients: Coefficients, steps: Steps) -> None:
         self._coefficients = coefficients
         device, layout = coefficients.device, coefficients.layout
         self._round_ac, self._round_constant = (
             device.shared_kernel(_SOURCE, name, **layout.macros) for name in ("round_ac", "round_constant")
         )
-        steps = grid if isinstance(grid, Steps) else Steps.of(grid, layout.stride)
         self._memory = Memory(device)
         try:
             self._turns = self._memory.upload(steps.turns, "the turns of splats")
@@ -151,12 +150,11 @@ class SlicedRounding:
 
     Args:
         coefficients: whose vectors are rounded.
-        grid: the steps.
+        steps: of the splats.
     """
 
-    def __init__(self, coefficients: SlicedCoefficients, grid: ColourGrid) -> None:
-        self._coefficients = coefficients
-        self._steps = Steps.of(grid, coefficients.layout.stride)
+    def __init__(self, coefficients: SlicedCoefficients, steps: Steps) -> None:
+        self._coefficients, self._steps = coefficients, steps
 
     def round(self, x: AnyVector, blocks: SlicedBlocks, this: Round, worth: float) -> None:
         """See :meth:`Rounding.round`."""

@@ -85,7 +85,9 @@ class SharedViews(Owner):
                 errors |= found.errors
                 found = found.sums
             self._packing.add_sums(sums, found)
-        if blocks is not None:
+        if blocks is not None and not self._in_process:
+            self._add_blocks(blocks, None)
+        elif blocks is not None:
             for place, found in enumerate(results):
                 if found.blocks is not None and found.blocks.nbytes == blocks.size:
                     self._packing.add_lent(blocks, found.blocks)
@@ -93,19 +95,23 @@ class SharedViews(Owner):
                     self._add_blocks(blocks, place)
         return errors
 
-    def _add_blocks(self, blocks: cl.Buffer, place: int) -> None:
-        """Some rows at a time: all of them take more memory than anything else."""
+    def _add_blocks(self, blocks: cl.Buffer, place: int | None) -> None:
+        """Add those of one part, or of all: some rows at a time, as all of them take more memory than anything else."""
         layout = self._coefficients.layout
         all_rows = layout.sh_count * (layout.sh_count + 1) // 2
         rows = max(_AT_ONCE // (8 * layout.stride), 1)
         for first in range(0, all_rows, rows):
             count = min(rows, all_rows - first)
-            more = self._others.ask(place, "block_rows", first, count)
-            if more.shape[1] != layout.stride:  # another device pads otherwise
-                padded = np.zeros((count, layout.stride), np.int64)
-                padded[:, : layout.splats] = more[:, : layout.splats]
-                more = padded
-            self._packing.add_rows(blocks, first, more)
+            if place is None:
+                found = self._others.begin("block_rows", first, count, logged=False).results()
+            else:
+                found = [self._others.ask(place, "block_rows", first, count)]
+            for more in found:
+                if more.shape[1] != layout.stride:  # another device pads otherwise
+                    padded = np.zeros((count, layout.stride), np.int64)
+                    padded[:, : layout.splats] = more[:, : layout.splats]
+                    more = padded
+                self._packing.add_rows(blocks, first, more)
 
     def close(self) -> None:
         """Give the master's device memory back; the parts are the caller's."""

@@ -80,13 +80,13 @@ class SlicedCoefficients(VectorSpace):
         #: Values of a piece of a vector; the sums of a dot product go on after a multiple of their items.
         self._piece = -(-self._splats * layout.columns // DOT_ITEMS) * DOT_ITEMS
         self._resident = resident
-        self._words = np.zeros((2, layout.stride), np.uint32)
         self._memory = Memory(device)
         self.ferry = Ferry(device)
         self._operands: list[cl.Buffer | None] = [None] * _OPERANDS
         self._held: list[tuple[HostColumns, int] | None] = [None] * _OPERANDS
         with device.all_or_nothing():
             self.own = Coefficients(device, Layout(self._splats, self._splats, layout.sh_count, layout.lanes))
+            self._active = self._memory.allocate(8 * layout.stride, "the coefficients that may change")
             self._slices = [self._memory.allocate(4 * self._piece, "the SH coefficients") for _ in range(_SLICES)]
         self.activate(None)
 
@@ -243,14 +243,12 @@ class SlicedCoefficients(VectorSpace):
             self._on_device_rectangle(x, part, buffer, to_slice=False)
 
     def give_flags(self, part: range) -> None:
-        """The flags of a slice's splats to the device."""
-        words = np.zeros((2, self._splats), np.uint32)
-        words[:, : len(part)] = self._words[:, part.start : part.stop]
-        self.own.restore_flags(words)
+        """Have the flags of a slice's splats be those of :attr:`own`."""
+        self._on_device_rectangle(self._active, part, self.own.active, to_slice=True, columns=2)
 
     def take_flags(self, part: range) -> None:
-        """The flags of a slice's splats from the device."""
-        self._words[:, part.start : part.stop] = self.own.save_flags()[:, : len(part)]
+        """Take the flags of a slice's splats from :attr:`own`."""
+        self._on_device_rectangle(self._active, part, self.own.active, to_slice=False, columns=2)
 
     def each(self, x: AnyVector, work: Callable[[range, cl.Buffer], None]) -> None:
         """Have work done on the slices of a vector and on their flags.
@@ -297,8 +295,10 @@ class SlicedCoefficients(VectorSpace):
         else:
             self.ferry.to_host(cargo, buffer, pitch=4 * self._splats)
 
-    def _on_device_rectangle(self, x: cl.Buffer, part: range, buffer: cl.Buffer, to_slice: bool) -> None:
-        """The same between a vector on the device and a slice."""
+    def _on_device_rectangle(
+        self, x: cl.Buffer, part: range, buffer: cl.Buffer, to_slice: bool, columns: int | None = None
+    ) -> None:
+        """The same between a vector on the device and a slice; or of so many columns."""
         whole, some = ((4 * part.start, 0, 0), (4 * self.layout.stride, 0)), ((0, 0, 0), (4 * self._splats, 0))
         source, target = (whole, some) if to_slice else (some, whole)
         with self.device.errors("failed while computing"):
@@ -307,7 +307,7 @@ class SlicedCoefficients(VectorSpace):
                 *((buffer, x) if to_slice else (x, buffer)),
                 src_origin=source[0],
                 dst_origin=target[0],
-                region=(4 * len(part), self.layout.columns, 1),
+                region=(4 * len(part), columns or self.layout.columns, 1),
                 src_pitches=source[1],
                 dst_pitches=target[1],
             )
@@ -316,11 +316,13 @@ class SlicedCoefficients(VectorSpace):
 
     def save_flags(self) -> NDArray[np.uint32]:
         """See :meth:`VectorSpace.save_flags`."""
-        return self._words.copy()
+        words: NDArray[np.uint32] = self.device.download(self._active, (2, self.layout.stride), np.uint32)
+        return words
 
     def restore_flags(self, words: NDArray[np.uint32]) -> None:
         """See :meth:`VectorSpace.restore_flags`."""
-        self._words[:] = words
+        with self.device.errors("failed while computing"):
+            cl.enqueue_copy(self.device.queue, self._active, words, is_blocking=True)
 
     def close(self) -> None:
         """Give all device memory back; the vectors' files go with the vectors."""

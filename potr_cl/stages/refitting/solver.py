@@ -140,7 +140,7 @@ class ColourSolver:
     def __init__(self, coefficients: VectorSpace, blocks: SplatBlocks | SlicedBlocks) -> None:
         self._coefficients = coefficients
         # Conjugate gradients have the ranks between.
-        self.x, self._start, self._residual = (coefficients.vector(rank) for rank in (4, 5, 2))
+        self.x, self._start, self._residual = (coefficients.vector(rank) for rank in (3, 5, 2))
         self._gradients = ConjugateGradients(coefficients)
         self.blocks = blocks
 

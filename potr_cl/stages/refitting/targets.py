@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Protocol
 
 import numpy as np
@@ -76,13 +77,20 @@ class RememberedTargets(Owner):
         largest = max(map(nbytes, cameras))
         # On a GPU several at a time are rendered faster.
         together = 1 if device.family == "cpu" else min(max(_TOGETHER // largest, 1), len(cameras))
-        with Memory(device) as memory:
-            buffer = memory.allocate(together * largest, "the target images")
+        with Memory(device) as memory, ThreadPoolExecutor(1) as thread:
+            # One thread takes pictures to the host while the next ones are rendered.
+            buffers = [memory.allocate(together * largest, "the target images") for _ in range(2)]
+            taken: Future[None] | None = None
             for first in range(0, len(cameras), together):
                 numbers = range(first, min(first + together, len(cameras)))
-                targets.into(numbers, buffer)
+                targets.into(numbers, buffers[0])
                 own = self._pictures[self._ends[numbers.start] : self._ends[numbers.stop]]
-                self._ferry.to_host([Cargo(own)], buffer)
+                if taken is not None:
+                    taken.result()
+                taken = thread.submit(self._ferry.to_host, [Cargo(own)], buffers[0])
+                buffers.reverse()
+            if taken is not None:
+                taken.result()
 
     def into(self, numbers: Sequence[int], buffer: cl.Buffer) -> None:
         """See :meth:`Targets.into`."""

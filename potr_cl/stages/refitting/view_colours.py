@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pyopencl as cl
 
@@ -11,6 +13,19 @@ from potr_cl.stages.refitting.vector_space import Layout
 
 #: Views that a work-item does one after the other, the coefficients in its registers.
 _TOGETHER = 8
+
+
+@dataclass(frozen=True)
+class Picks:
+    """Views' own splats.
+
+    Attributes:
+        numbers: (views, stride) uint32, their numbers.
+        free: (views, stride) uint8, which channels were not cut when the views' colours were made.
+    """
+
+    numbers: cl.Buffer
+    free: cl.Buffer
 
 
 class ViewColours:
@@ -28,7 +43,7 @@ class ViewColours:
     def enqueue(
         self,
         views: ViewSet,
-        picks: cl.Buffer | None,
+        picks: Picks | None,
         x: cl.Buffer,
         result: cl.Buffer,
         unit: float | None,
@@ -37,8 +52,8 @@ class ViewColours:
         """Enqueue the views' colours, or what ``unit`` times a direction adds to them where none is cut at 0.
 
         Args:
-            views: with their colours at the coefficients, if a direction is looked along.
-            picks: (views, stride) uint32, the numbers of the views' splats; None: they have all.
+            views: with their colours at the coefficients, if a direction is looked along and they have all splats.
+            picks: the views' own splats; None: they have all.
             x: (3 M, stride of the layout) float32, the coefficients or the direction.
             result: (views, stride, 4) float32.
             unit: of the direction; None: x are coefficients.
@@ -52,12 +67,13 @@ class ViewColours:
             means=self._means,
             stride=self._layout.stride,
             apart=views.stride,
-            numbers=views.table if picks is None else picks,
+            numbers=views.table if picks is None else picks.numbers,
             views=views.table,
             view_count=len(views.views),
             direction=unit is not None,
             unit=np.float32(1.0 if unit is None else unit),
             free=views.colours,
+            free_picks=views.table if picks is None else picks.free,
             colours=result,
         )
         together = _TOGETHER if picks is None else 1

@@ -1,0 +1,47 @@
+"""Who builds which program at a time: :func:`building`."""
+
+from __future__ import annotations
+
+import threading
+import warnings
+from collections import defaultdict
+from collections.abc import Hashable, Iterator
+from contextlib import contextmanager
+
+_turns = threading.Lock()
+#: Held by who builds or loads a program, by the program; of all programs of CPUs there is one.
+_locks: defaultdict[Hashable, threading.Lock] = defaultdict(threading.Lock)
+_silences: list[warnings.catch_warnings[None]] = []
+_builders = 0
+
+
+@contextmanager
+def building(program: Hashable, alone: bool) -> Iterator[None]:
+    """Build or load a program, while nobody else does the same one; others are built at the same time.
+
+    Of several devices of a kind the second one then finds what the first one has built. Warnings are not shown
+    meanwhile: some drivers chat unasked, and a full disk stops no build.
+
+    Args:
+        program: what names it.
+        alone: whether no other program may be built at a time: the compilers of CPUs have threads of their own, and
+            not all of them may be called by several.
+    """
+    global _builders
+    with _turns:
+        lock = _locks[None if alone else program]
+    with lock:
+        with _turns:
+            # Python has one list of filters for all threads: the first of them changes it, the last puts it back.
+            _builders += 1
+            if _builders == 1:
+                _silences.append(silence := warnings.catch_warnings())
+                silence.__enter__()
+                warnings.simplefilter("ignore")
+        try:
+            yield
+        finally:
+            with _turns:
+                _builders -= 1
+                if _builders == 0:
+                    _silences.pop().__exit__(None, None, None)

@@ -1,0 +1,142 @@
+"""How close the pictures of two scenes are, view by view: :class:`Against` finds the figures on a device."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from potr_cl.formats.images import Colour
+from potr_cl.host.threads import thread_pool
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import FloatArray
+from potr_cl.opencl.device import Device
+from potr_cl.quality.metrics import Lpips
+from potr_cl.quality.metrics_device import Similarity, in_batches
+from potr_cl.quality.photographs import read_photograph
+from potr_cl.quality.pictures import Picture, place_pictures
+
+#: Photographs read before they are needed.
+_READ_AHEAD = 32
+
+#: Makes pictures of a scene from some views, on a device as long as the context lasts.
+Pictures = Callable[[Sequence[Camera]], AbstractContextManager[list[Picture]]]
+
+
+class Against:
+    """Finds the figures of pictures that lie on one device.
+
+    Args:
+        device: that they lie on.
+        background: behind photographs with alpha.
+        ground_truth, lpips: as of :func:`potr_cl.quality.compare.compare`.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        background: Colour = (0.0, 0.0, 0.0),
+        ground_truth: Mapping[str, Path] | None = None,
+        lpips: Lpips | None = None,
+    ) -> None:
+        self._device, self._background = device, background
+        self._ground_truth, self._lpips = ground_truth, lpips
+        self._similarity = Similarity(device)
+
+    def figures(self, a: Pictures, b: Pictures, cameras: Sequence[Camera]) -> Iterator[ViewFigures]:
+        """The figures of some views, in their order.
+
+        Args:
+            a, b: make the pictures of the reference and of the candidate.
+            cameras: the views.
+
+        Raises:
+            UsageError, DataError, DeviceError: as of :func:`potr_cl.quality.compare.compare`.
+        """
+        truth = self._ground_truth
+        photographs = [] if truth is None else [(truth[camera.name], camera) for camera in cameras]
+        with thread_pool() as pool:
+            read = _ground_truth(pool, photographs, self._background)
+            for some in in_batches(self._device, cameras):
+                with a(some) as of_a, b(some) as of_b:
+                    yield from self._compared(some, of_a, of_b, None if truth is None else read)
+
+    def _compared(
+        self,
+        some: Sequence[Camera],
+        of_a: list[Picture],
+        of_b: list[Picture],
+        read: Iterator[FloatArray] | None,
+    ) -> Iterator[ViewFigures]:
+        found = [self._pairs(of_b, of_a)]
+        names = ["b_against_a"]
+        if read is not None:
+            device = self._device
+            buffer = device.upload(np.concatenate([next(read).reshape(-1) for _ in some]), "the photographs")
+            try:
+                truths = place_pictures(buffer, some)
+                found += [self._pairs(of, truths) for of in (of_a, of_b)]
+            finally:
+                device.free(buffer)
+            found.append([_loss(*losses) for losses in zip(*found[1:], strict=True)])
+            names += ["a_against_truth", "b_against_truth", "loss"]
+        for camera, of_view in zip(some, zip(*found, strict=True), strict=True):
+            yield ViewFigures(camera.name, dict(zip(names, of_view, strict=True)))
+
+    def _pairs(self, pictures: list[Picture], references: list[Picture]) -> list[Figures]:
+        pairs, lpips = list(zip(pictures, references, strict=True)), self._lpips
+        distances = [lpips(*(each.download(self._device) for each in pair)) if lpips else None for pair in pairs]
+        return [Figures(*found, distance) for found, distance in zip(self._similarity(pairs), distances, strict=True)]
+
+
+@dataclass(frozen=True)
+class Figures:
+    """How close two pictures are; ``psnr`` is infinite for identical ones, ``lpips`` None where it was not computed."""
+
+    psnr: float
+    ssim: float
+    lpips: float | None
+
+
+@dataclass(frozen=True)
+class ViewFigures:
+    """The figures of one view, or their means.
+
+    Attributes:
+        name: of the view.
+        figures: by what was compared: "b_against_a" always; with photographs also "a_against_truth",
+            "b_against_truth" and "loss", what B loses to A against the photograph (A's PSNR and SSIM minus B's,
+            B's LPIPS minus A's: positive where B is worse).
+    """
+
+    name: str
+    figures: dict[str, Figures]
+
+    @property
+    def identical(self) -> bool:
+        """Whether A's and B's pictures are the same in every pixel."""
+        return math.isinf(self.figures["b_against_a"].psnr)
+
+
+def _ground_truth(
+    pool: ThreadPoolExecutor, photographs: Sequence[tuple[Path, Camera]], background: Colour
+) -> Iterator[FloatArray]:
+    """The photographs in order, some read ahead."""
+    pending: deque[Future[FloatArray]] = deque()
+    for path, camera in photographs:
+        pending.append(pool.submit(read_photograph, path, camera, background))
+        if len(pending) > _READ_AHEAD:
+            yield pending.popleft().result()
+    while pending:
+        yield pending.popleft().result()
+
+
+def _loss(a: Figures, b: Figures) -> Figures:
+    lpips = b.lpips - a.lpips if a.lpips is not None and b.lpips is not None else None
+    return Figures(0.0 if a.psnr == b.psnr else a.psnr - b.psnr, a.ssim - b.ssim, lpips)

@@ -1,0 +1,266 @@
+"""Judging by one device or several: :class:`SharedJudging` deals the views out. The figures are the same."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
+from functools import partial
+from types import TracebackType
+from typing import Any, TypeVar
+
+from potr_cl.errors import DeviceError
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.model.splat_groups import SplatGroups
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Owner
+from potr_cl.quality.figures import ViewFigures
+from potr_cl.quality.ground_truth import GroundTruth
+from potr_cl.quality.judging import Judging, JudgingPart, Looks
+from potr_cl.raster.carried import Carried, HostScene, LentScene
+from potr_cl.raster.kept_scene import KeptScene
+from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
+from potr_cl.raster.seen_rasterizer import groups_worth_it
+from potr_cl.workers.dealing import shares
+from potr_cl.workers.parts import Each, Parts
+from potr_cl.workers.pool import Pool
+
+#: A larger uncompressed scene is not sent to another computer to be judged there: its pictures take less time here.
+_SENT_ANYWAY = 1 << 28
+#: How often several devices meet while they judge, so that one can tell how far they are; and views that a GPU renders
+#: from one time to the next at least.
+_MEETINGS, _LEAST_GPU = 16, 4
+
+_log = logging.getLogger("potr_cl")
+
+T = TypeVar("T")
+
+
+class SharedJudging(Owner):
+    """Compares candidates with one uncompressed scene.
+
+    Args:
+        device: of this process, the pool's first.
+        reference: the uncompressed scene.
+        views: all views that may be judged.
+        looks: how pictures are made.
+        pool: workers that views are shared out to; None: the device does all.
+        anyway: whether other computers are sent the uncompressed scene, however large.
+        coded: the uncompressed scene for other computers, where there is something smaller.
+
+    Raises:
+        DeviceError: the kernels cannot be built.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        reference: Drawable | KeptScene,
+        views: Sequence[Camera],
+        looks: Looks,
+        pool: Pool | None = None,
+        anyway: bool = False,
+        coded: Carried | None = None,
+    ) -> None:
+        self._device, self._reference, self._views, self._looks = device, reference, list(views), looks
+        self._pool = pool if pool is not None and pool.first is device else None
+        self._anyway, self._coded = anyway, coded
+        self._groups: SplatGroups | None = None
+        here: Drawable
+        if isinstance(reference, KeptScene):
+            here = reference.drawable(device, reference.scene)
+            there = isinstance(here, SceneBuffers)
+            # What is not kept there takes too much of what the user allows.
+            self._groups = groups_worth_it(
+                device, reference.scene, views, looks.rules.near, there, not there, reference.groups
+            )
+        else:
+            here = reference
+            if isinstance(here, Scene):
+                self._groups = groups_worth_it(device, here, views, looks.rules.near)
+        self._own = Judging(device, here, looks, self._groups)
+        self._parts: Parts | None = None
+        self._places: dict[str, int] = {}  # who has a view, by its name; the others are this device's
+        self._left = ExitStack()
+
+    def figures(
+        self,
+        candidate: Drawable,
+        views: Sequence[Camera],
+        coded: Carried | None = None,
+        progress: Callable[[int], None] = lambda done: None,
+    ) -> list[ViewFigures]:
+        """The figures of a candidate from some views, in their order.
+
+        Args:
+            candidate: to judge; where it is on a device, that is this one.
+            views: among those that this object was made for.
+            coded: the same for other computers: what it was coded as is smaller. None: there is nothing smaller.
+            progress: called with the number of views that are done.
+
+        Raises:
+            UsageError, DataError: a photograph cannot be read.
+            DeviceError: a view does not fit the device.
+        """
+        return self._of_views("figures", candidate, views, coded, progress)
+
+    def by_photographs(
+        self, candidate: Drawable, views: Sequence[Camera], photographs: GroundTruth
+    ) -> list[tuple[float, float]]:
+        """See :meth:`potr_cl.quality.judging.Judging.by_photographs`; other computers have no photographs."""
+        return self._of_views("by_photographs", candidate, views, None, lambda done: None, photographs)
+
+    def pictures(self, candidate: Drawable, cameras: Sequence[Camera]) -> list[tuple[FloatArray, FloatArray]]:
+        """(H, W, 3) float32 pictures of both scenes from some views."""
+        with ExitStack() as stack:
+            self._take(stack, candidate)
+            return [self._own.pictures(camera) for camera in cameras]
+
+    def _take(self, stack: ExitStack, candidate: Drawable) -> None:
+        self._own.take(candidate)
+        stack.callback(self._own.forget)
+
+    def _of_views(
+        self,
+        command: str,
+        candidate: Drawable,
+        views: Sequence[Camera],
+        coded: Carried | None,
+        progress: Callable[[int], None],
+        *args: Any,
+    ) -> list[Any]:
+        found: dict[str, Any] = {}
+
+        def note(cameras: Sequence[Camera], results: Iterable[Any]) -> None:
+            for camera, result in zip(cameras, results, strict=True):
+                found[camera.name] = result
+                progress(len(found))
+
+        with ExitStack() as stack:
+            sent = self._for_others(candidate, coded)
+            if sent is not None and self._open_parts() is not None:
+                self._shared_out(stack, command, candidate, sent, views, args, note)
+            else:
+                self._take(stack, candidate)
+            # All of them, if nobody helps; or what those who are lost have left.
+            left = [camera for camera in views if camera.name not in found]
+            note(left, getattr(self._own, command)(left, *args))
+        return [found[camera.name] for camera in views]
+
+    def _shared_out(
+        self,
+        stack: ExitStack,
+        command: str,
+        candidate: Drawable,
+        sent: Carried,
+        views: Sequence[Camera],
+        args: Sequence[Any],
+        note: Callable[[Sequence[Camera], Iterable[Any]], None],
+    ) -> None:
+        """Do the views together; if all others are lost, some are left."""
+        parts = self._parts
+        assert parts is not None
+        dealt: list[list[Camera]] = [[] for _ in range(len(parts) + 1)]
+        for camera in views:
+            dealt[self._places.get(camera.name, -1)].append(camera)
+        *theirs, mine = dealt
+        least = _LEAST_GPU if self._device.family == "gpu" else 1
+        most = max(map(len, dealt))
+        some = max(least, -(-most // _MEETINGS))
+        try:
+            _asked(partial(parts.begin, "take", sent, anew=True))
+            self._take(stack, candidate)
+            for first in range(0, most, some):
+                now = [each[first : first + some] for each in theirs]
+                pending = _asked(partial(parts.begin, command, Each(now), *args, logged=False))
+                own = mine[first : first + some]
+                note(own, getattr(self._own, command)(own, *args))
+                for cameras, results in zip(now, _asked(pending.results), strict=True):
+                    note(cameras, results)
+            _asked(partial(parts.begin, "forget", anew=True)).results()
+        except _NobodyElse as lost:
+            self._lose_parts(lost.error)
+
+    def _for_others(self, candidate: Drawable, coded: Carried | None) -> Carried | None:
+        """What other devices are given of a candidate; None: nothing that they could use."""
+        if self._pool is None:
+            return None
+        if self._pool.in_process:
+            return LentScene(candidate) if isinstance(candidate, SceneBuffers) else HostScene(candidate)
+        if coded is not None or isinstance(candidate, SceneBuffers):
+            return coded
+        return HostScene(candidate, travels=True)
+
+    def _open_parts(self) -> Parts | None:
+        """The others' parts; None: they are not worth it, or lost."""
+        pool = self._pool
+        if pool is None or self._parts is not None:
+            return self._parts
+        shared = self._shared(pool)
+        if shared is None:
+            self._pool = None
+            return None
+        try:
+            dealt = shares(pool, len(self._views))
+            thing = self._left.enter_context(pool.shared(shared))
+            given = [(thing, self._looks, self._groups)] * len(dealt.others)
+            if given:
+                self._parts = self._left.enter_context(Parts(pool, JudgingPart, given))
+        except DeviceError as error:
+            self._lose_parts(error)
+            return None
+        for place, numbers in enumerate(dealt.others):
+            self._places |= {self._views[number].name: place for number in numbers}
+        return self._parts
+
+    def _shared(self, pool: Pool) -> Scene | KeptScene | Carried | None:
+        """What other devices are given of the uncompressed scene; None: they had better do without."""
+        reference = self._reference
+        if pool.in_process:
+            return LentScene(reference) if isinstance(reference, SceneBuffers) else reference
+        if self._looks.lpips is not None or self._looks.ground_truth is not None:
+            return None  # they are read, or computed, here
+        if self._coded is not None:
+            return self._coded
+        scene = reference.scene if isinstance(reference, KeptScene) else reference
+        if isinstance(scene, SceneBuffers):
+            return None
+        there = pool.has(scene) or scene.nbytes <= _SENT_ANYWAY
+        return scene if there or self._anyway else None
+
+    def _lose_parts(self, error: DeviceError) -> None:
+        _log.warning("nobody else can judge (%s): %s does", error, self._device.info)
+        self._parts, self._pool, self._places = None, None, {}
+        self._left.close()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._parts = None
+        self._own.close()
+        self._left.__exit__(kind, error, trace)  # after Ctrl-C nobody is waited for
+
+    def close(self) -> None:
+        """Give all device memory back, here and elsewhere."""
+        self.__exit__(None, None, None)
+
+
+class _NobodyElse(Exception):
+    """All others are lost."""
+
+    def __init__(self, error: DeviceError) -> None:
+        super().__init__(str(error))
+        self.error = error
+
+
+def _asked(call: Callable[[], T]) -> T:
+    """What the others answer.
+
+    Raises:
+        _NobodyElse: none of them can.
+    """
+    try:
+        return call()
+    except DeviceError as error:
+        raise _NobodyElse(error) from None

@@ -1,0 +1,228 @@
+"""Pictures of a large scene, each drawn from the splats that its view may show: :class:`SeenRasterizer`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+
+from potr_cl.host.threads import thread_pool
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.model.splat_groups import SplatGroups
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Memory, Owner, Reused
+from potr_cl.raster.culling import part_seen
+from potr_cl.raster.kept_scene import fits_whole, whole_on_device
+from potr_cl.raster.picked_splats import PickedSplats, Picker, Picks
+from potr_cl.raster.preparing_memory import PreparingMemory
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import INRIA, RasterRules
+from potr_cl.raster.scene_buffers import Drawable, SceneBuffers, gathered
+
+#: Smaller scenes are projected whole before their groups are found, and so are scenes of which a view sees more.
+_LEAST_SPLATS, _MOST_SEEN = 1 << 21, 1 / 2
+#: To find the groups takes about as long as a GPU takes to project the whole scene into so many views.
+_VIEWS = 48
+#: On a CPU a view's splats are not gathered faster than all are projected, but they take less memory: they are where a
+#: scene takes more than this part of it.
+_PART = 1 / 20
+
+
+class SeenRasterizer(Owner):
+    """Renders what :class:`~potr_cl.raster.rasterizer.Rasterizer` renders, of a scene of which no view sees much.
+
+    The pictures are the same bits: what is left out is drawn nowhere. Views take turns in the same memory. On a GPU
+    that has the scene, or has room for it, a view's splats are drawn from where they are. Elsewhere they are gathered
+    for each view, so that the device never holds a whole scene of the host.
+
+    Args:
+        device: to render on.
+        scene: the scene; it must outlive this object.
+        groups: of its splats.
+        rules: of the rasterizer to follow.
+        background: R, G, B behind the scene.
+
+    Attributes:
+        device, rules, background: as given.
+
+    Raises:
+        DeviceError: the device has no room for the numbers of the splats' groups.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        scene: Drawable,
+        groups: SplatGroups,
+        rules: RasterRules = INRIA,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        self.device, self.rules, self.background = device, rules, background
+        self._groups = groups
+        with ExitStack() as owned:
+            self._scene = scene = owned.enter_context(whole_on_device(device, scene))
+            self._preparing = owned.enter_context(PreparingMemory(device))
+            self._passing = Reused(device)
+            owned.callback(self._passing.give_back)
+            self._picker: Picker | None = None
+            if isinstance(scene, SceneBuffers) and device.family == "gpu":
+                self._picker = owned.enter_context(Picker(device, groups.group_of))
+                # Drawn where a view sees nothing: it is not in the picture either.
+                self._any = owned.enter_context(Memory(device)).upload(np.zeros(1, np.uint32), "the number of a splat")
+            self._owned = owned.pop_all()
+
+    def picks(self, memory: Memory, seen: NDArray[np.bool_]) -> Picks:
+        """The splats of several views on a device that has the scene, for :meth:`draw`.
+
+        Args:
+            memory: as of :class:`~potr_cl.raster.picked_splats.Picks`.
+            seen: (views, G) the groups that each may show.
+        """
+        assert self._picker is not None, "only of scenes that lie on a GPU"
+        return Picks(memory, self._picker, seen)
+
+    def draw(self, picks: Picks, number: int, camera: Camera, target: cl.Buffer, start: int) -> None:
+        """Render a view of these into a buffer, from a byte on, without waiting for it.
+
+        Args:
+            picks: the views' splats.
+            number: of the view among them.
+            camera: the view.
+            target, start: as of :meth:`render_into`.
+        """
+        with self._picked(picks, number) as rasterizer:
+            rasterizer.render_into([camera], target, start, self._passing)
+
+    @contextmanager
+    def _picked(self, picks: Picks, number: int) -> Iterator[Rasterizer]:
+        assert isinstance(self._scene, SceneBuffers)
+        try:
+            splats = picks.counts[number]
+            numbers = picks.numbers(self._passing, number) if splats else self._any
+            with self._rasterizer(PickedSplats(self._scene, numbers, max(splats, 1))) as rasterizer:
+                yield rasterizer
+        finally:
+            self._passing.close()
+
+    @contextmanager
+    def _gathered(self, seen: NDArray[np.bool_]) -> Iterator[Rasterizer]:
+        """A rasterizer of the splats of some groups, which are brought together."""
+        splats = self._groups.splats(seen)
+        if not len(splats):
+            splats = np.zeros(1, np.int64)
+        with ExitStack() as stack:
+            if isinstance(self._scene, SceneBuffers):
+                own: Drawable = stack.enter_context(gathered(self._scene, splats))
+            else:
+                own = self._scene.subset(splats)
+            yield stack.enter_context(self._rasterizer(own))
+
+    def _rasterizer(self, scene: Drawable) -> Rasterizer:
+        return Rasterizer(self.device, scene, self.rules, self.background, self._preparing)
+
+    def render_into(self, cameras: Sequence[Camera], target: cl.Buffer, start: int = 0) -> None:
+        """Render views one behind the other into a buffer.
+
+        Args:
+            cameras: of the views.
+            target: takes (pixels, 3) float32.
+            start: byte where they begin.
+
+        Raises:
+            DeviceError: a view does not fit the device, or the device failed.
+        """
+        seen = self._groups.visible_by(cameras, self.rules.near)
+        with Memory(self.device) as memory:
+            picks = None if self._picker is None else self.picks(memory, seen)
+            for number, camera in enumerate(cameras):
+                if picks is not None:
+                    self.draw(picks, number, camera, target, start)
+                else:
+                    with self._gathered(seen[number]) as rasterizer:
+                        rasterizer.render_into([camera], target, start)
+                start += 12 * camera.width * camera.height
+            with self.device.errors("failed while rendering"):
+                self.device.queue.finish()
+
+    def render(self, camera: Camera) -> tuple[FloatArray, FloatArray]:
+        """See :meth:`potr_cl.raster.rasterizer.Rasterizer.render`."""
+        seen = self._groups.visible(camera, self.rules.near)
+        with ExitStack() as stack:
+            if self._picker is None:
+                rasterizer = stack.enter_context(self._gathered(seen))
+            else:
+                memory = stack.enter_context(Memory(self.device))
+                rasterizer = stack.enter_context(self._picked(self.picks(memory, seen[None]), 0))
+            return rasterizer.render(camera)
+
+    def close(self) -> None:
+        """Give all device memory back."""
+        self._owned.close()
+
+
+def rasterizer_for(
+    device: Device,
+    scene: Drawable,
+    cameras: Sequence[Camera],
+    rules: RasterRules = INRIA,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Rasterizer | SeenRasterizer:
+    """What renders pictures of a scene from these views quickest; arguments and errors of :func:`rasterizer_of`."""
+    groups = groups_worth_it(device, scene, cameras, rules.near) if isinstance(scene, Scene) else None
+    return rasterizer_of(device, scene, rules, background, groups)
+
+
+def rasterizer_of(
+    device: Device,
+    scene: Drawable,
+    rules: RasterRules = INRIA,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    groups: SplatGroups | None = None,
+) -> Rasterizer | SeenRasterizer:
+    """What renders pictures of a scene quickest: all of it for each view, or what the view may show.
+
+    Args:
+        device, scene, rules, background: as of :class:`~potr_cl.raster.rasterizer.Rasterizer`.
+        groups: of the scene's splats, where views see little of it (:func:`groups_worth_it`).
+
+    Raises:
+        DeviceError: the scene does not fit the device.
+    """
+    if groups is None:
+        return Rasterizer(device, scene, rules, background)
+    return SeenRasterizer(device, scene, groups, rules, background)
+
+
+def groups_worth_it(
+    device: Device,
+    scene: Scene,
+    cameras: Sequence[Camera],
+    near: float = INRIA.near,
+    there: bool = False,
+    large: bool = False,
+    known: SplatGroups | None = None,
+) -> SplatGroups | None:
+    """The groups of a scene's splats, where it pays to render each view with what it may show; else None.
+
+    Args:
+        device: that renders.
+        scene: clean.
+        cameras: the views.
+        near: as in the rasterizer's rules.
+        there: whether all of the scene is on the device already.
+        large: whether it takes too much of the device's memory, or of what a user allows, to be there.
+        known: its groups, where somebody has found that views see little of it.
+    """
+    if device.info.kind == "cpu" or device.info.integrated:
+        if there or not (large or scene.nbytes > _PART * device.info.memory):
+            return None
+    elif known is None and len(cameras) < _VIEWS and (there or fits_whole(device, scene)):
+        return None
+    if known is not None or len(scene) < _LEAST_SPLATS or part_seen(scene, cameras, near) > _MOST_SEEN:
+        return known
+    with thread_pool() as pool:
+        return SplatGroups.of(scene, run=pool.map)

@@ -1,0 +1,62 @@
+"""What has changed in a worker's totals arrives in those of the master, on its device as on the host."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+from potr_cl.opencl.memory import Memory
+from potr_cl.stages.pruning.changed_totals import AddedChanges, ChangedTotals, changes_on_host
+from potr_cl.stages.pruning.survivors import SplatState
+from tests.devices import KERNELS, open_device
+
+
+def states_of(alive):
+    return np.where(alive, SplatState.ALIVE, SplatState.REMOVED).astype(np.uint8)
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+@pytest.mark.parametrize("numbered", [False, True])
+@pytest.mark.parametrize("splats", [1, 63, 64, 1000])
+def test_changes_add_up_to_the_totals(kernels, numbered, splats):
+    """Round by round, some splats going on the way; and the host finds the same as the device."""
+    worker, master = (open_device(kernels) for _ in range(2))
+    rng = np.random.default_rng(splats)
+    numbers = np.sort(rng.permutation(2 * splats)[:splats]) if numbered else np.arange(splats)
+    alive, totals, said = np.ones(splats, bool), np.zeros((splats, 2), np.int64), np.zeros((splats, 2), np.int64)
+    with Memory(worker) as there, Memory(master) as here, AddedChanges(master) as added:
+        states = there.upload(states_of(alive), "a test")
+        sums = here.upload(np.zeros((2 * splats, 2), np.int64), "a test")
+        own = here.upload(numbers.astype(np.uint32), "a test") if numbered else None
+        with ChangedTotals(worker, splats, states) as changed:
+            for _ in range(4):
+                some = rng.random(splats) < 0.3
+                totals[some] = rng.integers(-(2**62), 2**62, (int(some.sum()), 2))
+                alive[1:] &= rng.random(splats - 1) < 0.9
+                with Memory(worker) as more:
+                    worker.queue.finish()
+                    on_device = more.upload(totals, "a test")
+                    write(worker, states, states_of(alive))
+                    masks, found = (each.copy() for each in changed.take(on_device))
+                expected = changes_on_host(totals, said, alive)
+                assert np.array_equal(masks, expected[0])
+                assert np.array_equal(found, expected[1])
+                said[alive] = totals[alive]
+                added.add(sums, (masks, found), splats, own)
+                result = master.download(sums, (2 * splats, 2), np.int64)
+                assert np.array_equal(result[numbers][alive], totals[alive])
+                assert not np.delete(result, numbers, axis=0).any()
+    assert worker.allocated == master.allocated == 0
+
+
+def write(device, buffer, array):
+    cl.enqueue_copy(device.queue, buffer, array, is_blocking=True)
+
+
+def test_changes_that_do_not_fit_their_bits_are_refused():
+    device = open_device("gpu")
+    with Memory(device) as memory, AddedChanges(device) as added:
+        sums = memory.upload(np.zeros((64, 2), np.int64), "a test")
+        with pytest.raises(ValueError, match="do not fit"):
+            added.add(sums, (np.array([7], np.uint64), np.ones((2, 2), np.int64)), 64)

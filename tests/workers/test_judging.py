@@ -1,0 +1,277 @@
+"""Judging shared out gives the figures of one device, bit for bit, whoever is lost on the way."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import potr_cl
+from potr_cl.errors import DeviceError
+from potr_cl.formats.images import write_png
+from potr_cl.model import splat_groups
+from potr_cl.model.splat_groups import SplatGroups
+from potr_cl.outputs.coded_scene import CodedScene
+from potr_cl.outputs.potr import Potr
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.quality.by_photographs import judge_by_photographs
+from potr_cl.quality.evaluator import EvaluationViews, Evaluator
+from potr_cl.quality.ground_truth import GroundTruth
+from potr_cl.quality.judging import JudgingPart
+from potr_cl.raster import culling, seen_rasterizer
+from potr_cl.raster.kept_scene import KeptScene
+from potr_cl.raster.rasterizer import Rasterizer, render
+from potr_cl.raster.scene_buffers import SceneBuffers, uploaded
+from potr_cl.raster.seen_rasterizer import SeenRasterizer, rasterizer_of
+from potr_cl.workers.host import HostPool
+from tests.cases.elsewhere import ElsewherePool
+from tests.cases.streets import street
+from tests.devices import FAMILIES, open_device
+
+OPTIONS = EncodeOptions.for_preset("best", q=0.3, prune={"iterations": 2}, refit={"steps": 1}, between=False)
+BACKGROUND = (0.1, 0.2, 0.3)
+
+
+@pytest.fixture(scope="module", params=FAMILIES)
+def family(request):
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def cameras(plush_excerpt_cameras):
+    """Eleven views, small, five of which are held out."""
+    chosen = plush_excerpt_cameras[:11]
+    factor = 80 / chosen[0].width
+    return [
+        dataclasses.replace(
+            c, width=80, height=round(c.height * factor), fx=c.fx * factor, fy=c.fy * factor, cx=40, cy=c.cy * factor,
+            split="test" if number % 2 else "train",
+        )
+        for number, c in enumerate(chosen)
+    ]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def coded(plush_excerpt):
+    """A file that has lost something."""
+    options = OPTIONS.changed(prune=False, refit=False, compact=False)
+    return CodedScene(Potr(), encode(plush_excerpt, None, options).data)
+
+
+def judged(device, scene, coded, views, pool=None):
+    with (
+        Evaluator(device, scene, views, BACKGROUND, pool, remember=False) as evaluator,
+        coded.on(device) as candidate,
+    ):
+        told = []
+        comparison, beside = evaluator.judge(candidate, lambda _, done: told.append(done), coded)
+    assert told == sorted(told)
+    assert told[-1] == 1
+    return comparison, beside
+
+
+@pytest.mark.parametrize("kind", [HostPool, ElsewherePool])
+def test_the_same_figures(plush_excerpt, cameras, coded, family, kind):
+    views = EvaluationViews.of(cameras)
+    assert len(views.views) == 5
+    assert len(views.beside) == 4
+    expected = judged(open_device(family), plush_excerpt, coded, views)
+    assert 20 < expected[1] < 90
+    devices = [open_device(family) for _ in range(3)]
+    done = {device: 0 for device in devices}
+    with kind(devices) as pool, pytest.MonkeyPatch.context() as patch:
+        figures = JudgingPart.figures
+
+        def noted(self, cameras):
+            done[self._device] += len(cameras)
+            return figures(self, cameras)
+
+        patch.setattr(JudgingPart, "figures", noted)
+        assert judged(devices[0], plush_excerpt, coded, views, pool) == expected
+        others = [done[device] for device in devices[1:]]
+        assert min(others) >= 3
+        assert sum(others) == (6 if pool.in_process else 9)
+        assert pool.traffic.sent > 0
+    assert [device.allocated for device in devices] == [0] * 3
+
+
+def test_a_scene_that_is_kept_is_not_sent_again(plush_excerpt, cameras, coded, family, monkeypatch):
+    views = EvaluationViews.of(cameras)
+    expected = judged(open_device(family), plush_excerpt, coded, views)
+    devices = [open_device(family) for _ in range(2)]
+    with HostPool(devices) as pool, KeptScene(devices[0], plush_excerpt) as kept:
+        for device in devices:
+            assert isinstance(kept.on(device), SceneBuffers)
+        monkeypatch.setattr("potr_cl.raster.rasterizer.uploaded", None)
+        assert judged(devices[0], kept, coded, views, pool) == expected
+    assert [device.allocated for device in devices] == [0] * 2
+
+
+def test_a_candidate_of_the_host_is_judged_too(plush_excerpt, cameras, coded, family):
+    """As files are whose readers make no scene on a device; and pictures are remembered from one to the next."""
+    views, worse = EvaluationViews.of(cameras), coded.output.read(coded.data)
+    device = open_device(family)
+    with Evaluator(device, plush_excerpt, views, BACKGROUND) as alone:
+        expected = alone.psnr(worse), alone.psnr(plush_excerpt), alone.psnr(worse, most=3)
+    assert expected[1] == np.inf
+    for kind in (HostPool, ElsewherePool):
+        devices = [open_device(family) for _ in range(2)]
+        with kind(devices) as pool, Evaluator(devices[0], plush_excerpt, views, BACKGROUND, pool) as together:
+            assert (together.psnr(worse), together.psnr(plush_excerpt), together.psnr(worse, most=3)) == expected
+        assert [device.allocated for device in devices] == [0] * 2
+
+
+@pytest.mark.parametrize("kind", [HostPool, ElsewherePool])
+@pytest.mark.parametrize("command", ["take", "figures"])
+@pytest.mark.parametrize("lost", ["one", "all"])
+def test_a_worker_that_is_lost(plush_excerpt, cameras, coded, family, kind, command, lost, monkeypatch, caplog):
+    views = EvaluationViews.of(cameras)
+    expected = judged(open_device(family), plush_excerpt, coded, views)
+    devices = [open_device(family) for _ in range(3)]
+    real = getattr(JudgingPart, command)
+
+    def failing(self, *args):
+        if lost == "all" or self._device is devices[1]:
+            raise DeviceError("the device failed")
+        return real(self, *args)
+
+    monkeypatch.setattr(JudgingPart, command, failing)
+    with kind(devices) as pool:
+        assert judged(devices[0], plush_excerpt, coded, views, pool) == expected
+    assert ("nobody else can judge" in caplog.text) == (lost == "all")
+    assert "its views go to" in caplog.text
+    assert [device.allocated for device in devices] == [0] * 3
+
+
+def test_a_large_scene_is_not_sent_to_be_judged(plush_excerpt, cameras, coded, monkeypatch):
+    views = EvaluationViews.of(cameras)
+    devices = [open_device("cpu") for _ in range(2)]
+    expected = judged(devices[0], plush_excerpt, coded, views)
+    monkeypatch.setattr("potr_cl.quality.shared_judging._SENT_ANYWAY", plush_excerpt.nbytes - 1)
+    with ElsewherePool(devices) as pool:
+        assert judged(devices[0], plush_excerpt, coded, views, pool) == expected
+        assert pool.scenes == pool.traffic.sent == 0
+        monkeypatch.setattr(pool, "has", lambda thing: thing is plush_excerpt)
+        assert judged(devices[0], plush_excerpt, coded, views, pool) == expected
+        assert len(coded.data) <= pool.traffic.sent < 2 * len(coded.data) + 1000
+
+
+def test_a_search_for_a_psnr_judges_together(plush_excerpt, cameras, monkeypatch):
+    options = EncodeOptions.for_preset("best", prune={"iterations": 4}, refit={"steps": 2}, between=False)
+    device = open_device("cpu")
+    alone = potr_cl.encode(plush_excerpt, cameras, options, device=device, min_psnr=32)
+    judged_by = []
+    figures = JudgingPart.figures
+    monkeypatch.setattr(
+        JudgingPart, "figures", lambda self, views: judged_by.append(self._device) or figures(self, views)
+    )
+    devices = [device, open_device("cpu")]
+    together = potr_cl.encode(plush_excerpt, cameras, options, device=devices, min_psnr=32)
+    assert together.data == alone.data
+    assert set(judged_by) == {devices[1]}
+    assert [device.allocated for device in devices] == [0] * 2
+
+
+def test_photographs_are_judged_by_together(plush_excerpt, cameras, coded, tmp_path, family):
+    for camera in cameras[1:4]:
+        with (tmp_path / f"{camera.name}.png").open("wb") as file:
+            write_png(file, np.clip(255 * render(plush_excerpt, camera)[0], 0, 255).astype(np.uint8))
+    truth = GroundTruth(tmp_path, cameras)
+    device = open_device(family)
+    with coded.on(device) as candidate:
+        expected = judge_by_photographs(truth, cameras, (plush_excerpt, candidate), device)
+    assert expected.views == [cameras[1].name, cameras[3].name]
+    assert min(expected.uncompressed) > 55 > max(expected.file)
+    devices = [open_device(family) for _ in range(2)]
+    for kind in (HostPool, ElsewherePool):
+        with kind(devices) as pool, coded.on(devices[0]) as candidate:
+            assert judge_by_photographs(truth, cameras, (plush_excerpt, candidate), devices[0], pool=pool) == expected
+    assert [device.allocated for device in devices] == [0] * 2
+
+
+@pytest.fixture
+def _small_groups(monkeypatch):
+    """Scenes count as large, and devices as small."""
+    monkeypatch.setattr(splat_groups, "LARGEST", 32)
+    monkeypatch.setattr(seen_rasterizer, "_LEAST_SPLATS", 1)
+    monkeypatch.setattr(seen_rasterizer, "_PART", 0)
+    monkeypatch.setattr(culling, "_SAMPLED", 2)
+
+
+@pytest.mark.usefixtures("_small_groups")
+def test_views_of_a_large_scene_are_judged_by_what_they_see(family, monkeypatch):
+    scene, cameras = street(5, 500, across=True)
+    cameras = [dataclasses.replace(c, split="test" if k % 2 else "train") for k, c in enumerate(cameras)]
+    coded = CodedScene(Potr(), encode(scene, None, OPTIONS.changed(prune=False, refit=False, compact=False)).data)
+    views = EvaluationViews.of(cameras)
+    with monkeypatch.context() as patch:
+        patch.setattr(seen_rasterizer, "_LEAST_SPLATS", 1 << 30)
+        expected = judged(open_device(family), scene, coded, views)
+    projected = []
+    made = Rasterizer.__init__
+
+    def noted(self, device, scene, *args):
+        projected.append(len(scene))
+        made(self, device, scene, *args)
+
+    monkeypatch.setattr(Rasterizer, "__init__", noted)
+    devices = [open_device(family) for _ in range(2)]
+    assert judged(devices[0], scene, coded, views) == expected
+    # Each view once, of the uncompressed scene; the candidate is projected whole.
+    assert len(projected) == len(views.views) + len(views.beside) + 1
+    assert np.mean(sorted(projected)[:-1]) < 0.4 * len(scene)
+    with HostPool(devices) as pool:
+        assert judged(devices[0], scene, coded, views, pool) == expected
+        with KeptScene(devices[0], scene, memory=0) as kept:
+            kept.groups = SplatGroups.of(scene)
+            monkeypatch.setattr(seen_rasterizer, "_LEAST_SPLATS", 1 << 30)
+            assert judged(devices[0], kept, coded, views, pool) == expected
+            assert devices[0].allocated == 0
+    assert [device.allocated for device in devices] == [0] * 2
+
+
+@pytest.mark.usefixtures("_small_groups")
+def test_an_encode_leaves_the_groups_that_it_has_found(family, monkeypatch):
+    monkeypatch.setattr("potr_cl.stages.pruning.visible_parts.LEAST_SPLATS", 1)
+    scene, cameras = street(5, 500, across=True)
+    device = open_device(family)
+    with KeptScene(device, scene) as kept:
+        encode(scene, cameras, dataclasses.replace(OPTIONS, cameras_anyway=True), device=device, kept=kept)
+        assert kept.groups is not None
+        assert len(kept.groups.group_of) == len(scene)
+
+
+@pytest.mark.usefixtures("_small_groups")
+@pytest.mark.parametrize("where", ["host", "device"])
+@pytest.mark.parametrize("rules", ["inria", "gsplat"])
+def test_pictures_of_what_views_see(family, where, rules):
+    """Of the host's scene and of one that lies on the device, one view and several, one of which sees nothing."""
+    scene, cameras = street(5, 500, across=True)
+    away = dataclasses.replace(cameras[0], translation=cameras[0].translation + np.array([0, 0, -500.0]))
+    device, rules = open_device(family), potr_cl.raster.rules.RULES[rules]
+    groups = SplatGroups.of(scene)
+    assert not groups.visible(away, rules.near).any()
+    drawable = uploaded(device, scene) if where == "device" else scene
+    with (
+        Rasterizer(device, scene, rules, BACKGROUND) as whole,
+        rasterizer_of(device, drawable, rules, BACKGROUND, groups) as some,
+    ):
+        assert isinstance(some, SeenRasterizer)
+        for camera in (*cameras[:4], away):
+            for wanted, got in zip(whole.render(camera), some.render(camera), strict=True):
+                assert np.array_equal(wanted, got)
+        chosen = [*cameras[3:6], away]
+        pixels = sum(3 * camera.width * camera.height for camera in chosen)
+        buffers = [device.allocate(4 * pixels, "pictures") for _ in range(2)]
+        for rasterizer, buffer in zip((whole, some), buffers, strict=True):
+            rasterizer.render_into(chosen, buffer)
+        wanted, got = (device.download(buffer, (pixels,), np.float32) for buffer in buffers)
+        assert np.array_equal(wanted, got)
+        assert wanted.std() > 0.02
+        for buffer in buffers:
+            device.free(buffer)
+    if isinstance(drawable, SceneBuffers):
+        drawable.close()
+    assert device.allocated == 0
