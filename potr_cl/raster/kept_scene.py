@@ -67,7 +67,7 @@ class KeptScene(Owner):
         return scene is self._scene
 
     def subset(self, splats: NDArray[np.int64]) -> Scene:
-        """Some of its splats, on the host."""
+        """Some of its splats, (n,) by number, on the host."""
         return self._scene.subset(splats)
 
     def drawable(self, device: Device, scene: Scene) -> Drawable:
