@@ -95,8 +95,8 @@ SENTENCES: Sequence[tuple[str, Sequence[Figure]]] = (
         ],
     ),
     (
-        "lego is at least {} and plush {} times smaller than that format's file, with preset `smallest` {} and {} "
-        "times, and with the training photographs, which one of these formats has seen too, {} and {} times",
+        "lego is at least {} and plush {} times smaller than that format's file. With preset `smallest` it is {} and "
+        "{} times. With the training photographs, which one of these formats has seen too, it is {} and {} times.",
         (
             _smaller("lego", _TUNED),
             _smaller("plush", _PLAIN),
