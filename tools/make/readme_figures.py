@@ -125,6 +125,13 @@ SENTENCES: Sequence[tuple[str, Sequence[Figure]]] = (
             )
         ],
     ),
+    (
+        "about {} bytes a splat, most of it the re-fit's, and {} bytes a splat and view",
+        [
+            Figure("memory/growth_fit", {"peak": "host"}, column)
+            for column in ("bytes a splat", "bytes a splat and view")
+        ],
+    ),
     ("`[view]` {} MB", (Figure("install/sizes", {"": "extra `view`, besides"}, "size"),)),
 )
 
