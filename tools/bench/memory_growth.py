@@ -5,7 +5,7 @@
 Scenes of any size are drawn from a trained one (tools.make.large_scene). Each encode runs in a process of its own, so
 that its peak is its own; the host's is the kernel's figure (Linux only) less what the process held before the encode,
 the device's is what was allocated at most. On CPU devices the device's memory is the host's and counts there too. The
-peaks are fitted by
+peaks, of the views that are given and none between them, are fitted by
 
     bytes = constant + a splats + b views + c splats views
 
@@ -83,7 +83,8 @@ def measure(point: Point, like: Path, size: tuple[int, int], preset: Preset, rou
         path.write_text(json.dumps(entries))
         cameras = load_cameras(path)
     device = CountingDevice(spec)
-    options = EncodeOptions.for_preset(preset, prune={"iterations": rounds}, memory=point.memory)
+    # As many views as are said: of few views, others between them would be looked at too.
+    options = EncodeOptions.for_preset(preset, between=False, prune={"iterations": rounds}, memory=point.memory)
     before = resident("VmRSS")
     reset_peak()
     encode(scene, cameras, options, device.enter, device)
