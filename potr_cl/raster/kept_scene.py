@@ -24,6 +24,8 @@ from potr_cl.raster.view_shares import Excerpt
 
 #: A scene that takes more than this part of the device's memory is not kept: others may need the room.
 _PART = 10
+#: Nor is it there for a while if it takes more than this one.
+_AWHILE = 3
 #: The whole scene is on the device too where that has so many times as much memory.
 _WHOLE = 3
 
@@ -50,14 +52,21 @@ class KeptScene(Owner):
         self.groups: SplatGroups | None = None
 
     def _placed(self, device: Device) -> SceneBuffers | None:
-        most = device.info.memory
-        if self._memory is not None and (device.info.kind == "cpu" or device.info.integrated):
-            most = min(most, self._memory)
-        if _PART * self._scene.nbytes <= most:
+        if _PART * self._scene.nbytes <= self._allowed(device):
             with suppress(DeviceMemoryError):
                 # To make a scene ready on the host takes many times as long as to copy it from device to device.
                 return uploaded(device, self._scene) if self._buffers is None else copied(device, self._buffers)
         return None
+
+    def _allowed(self, device: Device) -> int:
+        """Bytes of a device's memory that there are, or that the user would have taken."""
+        if self._memory is not None and (device.info.kind == "cpu" or device.info.integrated):
+            return min(device.info.memory, self._memory)
+        return device.info.memory
+
+    def is_large_for(self, device: Device) -> bool:
+        """Whether the scene had better not lie whole on a device even for a while."""
+        return _AWHILE * self._scene.nbytes > self._allowed(device)
 
     @property
     def scene(self) -> Scene:

@@ -80,6 +80,7 @@ def test_other_colours_leave_the_kept_ones_alone(device):
             assert np.array_equal(rasterizer.render(camera)[0], before)
 
 
+@pytest.mark.one_family
 def test_an_encode_uploads_its_scene_once_and_makes_the_same_bytes(
     device, plush_excerpt, plush_excerpt_cameras, monkeypatch
 ):
@@ -119,6 +120,7 @@ def test_other_devices_keep_it_too(device):
         assert small.allocated == 0
 
 
+@pytest.mark.one_family
 def test_several_devices_are_given_it_once_each(device, plush_excerpt, plush_excerpt_cameras, monkeypatch):
     scenes = []
     real = scene_buffers.SceneBuffers.write_sh
