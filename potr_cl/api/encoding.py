@@ -156,7 +156,8 @@ def encode(
         kept: KeptScene | None = None
         if target is None:
             if judging is not None and opened is not None:
-                kept = stack.enter_context(KeptScene(opened, what, settings.memory))
+                others = () if pool is None else pool.devices
+                kept = stack.enter_context(KeptScene(opened, what, settings.memory, others))
             encoded = run_stages(what, views, settings, progress, opened, kept=kept, tell=tell, pool=pool)
         else:
             found = encode_to_target(what, views, target, settings, progress, opened, tell, pool=pool)

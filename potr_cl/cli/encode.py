@@ -164,7 +164,7 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Non
             kept = (
                 None
                 if device is None or target is not None
-                else stack.enter_context(KeptScene(device, scene, options.memory))
+                else stack.enter_context(KeptScene(device, scene, options.memory, () if pool is None else pool.devices))
             )
         progress = stack.enter_context(contextlib.closing(Progress()))
         page = stack.enter_context(replacing(args.report)) if args.report is not None else None

@@ -67,7 +67,8 @@ def encode(
             cameras = cameras_or_virtual(scene, cameras, options, watch, in_frame=True)
             if kept is None and cameras and options.look_at_views(scene):
                 device = device or (Device() if pool is None else pool.first)
-                kept = stack.enter_context(KeptScene(device, scene, options.memory))
+                others = () if pool is None else pool.devices
+                kept = stack.enter_context(KeptScene(device, scene, options.memory, others))
         run = Run(options, watch, device, kept, pool)
         encoded = run.finished(run.stages(State.of(scene, train_views(cameras) if cameras else [])))
     tell_left_out(scene, encoded)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
@@ -38,18 +38,21 @@ class KeptScene(Owner):
         scene: whose arrays do not change meanwhile.
         memory: bytes that the user would have taken; None: as much as there is. Where a device's memory is the host's,
             a scene that is a large part of it is not kept: it is there already.
+        others: devices of this process that it is brought to as well, without waiting for it.
 
     Attributes:
         groups: of the scene's splats, once somebody has found that views see little of it.
     """
 
-    def __init__(self, device: Device, scene: Scene, memory: int | None = None) -> None:
+    def __init__(self, device: Device, scene: Scene, memory: int | None = None, others: Sequence[Device] = ()) -> None:
         self._device, self._scene, self._memory = device, scene, memory
         self._buffers: SceneBuffers | None = None
         self._buffers = self._placed(device)
         self._elsewhere: dict[Device, Future[SceneBuffers | None]] = {}
         self._lock = threading.Lock()
         self.groups: SplatGroups | None = None
+        for other in others:
+            self.bring_to(other)
 
     def _placed(self, device: Device) -> SceneBuffers | None:
         if _PART * self._scene.nbytes <= self._allowed(device):

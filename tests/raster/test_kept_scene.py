@@ -201,7 +201,8 @@ def test_pruning_copies_no_more_of_a_scene_than_is_left(device):
 
 def test_another_device_gets_the_same_bits(device):
     scene, other = random_splats(3000, degree=3, seed=4), Device(device.info, family=device.family)
-    with KeptScene(device, scene) as kept:
+    with KeptScene(device, scene, others=[other]) as kept:
+        assert other.allocated or kept.bring_to(other).result()  # it has begun, or is done
         first, second = kept.on(device), kept.bring_to(other).result()
         assert isinstance(first, SceneBuffers)
         assert second is not None
