@@ -12,11 +12,14 @@ from potr_cl.host.silence import without_warnings
 _turns = threading.Lock()
 #: Held by who builds or loads a program, by the program; of all programs of CPUs there is one.
 _locks: defaultdict[Hashable, threading.Lock] = defaultdict(threading.Lock)
+#: NVIDIA's compiler takes no longer for two programs at a time than for one after the other, but several times as long
+#: for six.
+_at_a_time = threading.BoundedSemaphore(2)
 
 
 @contextmanager
 def building(program: Hashable, alone: bool) -> Iterator[None]:
-    """Build or load a program, while nobody else does the same one; others are built at the same time.
+    """Build or load a program, while nobody else does the same one; another one is built at the same time.
 
     Of several devices of a kind the second one then finds what the first one has built. Warnings are not shown
     meanwhile: some drivers chat unasked, and a full disk stops no build.
@@ -28,5 +31,5 @@ def building(program: Hashable, alone: bool) -> Iterator[None]:
     """
     with _turns:
         lock = _locks[None if alone else program]
-    with lock, without_warnings():
+    with lock, _at_a_time, without_warnings():
         yield

@@ -12,6 +12,14 @@
 /* Added to the unit diagonal of a scaled block before it is inverted in single precision. */
 #define UNIT_DAMPING 1e-4f
 
+/* a b + c. Where loops are unrolled a compiler can choose which of two products it fuses with a sum; here it is told,
+   so that the bits are those of the loops. */
+#if LANES == 1
+#define FUSED(a, b, c) fma(a, b, c)
+#else
+#define FUSED MAD
+#endif
+
 /* result = the inverse of each splat's own block of the normal equations, restricted to the active coefficients, times
    residual: a Cholesky factorisation a channel. The squared lengths of Y, Co and Cg in R, G, B are 3, 2 and 3. */
 kernel void precondition(
@@ -24,8 +32,12 @@ kernel void precondition(
     float prior,
     global float *result)
 {
+#if LANES == 1
+#pragma OPENCL FP_CONTRACT OFF
+#endif
     const size_t index = get_global_id(0);
     vfloat trace = (vfloat)(0.0f);
+    UNROLL
     for (int i = 0; i < SH_COUNT; ++i)
         trace += VLOAD(index, blocks + AT(i, i) * stride);
     for (int c = 0; c < 3; ++c) {
@@ -35,30 +47,36 @@ kernel void precondition(
         /* Row by row, U with U^T U = block. The diagonal holds the pivots' inverse square roots, and 0 for what is left
            out. */
         vfloat factor[TRIANGLE], y[SH_COUNT];
+        UNROLL
         for (int j = 0; j < SH_COUNT; ++j) {
             const size_t column = 3 * j + c;
             const vfloat own = VLOAD(index, blocks + AT(j, j) * stride);
-            const vfloat diagonal = MAD(length, own, least + (prior + (j ? lambda : 0.0f)));
+            const vfloat diagonal = FUSED((vfloat)(length), own, least + (prior + (j ? lambda : 0.0f)));
             vfloat pivot = diagonal, rest = VLOAD(index, residual + column * stride);
+            UNROLL
             for (int i = 0; i < j; ++i) {
-                pivot = MAD(-factor[AT(i, j)], factor[AT(i, j)], pivot);
-                rest = MAD(-factor[AT(i, j)], y[i], rest);
+                pivot = FUSED(-factor[AT(i, j)], factor[AT(i, j)], pivot);
+                rest = FUSED(-factor[AT(i, j)], y[i], rest);
             }
             const vint keep = (pivot > LEAST_PIVOT * diagonal) && (pivot > 1e-30f);
             const vfloat inverse =
                 (keep ? 1.0f / sqrt(pivot) : (vfloat)(0.0f)) * active_lanes(active, stride, index, column);
             factor[AT(j, j)] = inverse;
             y[j] = rest * inverse;
+            UNROLL
             for (int k = j + 1; k < SH_COUNT; ++k) {
                 vfloat sum = length * VLOAD(index, blocks + AT(j, k) * stride);
+                UNROLL
                 for (int i = 0; i < j; ++i)
-                    sum = MAD(-factor[AT(i, j)], factor[AT(i, k)], sum);
+                    sum = FUSED(-factor[AT(i, j)], factor[AT(i, k)], sum);
                 factor[AT(j, k)] = sum * inverse * active_lanes(active, stride, index, 3 * k + c);
             }
         }
+        UNROLL
         for (int j = SH_COUNT - 1; j >= 0; --j) {
+            UNROLL
             for (int k = j + 1; k < SH_COUNT; ++k)
-                y[j] = MAD(-factor[AT(j, k)], y[k], y[j]);
+                y[j] = FUSED(-factor[AT(j, k)], y[k], y[j]);
             y[j] *= factor[AT(j, j)];
             VSTORE(y[j], index, result + (3 * j + c) * stride);
         }
