@@ -272,18 +272,17 @@ class Parts(Owner):
         """A part in pieces on other workers, as far as the part itself is, and what they find; None if they cannot."""
         given = self._kind.split(self._given[place], len(others)) if others else []
         pieces: list[_Piece] = []
-        most = None if self._pool.patience is None else max(self._pool.patience, _SLOWER * self._longest)
         makings: list[Future[Held]] = []
         try:
             for each, worker in zip(given, others, strict=False):
                 makings.append(worker.make(self._kind, self._memory, each))
             for each, worker, making in zip(given, others, makings, strict=False):
-                pieces.append(_Piece(each, worker, making.result(most)))
+                pieces.append(_Piece(each, worker, self._answer(making)))
             for name, args in [*self._log, *([] if command is None else [command])]:
                 answers = [self._send(piece.held, self._origins[place], name, args) for piece in pieces]
                 for piece, answer in zip(pieces, answers, strict=True):
-                    piece.found = answer.result(most)
-        except (DeviceError, NotInTime) as error:
+                    piece.found = self._answer(answer)
+        except DeviceError as error:
             _log.info("others cannot do the views of a slow worker (%s)", error)
             for making in makings:
                 making.add_done_callback(_abandon_made)
@@ -333,7 +332,7 @@ class Parts(Owner):
             self._held[place], self._by[place] = None, other
             try:
                 held = self._remake(place)
-                return held if command is None else self._begin(place, *command).result()
+                return held if command is None else self._answer(self._begin(place, *command))
             except DeviceError as another:
                 last = another
 
@@ -341,11 +340,23 @@ class Parts(Owner):
         """Make a part on the worker that has it now, and have it do all that it has been told."""
         worker = self._by[place]
         assert worker is not None
-        held = worker.make(self._kind, self._memory, self._given[place]).result()
+        held: Held = self._answer(worker.make(self._kind, self._memory, self._given[place]))
         self._held[place] = held
         for command, args in self._log:
-            self._begin(place, command, args).result()
+            self._answer(self._begin(place, command, args))
         return held
+
+    def _answer(self, future: Future[Any]) -> Any:
+        """What one part alone is waited for.
+
+        Raises:
+            WorkerLost: it takes so much longer than anything has taken by now that its worker must stand still.
+        """
+        patience = self._pool.patience
+        try:
+            return future.result(None if patience is None else max(patience, _SLOWER * self._longest))
+        except NotInTime:
+            raise WorkerLost("it does not answer") from None
 
     def _note(self, command: str, args: tuple[Any, ...]) -> None:
         self._log.append((command, args))

@@ -129,6 +129,12 @@ def test_a_silent_worker_is_given_up():
     assert course(FakePool(FakeWorker("a", 4, silent=True), FakeWorker("b"), patience=0.3)) == EXPECTED
 
 
+def test_who_should_do_it_instead_is_silent_too():
+    """Several stand still at the same time; each is waited for once."""
+    workers = FakeWorker("a", 3, silent=True), FakeWorker("b", 4, silent=True), FakeWorker("c")
+    assert course(FakePool(*workers, patience=0.2)) == EXPECTED
+
+
 @pytest.mark.parametrize("lost_at", [None, 1, 2, 3, 4])
 def test_parts_can_be_told_different_things(lost_at):
     """And those that are made again are told again what was theirs."""

@@ -230,7 +230,7 @@ def packing(device: Device) -> None:
         packs.set_floats(x, packs.floats(x))
         sums = memory.upload(np.ones((layout.columns, layout.stride), np.int64), "sums")
         packs.add_sums(sums, packs.sums(sums))
-        packs.add_rows(sums, 1, np.ones((1, layout.stride), np.int64))
+        packs.add_rows(sums, 1, packs.rows(sums, 0, 1))
 
 
 def marks(device: Device) -> None:

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner, Scratch, Staging
+from potr_cl.opencl.narrow import Narrowed, Narrowing
 
 #: (N / 64, rounded up) uint64, a bit for each splat, the lowest first; and (n, 2) int64, the changes of those whose bit
 #: is set.
-Changes: TypeAlias = tuple[NDArray[np.uint64], NDArray[np.int64]]
+Changes: TypeAlias = "tuple[NDArray[np.uint64], Narrowed | NDArray[np.int64]]"
 
 _SOURCE = "prune/changes.cl"
 #: Splats of a run (RUN of the kernels), and work-items of a work-group.
@@ -45,7 +46,7 @@ class ChangedTotals(Owner):
         self._find, self._take = (device.kernel(_SOURCE, name, NUMBERED=0) for name in ("changed_runs", "take_changes"))
         self._runs = _Runs(device, splats)
         self._changes = Scratch(device, _WHAT)
-        self._masks, self._found = Staging(device), Staging(device)
+        self._masks, self._narrowing = Staging(device), Narrowing(device)
         self._memory = Memory(device)
         with device.all_or_nothing():
             self._before = self._memory.allocate(_TOTALS * splats, _WHAT)
@@ -53,7 +54,7 @@ class ChangedTotals(Owner):
 
     def take(self, totals: cl.Buffer) -> Changes:
         """The changes in (N, 2) int64 totals; valid until the next call."""
-        device, runs = self._device, self._runs
+        runs = self._runs
         everywhere = {"totals": totals, "before": self._before, "splats": self._splats, "masks": runs.masks}
         self._find.bind(**everywhere, states=self._states, counts=runs.starts)
         self._find.launch((-(-runs.count // _GROUP) * _GROUP,), (_GROUP,))
@@ -62,14 +63,13 @@ class ChangedTotals(Owner):
         self._changes.reserve(_TOTALS * max(changed, 1))
         self._take.bind(**everywhere, starts=runs.starts, changes=self._changes.buffer)
         self._take.launch((-(-self._splats // _GROUP) * _GROUP,), (_GROUP,))
-        found: NDArray[np.int64] = self._found.download(self._changes.buffer, (changed, 2), np.int64)
-        device.queue.finish()
-        return masks, found
+        return masks, self._narrowing.download(self._changes.buffer, (changed, 2))
 
     def close(self) -> None:
         """Give the device's memory back."""
         self._runs.close()
         self._changes.close()
+        self._narrowing.close()
         self._memory.close()
 
 
@@ -88,7 +88,7 @@ class AddedChanges(Owner):
         self._add = {numbered: device.kernel(_SOURCE, "add_changes", NUMBERED=int(numbered)) for numbered in (0, 1)}
         self._count = device.kernel(_SOURCE, "count_runs", NUMBERED=0)
         self._runs: dict[int, _Runs] = {}
-        self._changes = Scratch(device, _WHAT)
+        self._changes, self._narrowing = Scratch(device, _WHAT), Narrowing(device)
 
     def add(self, totals: cl.Buffer, changes: Changes, splats: int, numbers: cl.Buffer | None = None) -> None:
         """Add changes to totals.
@@ -100,20 +100,24 @@ class AddedChanges(Owner):
             numbers: (splats,) uint32, their numbers among all; None: the same.
         """
         masks, found = changes
-        if not len(found):
+        changed = found.shape[0]
+        if not changed:
             return
         device = self._device
         if splats not in self._runs:
             self._runs[splats] = _Runs(device, splats)
         runs = self._runs[splats]
-        self._changes.reserve(found.nbytes)
+        self._changes.reserve(_TOTALS * changed)
         with device.errors("failed while computing"):
             cl.enqueue_copy(device.queue, runs.masks, masks, is_blocking=True)
-            cl.enqueue_copy(device.queue, self._changes.buffer, found, is_blocking=True)
+            if isinstance(found, Narrowed):
+                self._narrowing.upload(self._changes.buffer, found)
+            else:
+                cl.enqueue_copy(device.queue, self._changes.buffer, found, is_blocking=True)
         self._count.bind(masks=runs.masks, runs=runs.count, counts=runs.starts)
         self._count.launch((-(-runs.count // _GROUP) * _GROUP,), (_GROUP,))
-        if runs.begin() != len(found):
-            raise ValueError(f"{len(found)} changes do not fit the bits that are set")
+        if runs.begin() != changed:
+            raise ValueError(f"{changed} changes do not fit the bits that are set")
         add = self._add[int(numbers is not None)]
         add.bind(
             totals=totals,
@@ -131,6 +135,7 @@ class AddedChanges(Owner):
         for runs in self._runs.values():
             runs.close()
         self._changes.close()
+        self._narrowing.close()
 
 
 def changes_on_host(totals: NDArray[np.int64], before: NDArray[np.int64], alive: NDArray[np.bool_]) -> Changes:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.memory import Owner, Scratch, Staging
+from potr_cl.opencl.narrow import Narrowed, Narrowing
 from potr_cl.opencl.relay import Lent, Relay, done_so_far
 from potr_cl.stages.refitting.coefficients import Coefficients
 
@@ -50,6 +51,7 @@ class Packing(Owner):
         }
         self._staging = Staging(device)
         self._relay = Relay(device)
+        self._narrowing = Narrowing(device)
         self.count = 0
         self._places = Scratch(device, "the coefficients' places")
         self._starts = Scratch(device, "the coefficients' places")
@@ -110,15 +112,19 @@ class Packing(Owner):
         self._launch("unpack_floats", x, self._arrived)
         self._looked_at(packed)
 
-    def sums(self, columns: cl.Buffer) -> NDArray[np.int64]:
-        """(count,) int64, sums over views of active coefficients; valid until something else is packed.
+    def sums(self, columns: cl.Buffer) -> Narrowed:
+        """(count,) int64, sums over views of active coefficients; valid until something else is narrowed.
 
         All sums become 0.
         """
         self._packed.reserve(8 * self.count)
         self._launch("pack_sums", columns)
-        packed: NDArray[np.int64] = self._staging.download(self._packed.buffer, (self.count,), np.int64)
-        return packed
+        return self._narrowing.download(self._packed.buffer, (self.count,))
+
+    def rows(self, sums: cl.Buffer, row: int, rows: int) -> Narrowed:
+        """(rows, stride) int64, rows of sums from one on; valid until something else is narrowed."""
+        stride = self._coefficients.layout.stride
+        return self._narrowing.download(sums, (rows, stride), stride * row)
 
     def lend_sums(self, columns: cl.Buffer) -> Lent:
         """The same on the device, for others of this process."""
@@ -126,17 +132,25 @@ class Packing(Owner):
         self._launch("pack_sums", columns)
         return Lent(self._coefficients.device, self._packed.buffer, 8 * self.count)
 
-    def add_sums(self, columns: cl.Buffer, packed: NDArray[np.int64] | Lent) -> None:
+    def add_sums(self, columns: cl.Buffer, packed: Narrowed | Lent) -> None:
         """Add to sums over views."""
         self._take(packed, 8)
         self._launch("add_sums", columns, self._arrived)
         self._looked_at(packed)
 
-    def add_rows(self, sums: cl.Buffer, row: int, more: NDArray[np.int64]) -> None:
-        """Add whole rows, (rows, stride) int64, to sums from a row on."""
-        self._make_room(more.nbytes)
-        self._copy_to(self._arrived, more)
-        self._add_arrived(sums, row * more.shape[1], more.size)
+    def add_rows(self, sums: cl.Buffer, row: int, more: Narrowed) -> None:
+        """Add whole rows, (rows, n) int64, to sums from a row on; n may be another device's stride."""
+        rows, stride = more.shape
+        own = self._coefficients.layout.stride
+        self._make_room(8 * rows * max(stride, own))
+        if stride == own:
+            self._narrowing.upload(self._arrived.buffer, more)
+        else:
+            padded = np.zeros((rows, own), np.int64)
+            splats = self._coefficients.layout.splats
+            padded[:, :splats] = more.widened()[:, :splats]
+            self._copy_to(self._arrived, padded)
+        self._add_arrived(sums, row * own, rows * own)
         self._looked_at(more)
 
     def add_lent(self, sums: cl.Buffer, more: Lent) -> None:
@@ -157,12 +171,15 @@ class Packing(Owner):
         """Take a whole vector from another device, which lays it out in the same way."""
         self._relay.fetch(x, lent)
 
-    def _take(self, packed: NDArray[np.generic] | Lent, nbytes: int) -> None:
+    def _take(self, packed: NDArray[np.generic] | Narrowed | Lent, nbytes: int) -> None:
         """Have packed coefficients of so many bytes each on the device."""
-        if packed.nbytes != nbytes * self.count:
-            raise ValueError(f"{packed.nbytes // nbytes} packed coefficients, where {self.count} are active")
-        self._make_room(packed.nbytes)
-        if isinstance(packed, Lent):
+        count = packed.count if isinstance(packed, Narrowed) else packed.nbytes // nbytes
+        if count != self.count:
+            raise ValueError(f"{count} packed coefficients, where {self.count} are active")
+        self._make_room(nbytes * count)
+        if isinstance(packed, Narrowed):
+            self._narrowing.upload(self._arrived.buffer, packed)
+        elif isinstance(packed, Lent):
             self._relay.fetch(self._arrived.buffer, packed, free=self._free)
         else:
             self._copy_to(self._arrived, packed)
@@ -172,7 +189,7 @@ class Packing(Owner):
         if self._arrived.reserve(nbytes):
             self._free = None
 
-    def _looked_at(self, packed: NDArray[np.generic] | Lent) -> None:
+    def _looked_at(self, packed: NDArray[np.generic] | Narrowed | Lent) -> None:
         """The device looks no more at what has arrived, once it has done what it has been given by now."""
         # What the host copies waits for the device anyway. And a marker costs: with one in the queue, Intel's CPU
         # runtime leaves the thread idle that waits for a result, instead of computing on it.
@@ -209,3 +226,4 @@ class Packing(Owner):
         self._arrived.close()
         self._staging.close()
         self._relay.close()
+        self._narrowing.close()

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
-from potr_cl.opencl.memory import Memory, Staging
+from potr_cl.opencl.memory import Memory
+from potr_cl.opencl.narrow import Narrowed
 from potr_cl.opencl.relay import Lent
 from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import KeptScene, lying_on, whole_on_device
@@ -46,7 +47,7 @@ class Gradient:
     """
 
     errors: dict[int, float]
-    sums: NDArray[np.int64] | Lent
+    sums: Narrowed | Lent
     blocks: Lent | None = None
 
     @property
@@ -113,7 +114,6 @@ class ColourPart(Part):
             if ahead is not None:
                 self._targets = ahead.before(device, self._targets)
             self._map.prepare(self._targets)
-            self._staging = owned.enter_context(Staging(device))
             self._blocks = owned.enter_context(Memory(device))
             self._block_sums: cl.Buffer | None = None
             self._owned = owned.pop_all()
@@ -153,15 +153,14 @@ class ColourPart(Part):
             return Gradient(self._map.found_errors(), sums, lent)
         return Gradient(self._map.found_errors(), self._packing.sums(self._map.sums))
 
-    def block_rows(self, first: int, rows: int) -> NDArray[np.int64]:
+    def block_rows(self, first: int, rows: int) -> Narrowed:
         """Some rows of the sums of the splats' own blocks after a gradient; valid until the next call.
 
         Returns:
             (rows, stride) int64, of packed upper triangles.
         """
         assert self._block_sums is not None, "the gradient was without blocks"
-        stride = self._coefficients.layout.stride
-        return self._staging.download(self._block_sums, (rows, stride), np.int64, 8 * first * stride)
+        return self._packing.rows(self._block_sums, first, rows)
 
     def _forget_blocks(self) -> None:
         self._blocks.close()
@@ -169,7 +168,7 @@ class ColourPart(Part):
 
     def normal(
         self, direction: FloatArray | Lent, unit: float, constant: bool, part: int | None = None
-    ) -> NDArray[np.int64] | Lent:
+    ) -> Narrowed | Lent:
         """What these views add to :meth:`~potr_cl.stages.refitting.colour_map.ColourMap.normal`.
 
         Args:

@@ -107,10 +107,6 @@ class SharedViews(Owner):
             else:
                 found = [self._others.ask(place, "block_rows", first, count)]
             for more in found:
-                if more.shape[1] != layout.stride:  # another device pads otherwise
-                    padded = np.zeros((count, layout.stride), np.int64)
-                    padded[:, : layout.splats] = more[:, : layout.splats]
-                    more = padded
                 self._packing.add_rows(blocks, first, more)
 
     def close(self) -> None:
