@@ -39,6 +39,9 @@ def _clamped(image: NDArray[Any]) -> NDArray[np.float64]:
 def psnr(image: NDArray[Any], reference: NDArray[Any]) -> float:
     """Peak signal-to-noise ratio in decibels, of the squared error's mean over pixels and channels.
 
+    Args:
+        image, reference: (H, W, 3), from 0 to 1; what lies beyond is clamped.
+
     Returns:
         Infinity where the pictures are identical.
     """
@@ -47,7 +50,7 @@ def psnr(image: NDArray[Any], reference: NDArray[Any]) -> float:
 
 
 def ssim(image: NDArray[Any], reference: NDArray[Any]) -> float:
-    """Structural similarity (Wang et al. 2004), averaged over all pixels and channels.
+    """Structural similarity (Wang et al. 2004) of pictures (H, W, 3), averaged over all pixels and channels.
 
     The window is a Gaussian of 11 x 11 pixels with sigma 1.5 and the pictures are continued with zeros beyond their
     borders, as the original 3DGS implementation does. Statistics are taken in float64.
