@@ -44,6 +44,7 @@ study.fit                  how far should a scene be pruned before a fit, and wh
 study.colour_steps         what does version 3 of the format bring over version 2, part by part?
 study.compare_formats      what would people use instead?
 study.output_formats       how small are encodes to the formats that viewers open, and what do others read of them?
+study.elsewhere            what is left of a scene, with cameras and without, where nobody has photographed it?
 study.virtual_views        how many virtual views, how large, how wide, at what time and memory?
 study.rates                where do the bits go, and what do they buy?
 study.fit_guards           is a file with the fit ever worse than one without: few views, thresholds by hand?

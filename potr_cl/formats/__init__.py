@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import math
 import os
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -17,6 +19,11 @@ from potr_cl.formats.cameras.view_files import read_json
 from potr_cl.formats.lfs_pointer import refuse_lfs_pointer
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
+
+_log = logging.getLogger("potr_cl")
+
+#: A picture so many times as wide as its focal length covers 150 degrees, more than any pinhole is used for.
+_WIDE = 7.5
 
 __all__ = ["load_cameras", "load_scene", "read_cameras", "read_scene", "save_scene", "scene_writer"]
 
@@ -97,9 +104,23 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
     refuse_lfs_pointer(path)
     try:
         with _silent_overflows():
-            return _from_folder(path) if path.is_dir() else _from_file(path)
+            cameras = _from_folder(path) if path.is_dir() else _from_file(path)
     except OSError as error:
         raise UsageError(f"cannot read '{error.filename or path}': {error.strerror or error}") from error
+    _tell_of_wide_views(path, cameras)
+    return cameras
+
+
+def _tell_of_wide_views(path: Path, cameras: list[Camera]) -> None:
+    """Log one line if views are wider than any pinhole's: their focal lengths are hardly pixels."""
+    wide = [camera for camera in cameras if max(camera.width / camera.fx, camera.height / camera.fy) > _WIDE]
+    if wide:
+        one = max(wide, key=lambda camera: camera.width / camera.fx)
+        degrees = 2 * math.degrees(math.atan(one.width / 2 / one.fx))
+        _log.warning(
+            "'%s': %d of %d views are very wide, up to %.0f degrees: are their focal lengths in pixels of %d x %d?",
+            path, len(wide), len(cameras), degrees, one.width, one.height,
+        )  # fmt: skip
 
 
 def _silent_overflows() -> AbstractContextManager[Any]:

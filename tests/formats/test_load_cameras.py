@@ -76,6 +76,21 @@ def test_folders(data: Path, tmp_path: Path) -> None:
     assert len(load_cameras(tmp_path)) == 1
 
 
+def test_views_that_are_too_wide_for_a_pinhole_are_told(
+    data: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As of focal lengths in millimetres."""
+    load_cameras(data / "plush_cameras.json")
+    assert caplog.text == ""
+    views = [view() | {"img_name": f"{number}.png", "width": 990, "height": 742} for number in range(3)]
+    for number, focal in enumerate((35.0, 800.0, 28.0)):
+        views[number] |= {"fx": focal, "fy": focal}
+    load_cameras(write_json(tmp_path / "cameras.json", views))
+    assert (
+        "2 of 3 views are very wide, up to 174 degrees: are their focal lengths in pixels of 990 x 742?" in caplog.text
+    )
+
+
 def test_any_file_name(data: Path, tmp_path: Path) -> None:
     shutil.copy(data / "plush_cameras.json", tmp_path / "views of mine.JSON")
     assert len(load_cameras(tmp_path / "views of mine.JSON")) == 17

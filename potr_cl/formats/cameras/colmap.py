@@ -142,8 +142,8 @@ def load(folder: Path) -> list[Camera]:
 FORMAT = CameraFormat(
     name="COLMAP model (cameras and images as .bin or .txt)",
     suffixes=(".bin", ".txt"),
-    note="binary or text, with or without lens distortion, also in the folder `sparse/0` or `sparse`; every 8th view "
-    "by name is a test view",
+    note="binary or text, with or without lens distortion, also in the folder `sparse/0`, `sparse` or `0`; every 8th "
+    "view by name is a test view",
     recognises=lambda path, content: is_model(path.parent),
     load=lambda path, content: load(path.parent),
     is_in=is_model,
