@@ -28,9 +28,9 @@ from potr_cl.raster.scene_buffers import SPLAT_GROUP, Drawable, SceneBuffers, ga
 _LEAST_SPLATS, _MOST_SEEN = 1 << 21, 1 / 2
 #: To find the groups takes about as long as a GPU takes to project the whole scene into so many views.
 _VIEWS = 48
-#: On a CPU a view's splats are not gathered faster than all are projected, but they take less memory: they are where a
-#: scene takes more than this part of it.
-_PART = 1 / 20
+#: On a CPU it takes longer to gather a view's splats than to project all, but less memory: so it is done where the
+#: scene takes more than this part of it, once on the host and once for the device.
+_PART = 1 / 6
 #: Views that a GPU renders together at most, and splats of all of them, padding included.
 _TOGETHER, _PROJECTED = 8, 1 << 24
 

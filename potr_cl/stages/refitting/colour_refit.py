@@ -149,7 +149,7 @@ class ColourRefit(Owner):
                 rasterizer = owned.enter_context(Rasterizer(device, colourless(here), rules))
             self.colour_map = owned.enter_context(
                 ColourMap(
-                    launcher, rasterizer, self.coefficients, here.means, cameras, background, memory, own, helpers,
+                    launcher, rasterizer, self.coefficients, cameras, background, memory, own, helpers,
                     reach,
                 )
             )  # fmt: skip
