@@ -352,8 +352,8 @@ def filling(device: Device) -> None:
 
 
 STEPS: tuple[Step, ...] = (
-    pictures, long_lists, pruning, several_batches, view_by_view, part_by_part, some_of_a_scene, refit, refit_of_reached, packing, marks,
-    derivatives, fit, compaction, decoding, clusters, similarity, filling,
+    pictures, long_lists, pruning, several_batches, view_by_view, part_by_part, some_of_a_scene, refit,
+    refit_of_reached, packing, marks, derivatives, fit, compaction, decoding, clusters, similarity, filling,
 )  # fmt: skip
 
 
