@@ -63,9 +63,9 @@ class Run:
         """
         for stage in self._options.stages:
             if only is None or type(stage) in only:
-                before, state = state, self._one(stage, state)
-                if isinstance(stage, Fit):
-                    state = self._fit_that_pays(before, state)
+                after = self._one(stage, state)
+                # What is before it is kept no longer than this: colours of a large scene take gigabytes.
+                state = self._fit_that_pays(state, after) if isinstance(stage, Fit) else after
         return state
 
     def _fit_that_pays(self, before: State, after: State) -> State:

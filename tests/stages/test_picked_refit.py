@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from potr_cl.errors import DeviceMemoryError
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
@@ -92,6 +93,31 @@ def test_which_splats_are_reached(device, monkeypatch):
                 got, _ = alone.composite(views.views[0])
             assert np.array_equal(got, wanted)
         assert sum(map(len, found)) < 0.9 * sum(map(len, drawn)) < 0.5 * len(scene) * len(cameras)
+
+
+def test_fewer_views_together_where_the_device_has_no_room(device, monkeypatch):
+    monkeypatch.setattr(reached, "LEAST_SPLATS", 1)
+    monkeypatch.setattr(reached, "WORTH_IT", 1.0)
+    scene, cameras = crowded(200)
+    prepare = Rasterizer.prepare_set
+    together, found = [], []
+
+    def failing(self, some, *args):
+        together.append(len(some))
+        if len(some) > 3:
+            raise DeviceMemoryError("no room")
+        return prepare(self, some, *args)
+
+    with Rasterizer(device, scene) as rasterizer:
+        for full in (False, True):
+            if full:
+                monkeypatch.setattr(Rasterizer, "prepare_set", failing)
+            reach = reached_splats(rasterizer, cameras, range(len(cameras)))
+            assert reach is not None
+            found.append(reach.of)
+    assert max(together) > 3
+    for number in range(len(cameras)):
+        assert np.array_equal(found[0][number], found[1][number])
 
 
 def test_not_where_views_reach_much(device, monkeypatch):

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from potr_cl.errors import DeviceMemoryError
 from potr_cl.model import splat_groups
 from potr_cl.opencl.memory import Memory
 from potr_cl.pipeline.encode import encode
@@ -62,6 +63,32 @@ def test_the_same_pictures(device):
             assert np.array_equal(wanted, got)
             assert wanted.std() > 0.05
         device.queue.finish()
+
+
+def test_fewer_together_where_the_device_has_no_room(device, monkeypatch):
+    scene, cameras = street()
+    sights = Sights.of(scene, cameras, INRIA.near)
+    pixels = sum(3 * camera.width * camera.height for camera in cameras)
+    together = []
+    prepare = Rasterizer.prepare_set
+
+    def failing(self, some, *args):
+        together.append(len(some))
+        if len(some) > 2:
+            raise DeviceMemoryError("no room")
+        return prepare(self, some, *args)
+
+    found = []
+    with uploaded(device, scene) as whole, Memory(device) as memory:
+        buffer = memory.allocate(4 * pixels, "pictures")
+        for full in (False, True):
+            if full:
+                monkeypatch.setattr(Rasterizer, "prepare_set", failing)
+            with VisibleTargets(whole, cameras, sights, (0.0, 0.0, 0.0)) as visible:
+                visible.into(range(len(cameras)), buffer)
+            found.append(device.download(buffer, (pixels,), np.float32))
+    assert max(together) > 2 == together[-1]
+    assert np.array_equal(*found)
 
 
 @pytest.mark.parametrize("memory", [None, 3_000_000], ids=["all memory", "little"])

@@ -47,6 +47,8 @@ from potr_cl.opencl.discovery import list_devices
 from potr_cl.opencl.kernel import Kernel
 from potr_cl.opencl.memory import Memory
 from potr_cl.outputs.colour_grid import ColourGrid
+from potr_cl.raster import launch_gpu
+from potr_cl.raster import long_lists as long_lists_module
 from potr_cl.raster.culling import Sights, parts_of_views
 from potr_cl.raster.picked_splats import Picker
 from potr_cl.raster.rasterizer import Rasterizer
@@ -70,7 +72,7 @@ from potr_cl.stages.pruning.survivors import Survivors
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.pruning.view_by_view import ViewByView
 from potr_cl.stages.pruning.visible_parts import PartedRemoval
-from potr_cl.stages.refitting import coefficients, sliced_coefficients
+from potr_cl.stages.refitting import coefficients, reached, sliced_coefficients
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.packing import Packing
 from potr_cl.stages.refitting.refit import refit_colours
@@ -217,6 +219,25 @@ def refit(device: Device) -> None:
     assert np.array_equal(found[0], found[1])
 
 
+def refit_of_reached(device: Device) -> None:
+    """Of views with the splats that they reach, in pieces of lists that many work-groups sort: on a GPU."""
+    scene, views = random_splats(270, 1, seed=2), _views()
+    found = []
+    with Rasterizer(device, scene) as rasterizer:
+        targets = RenderedTargets(rasterizer, views)
+        for least, longest in ((1 << 30, 1 << 30), (1, 100)):
+            with (
+                patch.object(reached, "LEAST_SPLATS", least),
+                patch.object(reached, "WORTH_IT", 1.0),
+                patch.object(launch_gpu, "LONGEST", longest),
+                patch.object(long_lists_module, "LONGEST", longest),
+                patch.object(long_lists_module, "PIECE", 64),
+            ):
+                options = RefitOptions(steps=1, gain=0, drop=1e-9)
+                found.append(refit_colours(device, scene, views, targets, options).sh)
+    assert np.array_equal(found[0], found[1])
+
+
 def packing(device: Device) -> None:
     """What travels between devices that share a re-fit."""
     scene = random_splats(300, 2, seed=5)
@@ -331,8 +352,8 @@ def filling(device: Device) -> None:
 
 
 STEPS: tuple[Step, ...] = (
-    pictures, long_lists, pruning, several_batches, view_by_view, part_by_part, some_of_a_scene, refit, packing, marks,
-    derivatives, fit, compaction, decoding, clusters, similarity, filling,
+    pictures, long_lists, pruning, several_batches, view_by_view, part_by_part, some_of_a_scene, refit,
+    refit_of_reached, packing, marks, derivatives, fit, compaction, decoding, clusters, similarity, filling,
 )  # fmt: skip
 
 

@@ -55,6 +55,7 @@ class PickedViews(Owner):
         others: int = 0,
     ) -> None:
         self._rasterizer, self._cameras, self._reached = rasterizer, list(cameras), list(reached)
+        self._strides = [_padded(numbers) for numbers in reached]
         device = rasterizer.device
         self._preparing = PreparingMemory(device)
         self._passing = Reused(device)
@@ -65,7 +66,7 @@ class PickedViews(Owner):
         self._passed: tuple[range, cl.Buffer] | None = None
         try:
             # The largest view has its room in any case.
-            most_splats = max(self.budget.room // (LEAST_SETS * (GEOMETRY + nbytes)), *map(_padded, self._reached), 0)
+            most_splats = max(self.budget.room // (LEAST_SETS * (GEOMETRY + nbytes)), *self._strides, 0)
             to_do = self._dealt(most_views, most_splats, breaks)
             self.budget.largest = max((self.stride(numbers) * len(numbers) for numbers in to_do), default=0)
             while to_do:
@@ -86,14 +87,14 @@ class PickedViews(Owner):
         first = 0
         for stop in sorted({*breaks, len(self._cameras)}):
             while first < stop:
-                together = int(min(max(most_splats // _padded(self._reached[first]), 1), most_views, stop - first))
+                together = int(min(max(most_splats // self._strides[first], 1), most_views, stop - first))
                 launches.append(range(first, first + together))
                 first += together
         return launches
 
     def stride(self, numbers: range) -> int:
         """Room for the splats of each view of a launch."""
-        return _padded(self._reached[numbers.start])
+        return self._strides[numbers.start]
 
     def picks(self, numbers: range) -> cl.Buffer:
         """(views, stride) uint32, the numbers of the splats of each view of a launch that is ready, or was last."""
@@ -112,6 +113,8 @@ class PickedViews(Owner):
             stack.enter_context(views)
             if self.budget.keep(views, picks.size):
                 self._kept[numbers] = _Kept(views, rasterizer, picks, stack.pop_all())
+                for number in numbers:  # they lie on the device
+                    self._reached[number] = self._reached[number][:0].copy()
         self.launches.append(numbers)
 
     def _picked(self, numbers: range, memory: Memory) -> tuple[Rasterizer, cl.Buffer]:

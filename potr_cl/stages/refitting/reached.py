@@ -30,6 +30,8 @@ _SAMPLED = 12
 #: Views that are looked at together, at most, and in which part of the memory. Bytes of a view for each splat of the
 #: scene: shape, colour, bounds, and few intersections.
 _TOGETHER, _ROOM, _VIEW = 8, 1 / 4, 80
+#: Numbers for which memory is taken together.
+_ROOM_TAKEN = 1 << 24
 #: Work-items of a tile's work-group.
 _GROUP = 128
 
@@ -75,14 +77,14 @@ def reached_splats(
     if rasterizer.device.family != "gpu" or rasterizer.splats < LEAST_SPLATS or not numbers:
         return None
     found: dict[int, NDArray[np.uint32]] = {}
-    device = rasterizer.device
+    device, room = rasterizer.device, _Room()
     passing = Reused(device)
     try:
         with Memory(device) as own, Picker(device, np.zeros(rasterizer.splats, np.uint32)) as picker:
             marks = own.allocate(rasterizer.stride, "the splats that a view reaches")
             some = numbers[:: -(-len(numbers) // _SAMPLED)]
-            room = min((device.info.memory if memory is None else memory), device.info.memory - device.allocated)
-            most = int(min(max(room * _ROOM / (_VIEW * rasterizer.stride), 1), _TOGETHER))
+            free = min((device.info.memory if memory is None else memory), device.info.memory - device.allocated)
+            most = int(min(max(free * _ROOM / (_VIEW * rasterizer.stride), 1), _TOGETHER))
             for views in (some, sorted(set(numbers) - set(some))):
                 left = list(views)
                 while left:
@@ -95,7 +97,7 @@ def reached_splats(
                             raise
                         most = len(together) // 2
                         continue
-                    found.update(zip(together, splats, strict=True))
+                    found.update(zip(together, room.of(splats), strict=True))
                     del left[:most]
                 if views is some and not _worth_it(found, rasterizer.splats):
                     return None
@@ -103,6 +105,27 @@ def reached_splats(
         passing.give_back()
         rasterizer.rest()
     return Reach(found)
+
+
+class _Room:
+    """Keeps arrays in large pieces of memory, each of which the system has back when none of its arrays is left.
+
+    Of arrays of some megabytes, one by one, a process keeps the memory.
+    """
+
+    def __init__(self) -> None:
+        self._free = np.empty(0, np.uint32)
+
+    def of(self, arrays: Sequence[NDArray[np.uint32]]) -> list[NDArray[np.uint32]]:
+        """The same arrays, there."""
+        kept = []
+        for array in arrays:
+            if len(array) > len(self._free):
+                self._free = np.empty(max(_ROOM_TAKEN, len(array)), np.uint32)
+            own, self._free = self._free[: len(array)], self._free[len(array) :]
+            own[:] = array
+            kept.append(own)
+        return kept
 
 
 def _worth_it(found: dict[int, NDArray[np.uint32]], splats: int) -> bool:
