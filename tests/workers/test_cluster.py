@@ -194,7 +194,9 @@ def looks_of_scheduler(dask_scheduler):
     return [dask_scheduler.periodic_callbacks[name].callback_time for name in names], list(dask_scheduler.plugins)
 
 
-@pytest.mark.parametrize("own", [True, False], ids=["address", "client"])
+@pytest.mark.parametrize(
+    "own", [pytest.param(True, id="address", marks=pytest.mark.slow), pytest.param(False, id="client")]
+)
 def test_dask_looks_at_its_processes_seldom_meanwhile(own, device):
     with local_cluster(1) as cluster, distributed.Client(cluster, set_as_default=False) as watching:
 
