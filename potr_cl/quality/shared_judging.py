@@ -138,11 +138,10 @@ class SharedJudging(Owner):
                 progress(len(found))
 
         with ExitStack() as stack:
+            self._take(stack, candidate)
             sent = self._for_others(candidate, coded)
             if sent is not None and self._open_parts() is not None:
-                self._shared_out(stack, command, candidate, sent, views, args, note)
-            else:
-                self._take(stack, candidate)
+                self._shared_out(command, sent, views, args, note)
             # All of them, if nobody helps; or what those who are lost have left.
             left = [camera for camera in views if camera.name not in found]
             note(left, getattr(self._own, command)(left, *args))
@@ -150,9 +149,7 @@ class SharedJudging(Owner):
 
     def _shared_out(
         self,
-        stack: ExitStack,
         command: str,
-        candidate: Drawable,
         sent: Carried,
         views: Sequence[Camera],
         args: Sequence[Any],
@@ -171,7 +168,6 @@ class SharedJudging(Owner):
         some = together * max(round(most / (together * _MEETINGS)), 1)
         try:
             _asked(partial(parts.begin, "take", sent, anew=True))
-            self._take(stack, candidate)
             for first in range(0, most, some):
                 now = [each[first : first + some] for each in theirs]
                 pending = _asked(partial(parts.begin, command, Each(now), *args, logged=False))
@@ -234,7 +230,8 @@ class SharedJudging(Owner):
         # What else the line says is how to mend it, which nobody has to.
         _log.warning("nobody else can judge (%s): %s does", str(error).split(":")[0], self._device.info)
         self._parts, self._pool, self._places = None, None, {}
-        self._left.close()
+        abandoned = _Abandoned()
+        self._left.__exit__(type(abandoned), abandoned, None)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -246,6 +243,10 @@ class SharedJudging(Owner):
     def close(self) -> None:
         """Give all device memory back, here and elsewhere."""
         self.__exit__(None, None, None)
+
+
+class _Abandoned(BaseException):
+    """Has parts left without waiting for workers that may stand still."""
 
 
 class _NobodyElse(Exception):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from potr_cl.errors import UsageError
+from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera, camera_centres
 from potr_cl.model.placement.given_views import GivenViews
 from potr_cl.model.views_between import is_between, views_between
@@ -142,3 +143,28 @@ def test_parts_of_a_scene_are_shown_by_the_views_that_face_them():
     # Cameras in one place all show the same half.
     here = [dataclasses.replace(ORBIT[0], name=f"{number}") for number in range(5)]
     assert set(GivenViews(BALL, here).views_of_parts()) == {5}
+
+
+def test_views_are_allowed_together_as_one_by_one():
+    """Those within the ball, those that look away, and those whose place is no number among them."""
+    known = GivenViews(BALL, ORBIT)
+    inside = looking(np.array([0.0, 0, 0.97]), np.zeros(3))
+    away = dataclasses.replace(ORBIT[0], rotation=np.diag([1.0, -1, -1]) @ ORBIT[0].rotation)
+    nowhere = dataclasses.replace(ORBIT[0])
+    object.__setattr__(nowhere, "translation", np.array([0, np.nan, 0]))
+    views = [*views_between(BALL, ORBIT, 3, 0.3), inside, away, nowhere, *ORBIT]
+    beside = [number % len(ORBIT) for number in range(len(views))]
+    with thread_pool(3) as pool:
+        together = known.allow(views, beside, pool.map)
+    assert together == [known.allow([view], [number])[0] for view, number in zip(views, beside, strict=True)]
+    assert together[-15:-12] == [False] * 3
+    assert sum(together) > 30
+
+
+def test_threads_find_the_same_views():
+    with thread_pool(3) as pool:
+        found = views_between(BALL, ORBIT, 4, 0.3, run=pool.map)
+    for one, other in zip(found, views_between(BALL, ORBIT, 4, 0.3), strict=True):
+        assert one.name == other.name
+        assert np.array_equal(one.rotation, other.rotation)
+        assert np.array_equal(one.translation, other.translation)

@@ -154,6 +154,23 @@ def test_the_same_figures(lost, scene, device, judged, caplog):
     assert ("nobody else can judge" in caplog.text) == (lost == 2)
 
 
+@pytest.mark.slow
+def test_nobody_waits_for_a_judge_that_stands_still(scene, device, judged, caplog):
+    coded, views, expected = judged
+    with local_cluster(1) as cluster, ClusterPool(cluster.scheduler_address, device, patience=2.0) as pool:
+        (worker,) = cluster.workers.values()
+        process = process_of(worker)
+        try:
+            with Evaluator(device, scene, views, (0, 0, 0), pool) as evaluator, coded.on(device) as candidate:
+                began = time.monotonic()
+                judge = evaluator.judge(candidate, lambda what, done: done and os.kill(process, signal.SIGSTOP), coded)
+                assert judge == expected
+            assert time.monotonic() - began < 30
+        finally:
+            os.kill(process, signal.SIGCONT)
+    assert "nobody else can judge" in caplog.text
+
+
 def test_scenes_are_compared_by_a_cluster(scene, cameras, device, judged, tmp_path):
     coded, _, _ = judged
     (tmp_path / "b.potr").write_bytes(coded.data)

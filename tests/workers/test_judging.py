@@ -124,7 +124,7 @@ def test_a_candidate_of_the_host_is_judged_too(plush_excerpt, cameras, coded, fa
 
 
 @pytest.mark.parametrize("kind", [HostPool, ElsewherePool])
-@pytest.mark.parametrize("command", ["take", "figures"])
+@pytest.mark.parametrize("command", ["__init__", "take", "figures"])
 @pytest.mark.parametrize("lost", ["one", "all"])
 def test_a_worker_that_is_lost(plush_excerpt, cameras, coded, family, kind, command, lost, monkeypatch, caplog):
     views = EvaluationViews.of(cameras)
@@ -133,7 +133,7 @@ def test_a_worker_that_is_lost(plush_excerpt, cameras, coded, family, kind, comm
     real = getattr(JudgingPart, command)
 
     def failing(self, *args):
-        if lost == "all" or self._device is devices[1]:
+        if lost == "all" or (args[0] if command == "__init__" else self._device) is devices[1]:
             raise DeviceError("the device failed")
         return real(self, *args)
 
