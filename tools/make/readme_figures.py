@@ -126,7 +126,7 @@ SENTENCES: Sequence[tuple[str, Sequence[Figure]]] = (
         ],
     ),
     (
-        "about {} bytes a splat, most of it the re-fit's, and {} bytes a splat and view",
+        "about {} bytes a splat, and {} bytes a splat and view for what is kept of views",
         [
             Figure("memory/growth_fit", {"peak": "host"}, column)
             for column in ("bytes a splat", "bytes a splat and view")
