@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import importlib
 import math
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
 from potr_cl.host.installation import install_command
+from potr_cl.host.silence import without_warnings
 
 #: SSIM's Gaussian window: 11 x 11 pixels, sigma 1.5; the weights from its centre outwards along one axis.
 _RADIUS = 5
@@ -107,8 +107,7 @@ class Lpips:
         if not weights.is_file():
             raise UsageError(f"LPIPS is left out: put torchvision's weights '{weights.name}' into '{folder}'")
         self._torch = torch
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # lpips calls torchvision in a deprecated way
+        with without_warnings():  # lpips calls torchvision in a deprecated way
             try:
                 self._network = lpips.LPIPS(net="vgg", verbose=False)
             except Exception as error:

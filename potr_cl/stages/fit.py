@@ -52,8 +52,8 @@ BETWEEN: dict[Family, float] = {"cpu": 1.0, "gpu": 3.0}
 #: are followed too closely soon; and the most.
 _SQUARE = 10
 _MOST_STEPS: dict[Family, int] = {"cpu": 250, "gpu": 1000}
-#: Part of the steps in each cycle but the last; and of a fit without removed splats, where one with these does not pay.
-_FIRST, _ALONE = 0.25, 0.5
+#: Part of the steps in each cycle but the last.
+_FIRST = 0.25
 #: What a splat costs as a multiple of the error for which pruning would have let it go: what it adds to the error when
 #: it is rounded comes on top.
 _WORTH = 1.25
@@ -118,7 +118,8 @@ class Fit(Stage):
         further: times the ΔMSE_MAX of the pruning before it up to which splats are removed for the fit to make up for,
             where that is 10^-9.3; with its root more for a larger one. 0: none are removed.
         finer: by how much of its way to 1 the q is higher whose hyper-parameters the re-fit and the coder take.
-        cycles: how often splats are removed and a fit follows, each time up to a higher threshold.
+        cycles: how often splats are removed and a fit follows, each time up to a higher threshold; before the first of
+            several, none are.
         iterations: of the pruning in each of them.
         between: views between that the fit looks at, for each given view, unless there are more already. "auto": as
             many as pay on the device.
@@ -151,7 +152,7 @@ class Fit(Stage):
     )
     further: float = option(FURTHER)
     finer: float = option(FINER)
-    cycles: int = option(1)
+    cycles: int = option(2)
     iterations: int = option(16)
     between: float | Literal["auto"] = option("auto")
     photograph_steps: int | Literal["auto"] = option("auto")
@@ -274,10 +275,7 @@ class Fit(Stage):
         return dataclasses.replace(state, views=(*given, *added), added=len(added))
 
     def _cycles(self, state: State, bench: Workbench, targets: Targets | TargetPictures, asked: SupportsBool) -> State:
-        """Remove splats and fit by turns, each time up to a higher threshold, and keep what costs least.
-
-        Where none of that pays, what pruning has left is fitted as it is.
-        """
+        """Remove splats and fit by turns, each time up to a higher threshold, and keep what costs least."""
         price: float | None = state.learnt.get("price")
         worth = 0.0 if price is None else _WORTH * price
         without = held_out_error(bench.opened, state.scene, state.views, targets, state.added, bench.background)
@@ -286,38 +284,29 @@ class Fit(Stage):
         if price is not None:
             least *= _LESS
             further = self.limit(price) / price
-        best = state
+        last = best = state
         taken: Fitted | None = None
-        steps_of = self._steps_of_cycles(bench.opened.family, further > 1)
+        steps_of = self._steps_of_cycles(bench.opened.family, price is not None and further > 1)
         total, done = sum(steps_of) + self.further_steps_on(bench.opened.family), 0
-
-        def tried(start: State, steps: int) -> State:
-            """The state after a fit, whether or not it is the best one."""
-            nonlocal best, least, taken, done
+        for number, steps in enumerate(steps_of):
+            part = number / (len(steps_of) - 1) if len(steps_of) > 1 else 1.0
+            if price is not None and further > 1 and part > 0:
+                last = self._pruned(last, price * further**part, bench)
 
             def progress(now: int, _steps: int, before: int = done) -> None:
-                bench.progress("fit", 0.99 * min((before + now) / total, 1.0))
+                bench.progress("fit", 0.99 * (before + now) / total)
 
-            fitted = self._fitted(start, bench, targets, steps, progress, asked)
-            then, done = dataclasses.replace(start, scene=fitted.scene, geometry=None), done + steps
+            fitted = self._fitted(last, bench, targets, steps, progress, asked)
+            last, done = dataclasses.replace(last, scene=fitted.scene, geometry=None), done + steps
             cost = fitted.error + worth * len(fitted.scene)
             spared = len(state.scene) - len(fitted.scene)
             if cost < least and (spared or fitted.error < _LESS_ALONE * without):
-                best, least = then, cost
+                best, least = last, cost
                 taken = dataclasses.replace(fitted, spared=spared, without=without, cost=cost / plain)
-            return then
-
-        last = state
-        for number, steps in enumerate(steps_of, start=1):
-            if price is not None and further > 1:
-                last = self._pruned(last, price * further ** (number / len(steps_of)), bench)
-            last = tried(last, steps)
             if asked:
                 break
-        if taken is None and further > 1 and not asked:
-            tried(state, max(round(_ALONE * sum(steps_of)), 1))
         if taken is None:
-            why = _INTERRUPTED if asked else _NO_GAIN if further > 1 else _LITTLE_GAIN
+            why = _INTERRUPTED if asked else _NO_GAIN if len(steps_of) > 1 else _LITTLE_GAIN
             return state.having_learnt(self.name, LeftOut(why, bool(asked)))
         return best.having_learnt(self.name, taken)
 

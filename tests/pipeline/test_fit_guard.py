@@ -67,7 +67,7 @@ def test_what_pays_is_taken(judged, plush_excerpt_cameras):
     options = EncodeOptions(q=0.5).changed(prune={"delta_mse_max": 3e-7}, fit={"steps": 50})
     made, _ = judged(train_views(plush_excerpt_cameras), options)
     assert not isinstance(made.fitted, LeftOut)
-    assert made.fitted.spared == 0, "so many splats were removed for it that it did not pay; then it did without"
+    assert made.fitted.spared == 0, "where as many splats go as a fit is to make up for, it does not pay here"
 
 
 @pytest.mark.parametrize(("threshold", "doubt"), [(3e-9, True), (3e-7, False)])

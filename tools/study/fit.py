@@ -136,7 +136,7 @@ _PARTS: dict[str, dict[str, Any]] = {
     "opacities stay": {"rates": _without("opacity_logits")},
     "colours stay": {"rates": _without("dc", "ac")},
     "steps of the quantiser as without a fit": {"finer": 0.0},
-    "splats removed twice, not once": {"cycles": 2},
+    "splats removed once, not twice": {"cycles": 1},
     "no splats removed for it": {"further": 0.0},
     "no views between of its own": {"between": 0},
 }
