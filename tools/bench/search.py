@@ -34,7 +34,6 @@ from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from tools.results import Column, Results, Table
 from tools.workloads import read, scene_parser
 
-
 #: What the page calls a search's steps, where that is another word than the code's.
 _STEPS = {"scout": "rough", "encode": "full", "refit": "re-fit"}
 
