@@ -34,6 +34,9 @@ from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from tools.results import Column, Results, Table
 from tools.workloads import read, scene_parser
 
+#: What the page calls a search's steps, where that is another word than the code's.
+_STEPS = {"scout": "rough", "encode": "full", "refit": "re-fit"}
+
 
 class Timed:
     """Seconds that a block took: by the clock, and of all processors, which other work on them disturbs less."""
@@ -116,7 +119,8 @@ def bench(folder: Path, device: Device, tables: _Tables, args: argparse.Namespac
             psnr = measured(found.encoded)
             kinds = Counter(step.kind for step in found.tries)
             gain, clock, processors = _against(plain, math.log(found.encoded.nbytes), psnr, took)
-            steps = ", ".join(f"{count} {kind}" if count > 1 else kind for kind, count in kinds.items())
+            names = [(_STEPS.get(kind, kind), count) for kind, count in kinds.items()]
+            steps = ", ".join(f"{count} {name}" if count > 1 else name for name, count in names)
             tables.targets.add(
                 folder.name, str(target), found.encoded.nbytes, psnr, gain, found.options.q, steps, clock, processors
             )
