@@ -129,6 +129,13 @@ def test_flags_exist(page: Path) -> None:
                 assert flag in known | elsewhere, f"no command has {flag}"
 
 
+def test_every_extra_is_described() -> None:
+    tomllib = pytest.importorskip("tomllib", reason="since Python 3.11")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    page = (ROOT / "docs" / "install.md").read_text("utf-8")
+    assert [extra for extra in project["optional-dependencies"] if f"`{extra}`" not in page] == []
+
+
 def test_generated_pages_are_current() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "tools.make.docs", "--check"], cwd=ROOT, capture_output=True, text=True, check=False

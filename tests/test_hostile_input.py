@@ -72,7 +72,7 @@ def attack(form: str, tmp_path: Path, count: int, seed: int) -> None:
 
 
 def test_some_changed_files(form, tmp_path):
-    attack(form, tmp_path, 600, 1)
+    attack(form, tmp_path, 300, 1)
 
 
 @pytest.mark.slow

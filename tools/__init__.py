@@ -61,14 +61,18 @@ study.lens_field           which pinhole view should stand for a distorted photo
 
 What happens at the limits (``stress``):
 
-=================  =====================================================================================================
-stress.run         every kernel against float64 on the worst inputs: what error is the kernel's own?
-stress.platforms   the rasterizer, the metrics and the re-fit on every OpenCL runtime of this machine
-stress.simulated   does Oclgrind see a race, an access out of bounds or an uninitialised read in any kernel?
-stress.viewer      do the viewer's memory and time stay bounded, however long its cameras move?
-stress.fuzz        does any changed file do more than be refused or decode to finite numbers?
-stress.native      does the compiled decoder touch memory that is not its own, or differ from NumPy's, on changed files?
-=================  =====================================================================================================
+==================  ====================================================================================================
+stress.run          every kernel against float64 on the worst inputs: what error is the kernel's own?
+stress.platforms    the rasterizer, the metrics and the re-fit on every OpenCL runtime of this machine
+stress.simulated    does Oclgrind see a race, an access out of bounds or an uninitialised read in any kernel?
+stress.viewer       do the viewer's memory and time stay bounded, however long its cameras move?
+stress.fuzz         does any changed file do more than be refused or decode to finite numbers?
+stress.guided       the same of files that are changed towards code that none has reached yet (Atheris)
+stress.bombs        what do files take that unpack to far more than they are, or claim to?
+stress.signals      what is left of a command that is told to end, at any moment?
+stress.determinism  does every command write the same bytes the second time?
+stress.native       does the compiled decoder touch memory not its own, or differ from NumPy's, on changed files?
+==================  ====================================================================================================
 
 What tests and pages are made of (``make``):
 

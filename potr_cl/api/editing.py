@@ -99,6 +99,7 @@ class PrunedScene(Edited):
 
     @property
     def said(self) -> str:
+        """What the command line says of it, a line."""
         part = 100 * self.pruned.kept / self.source_splats
         splats = f"kept {self.pruned.kept:,} of {self.source_splats:,} splats ({part:.1f} %)"
         return f"{splats} in {self.pruned.iterations} iterations"
@@ -116,6 +117,7 @@ class CompactedScene(Edited):
 
     @property
     def said(self) -> str:
+        """What the command line says of it, a line."""
         before, after = (100 * part for part in self.sparsity)
         return f"{len(self.scene):,} splats, {after:.1f} % of the AC coefficients quantise to 0, {before:.1f} % before"
 
@@ -141,6 +143,7 @@ class RefittedScene(Edited):
 
     @property
     def said(self) -> str:
+        """What the command line says of it, a line."""
         before, after = (decibels_of(error) for error in self.refitted.errors)
         views = f"PSNR {after} of {self.views} training views, {before} before"
         return f"{len(self.scene):,} splats re-fitted in {self.refitted.steps} steps, {views}"

@@ -60,6 +60,7 @@ class FittedScene(Edited):
 
     @property
     def said(self) -> str:
+        """What the command line says of it, a line."""
         return f"{len(self.scene)} splats, {self.fitted}"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.proof import proved
 from potr_cl.pipeline.stopwatch import Stopwatch
 from potr_cl.quality.evaluator import EvaluationViews
+from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.report.summary import decibels
 from potr_cl.stages.stage import Progress
 from potr_cl.workers.opening import ClusterSource, DevicesSource, open_workers
@@ -150,22 +152,24 @@ def make_ladder(
         raise UsageError(f"cannot make the folder '{folder}': {error.strerror}") from None
     views = EvaluationViews.of(list(cameras)) if cameras is not None and device is not None and judged else None
     rungs = []
-    for q, file in zip(steps, files[:-1], strict=True):
-        encoded = run_stages(scene, cameras, options.changed(q=q), progress, device, pool=pool)
-        psnr = ssim = None
-        judged_on = None if views is None else encoded.device or device
-        with proved(encoded, trust, judged_on) as written:
-            nbytes, splats = len(written.data), len(written.scene)
-            with replacing(file) as opened:
-                opened.write(written.data)
-            if views is not None and judged_on is not None:
-                judge = Judge(views, judged_on, options.background, pool=pool)
-                quality, _ = judge(scene, written, Stopwatch(progress))
-                psnr, ssim = quality["psnr"], quality["ssim"]
-        rungs.append(Rung(q, file.name, nbytes, splats, psnr, ssim))
-        if tell is not None:
-            figure = "" if views is None else f", {decibels(psnr)}"
-            tell(f"{file}: q {q:g}, {nbytes:,} bytes, {splats:,} splats{figure}")
+    # The uncompressed scene stays on the device from one quality to the next, where there is room.
+    with nullcontext() if device is None else KeptScene(device, scene, options.memory) as kept:
+        for q, file in zip(steps, files[:-1], strict=True):
+            encoded = run_stages(scene, cameras, options.changed(q=q), progress, device, kept=kept, pool=pool)
+            psnr = ssim = None
+            judged_on = None if views is None else encoded.device or device
+            with proved(encoded, trust, judged_on) as written:
+                nbytes, splats = len(written.data), len(written.scene)
+                with replacing(file) as opened:
+                    opened.write(written.data)
+                if views is not None and judged_on is not None:
+                    judge = Judge(views, judged_on, options.background, kept=kept, pool=pool)
+                    quality, _ = judge(scene, written, Stopwatch(progress))
+                    psnr, ssim = quality["psnr"], quality["ssim"]
+            rungs.append(Rung(q, file.name, nbytes, splats, psnr, ssim))
+            if tell is not None:
+                figure = "" if views is None else f", {decibels(psnr)}"
+                tell(f"{file}: q {q:g}, {nbytes:,} bytes, {splats:,} splats{figure}")
     ladder = Ladder(files[-1], name.name, options.source_bytes, "" if views is None else str(views), tuple(rungs))
     ladder.save()
     return ladder

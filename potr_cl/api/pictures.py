@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import os
+from collections import deque
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, overload
@@ -26,6 +28,7 @@ from potr_cl.api.views import Viewpoints, told
 from potr_cl.errors import DataError, DeviceError, UsageError
 from potr_cl.formats.images import to_8_bits, write_png
 from potr_cl.host.atomic_write import replacing
+from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.quality.pictures import Renderer
@@ -36,6 +39,8 @@ from potr_cl.report.labels import U8, contact_sheet
 
 #: Pixels along a side of each of a preview's pictures.
 _PREVIEW = 200
+#: Threads that pack pictures, and bytes of pictures that may wait for them.
+_PACKING, _WAITING = 16, 1 << 29
 
 
 class Rendering(NamedTuple):
@@ -273,15 +278,29 @@ def make_folder(folder: Path) -> None:
 
 
 def written_pictures(rasterizer: Renderer, cameras: Sequence[Camera], paths: Sequence[Path]) -> Iterator[Path]:
-    """Render views and write them one after another, so that no more than one is in memory; yields what is written.
+    """Render views and write them, so that few are in memory at a time; yields what is written, in order.
+
+    To pack a picture takes ten times as long as a GPU takes to render it: threads do that while others are rendered.
 
     Raises:
         UsageError: a file cannot be written.
         DeviceError: a view does not fit the device, or the device failed.
     """
-    for camera, path in zip(cameras, paths, strict=True):
-        Rendering(*rasterizer.render(camera)).save(path)
-        yield path
+    packed: deque[tuple[Path, Future[None]]] = deque()
+
+    def written(most: int) -> Iterator[Path]:
+        while len(packed) > most:
+            path, done = packed.popleft()
+            done.result()
+            yield path
+
+    with thread_pool(min(os.cpu_count() or 1, _PACKING)) as pool:
+        for camera, path in zip(cameras, paths, strict=True):
+            rendering = Rendering(*rasterizer.render(camera))
+            packed.append((path, pool.submit(rendering.save, path)))
+            nbytes = rendering.image.nbytes + rendering.transmittance.nbytes
+            yield from written(min(_PACKING, _WAITING // max(nbytes, 1)))
+        yield from written(0)
 
 
 def png_bytes(pixels: U8) -> bytes:

@@ -26,7 +26,7 @@ def pack_integers(values: NDArray[np.integer], signed: bool) -> tuple[bytes, int
 
 
 def unpack_integers(raw: NDArray[np.uint8], planes: int, signed: bool, start: int, stop: int) -> NDArray[np.integer]:
-    """Integers ``start`` to ``stop`` of byte planes, in the narrowest integer type that holds that many planes."""
+    """Integers ``start`` to ``stop`` of byte planes (planes x count,), in the narrowest type that holds as many."""
     count = len(raw) // planes if planes else 0
     if planes == 0:
         return np.zeros(stop - start, np.int8)

@@ -6,7 +6,6 @@ import contextlib
 import io
 import os
 import stat
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from potr_cl.errors import DataError, PotrError, UsageError
 from potr_cl.formats.lfs_pointer import refuse_lfs_pointer
+from potr_cl.host.silence import without_warnings
 from potr_cl.model.scene import FloatArray
 
 # Pillow takes a tenth of the time that a command needs to begin, and few commands see a picture.
@@ -67,9 +67,7 @@ def opened_image(source: Any, formats: tuple[str, ...]) -> Image.Image:
     """
     from PIL import Image
 
-    with warnings.catch_warnings():
-        # A size that Pillow would warn of is checked by whoever calls this.
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+    with without_warnings():  # a size that Pillow would warn of is checked by whoever calls this
         image = Image.open(source, formats=formats)
     if image.format == "WEBP" and getattr(image, "n_frames", 1) != 1:
         image.close()
@@ -99,13 +97,12 @@ def _opened_photograph(path: Path) -> Iterator[Image.Image]:
         # Before it is opened: a pipe would be waited for.
         if not stat.S_ISREG(os.stat(path).st_mode):
             raise UsageError(f"cannot read '{path}': it is not a regular file")
-        with _File(path) as file, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Pillow tells of parts that it leaves out: no colour depends on them
-            with opened_image(file, _FORMATS) as image:
-                width, height = image.size
-                if width * height > _MOST_PIXELS:
-                    raise DataError(f"'{path}' has {width} x {height} pixels, at most {_MOST_PIXELS} are read")
-                yield image
+        # Pillow tells of parts that it leaves out: no colour depends on them.
+        with _File(path) as file, without_warnings(), opened_image(file, _FORMATS) as image:
+            width, height = image.size
+            if width * height > _MOST_PIXELS:
+                raise DataError(f"'{path}' has {width} x {height} pixels, at most {_MOST_PIXELS} are read")
+            yield image
     except PotrError:
         raise
     except (FileNotFoundError, NotADirectoryError, PermissionError) as error:

@@ -7,6 +7,7 @@ no name: nothing is left of it, whatever ends the process.
 from __future__ import annotations
 
 import errno
+import logging
 import math
 import mmap
 import os
@@ -20,6 +21,9 @@ import numpy as np
 
 from potr_cl.errors import PotrError
 from potr_cl.host.leftovers import place_for_temporary_files
+from potr_cl.host.memory_left import memory_left
+
+_log = logging.getLogger("potr_cl")
 
 #: What a file system says that cannot promise room.
 _NO_PROMISE = (errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS)
@@ -27,8 +31,12 @@ _NO_PROMISE = (errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS)
 
 #: Bytes of the largest array that is not mapped where memory is bounded.
 _LARGEST: ContextVar[float] = ContextVar("largest", default=math.inf)
+#: What has found no room on the disk in the innermost block; of the first the log is told.
+_TOLD: ContextVar[list[str]] = ContextVar("told")
 #: It is this part of the memory: of arrays just below it there may be twenty at a time, as of the re-fit's vectors.
 _PART = 1 / 64
+#: So many times as much memory must be left as an array takes that was to lie in a file.
+_PLENTY = 3
 #: Rows that are copied at a time.
 _ROWS = 1 << 18
 
@@ -41,16 +49,40 @@ def bounded(memory: float | None) -> Iterator[None]:
         memory: bytes that the work may take about; None: as before.
     """
     token = _LARGEST.set(_LARGEST.get() if memory is None else _PART * memory)
+    told = _TOLD.set([])
     try:
         yield
     finally:
         _LARGEST.reset(token)
+        _TOLD.reset(told)
 
 
-def array(shape: tuple[int, ...], dtype: Any, what: str) -> np.ndarray[Any, Any]:
-    """A new array, not set: as :func:`numpy.empty`, or, if it is large and memory is bounded, as :func:`mapped`."""
-    large = math.prod(shape) * np.dtype(dtype).itemsize > _LARGEST.get()
-    return mapped(shape, dtype, what) if large else np.empty(shape, dtype)
+def array(shape: tuple[int, ...], dtype: Any, what: str, first: bool = False) -> np.ndarray[Any, Any]:
+    """A new array, not set: as :func:`numpy.empty`, or, if it is large and memory is bounded, as :func:`mapped`.
+
+    Where the disk has no room for a later one, hours of work may be lost. So it is kept in memory then, if there is
+    plenty; the logger "potr_cl" is told.
+
+    Args:
+        shape, dtype, what: as of :func:`mapped`.
+        first: whether it is what the work begins with: nothing is lost yet.
+
+    Raises:
+        As :func:`mapped`.
+    """
+    nbytes = math.prod(shape) * np.dtype(dtype).itemsize
+    if nbytes <= _LARGEST.get():
+        return np.empty(shape, dtype)
+    try:
+        return mapped(shape, dtype, what)
+    except PotrError as error:
+        if first or memory_left() < _PLENTY * nbytes:
+            raise
+        told = _TOLD.get([])
+        if not told:
+            _log.warning("%s; it and what follows takes memory beyond --memory now", error)
+        told.append(what)
+        return np.empty(shape, dtype)
 
 
 def rows(values: np.ndarray[Any, Any], numbers: np.ndarray[Any, Any] | None, what: str) -> np.ndarray[Any, Any] | None:

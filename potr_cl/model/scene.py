@@ -230,7 +230,7 @@ class Scene:
 
         Args:
             other: the other one.
-            order: their numbers, those of the other one's splats counted on from this one's.
+            order: (N,) their numbers, those of the other one's splats counted on from this one's.
         """
         given = [
             (self.means, other.means),

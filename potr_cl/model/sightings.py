@@ -103,7 +103,7 @@ class Poses:
         return Poses(self.centres[views], self.rotations[views], self.windows[views], self.near)
 
     def moved(self, axes: F64, scale: float, shift: F64) -> Poses:
-        """The same cameras after the world was moved: x became scale · axes x + shift."""
+        """The same cameras after the world was moved: x became scale · axes x + shift, axes (3, 3), shift (3,)."""
         with np.errstate(over="ignore", invalid="ignore"):
             centres = scale * self.centres @ axes.T + shift
         return Poses(centres, self.rotations @ axes.T, self.windows, self.near * scale)

@@ -73,29 +73,31 @@ def views_between(
     if each == 0 or len(cameras) < 2:
         return []
     known = known or GivenViews(scene, cameras, run)
-    known.recall()
     centres = camera_centres(cameras)
     distance = np.linalg.norm(centres[:, None] - centres, axis=2)
     np.fill_diagonal(distance, np.inf)
     neighbours = np.argsort(distance, axis=1, kind="stable")[:, :_NEIGHBOURS]
 
-    def view_of(turn_and_number: tuple[int, int]) -> Camera | None:
-        turn, number = turn_and_number
-        random = np.random.default_rng((turn, number))
+    draws = []
+    for turn, number in (wanted := _rounds(len(cameras), each, first)):
         others = neighbours[number][np.isfinite(distance[number][neighbours[number]])]
-        draw = _Draw.drawn(random, len(others))
-        other = cameras[others[draw.neighbour]]
-        off = spread
-        for _ in range(_TRIES):
-            view = dataclasses.replace(
-                _between(cameras[number], other, draw, off), name=f"{_PREFIX}{turn}_{number:04d}", split="train"
+        draw = _Draw.drawn(np.random.default_rng((turn, number)), len(others))
+        draws.append((cameras[number], cameras[others[draw.neighbour]], draw))
+    found: list[Camera | None] = [None] * len(wanted)
+    left, off = list(range(len(wanted))), spread
+    for _ in range(_TRIES):
+        views = [
+            dataclasses.replace(
+                _between(*draws[place], off), name=f"{_PREFIX}{wanted[place][0]}_{wanted[place][1]:04d}", split="train"
             )
-            if known.allow(view, number):
-                return view
-            off *= _NEARER
-        return None
-
-    return [view for view in run(view_of, _rounds(len(cameras), each, first)) if view is not None]
+            for place in left
+        ]
+        fits = known.allow(views, [wanted[place][1] for place in left], run)
+        for place, view, fit in zip(left, views, fits, strict=True):
+            found[place] = view if fit else None
+        left = [place for place, fit in zip(left, fits, strict=True) if not fit]
+        off *= _NEARER
+    return [view for view in found if view is not None]
 
 
 def _rounds(count: int, each: float, first: int) -> list[tuple[int, int]]:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import threading
-import warnings
 from collections import defaultdict
 from collections.abc import Hashable, Iterator
 from contextlib import contextmanager
 
+from potr_cl.host.silence import without_warnings
+
 _turns = threading.Lock()
 #: Held by who builds or loads a program, by the program; of all programs of CPUs there is one.
 _locks: defaultdict[Hashable, threading.Lock] = defaultdict(threading.Lock)
-_silences: list[warnings.catch_warnings[None]] = []
-_builders = 0
 
 
 @contextmanager
@@ -27,21 +26,7 @@ def building(program: Hashable, alone: bool) -> Iterator[None]:
         alone: whether no other program may be built at a time: the compilers of CPUs have threads of their own, and
             not all of them may be called by several.
     """
-    global _builders
     with _turns:
         lock = _locks[None if alone else program]
-    with lock:
-        with _turns:
-            # Python has one list of filters for all threads: the first of them changes it, the last puts it back.
-            _builders += 1
-            if _builders == 1:
-                _silences.append(silence := warnings.catch_warnings())
-                silence.__enter__()
-                warnings.simplefilter("ignore")
-        try:
-            yield
-        finally:
-            with _turns:
-                _builders -= 1
-                if _builders == 0:
-                    _silences.pop().__exit__(None, None, None)
+    with lock, without_warnings():
+        yield

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import functools
 import re
-import warnings
 
 import pyopencl as cl
+
+from potr_cl.host.silence import without_warnings
 
 _EMPTY_PROGRAM = "kernel void nothing(void) {}"
 #: What pyopencl puts before and after the compiler's own words.
@@ -34,8 +35,7 @@ def fault(device: cl.Device) -> str | None:
     Costs a few hundredths of a second, once a device and process.
     """
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", cl.CompilerWarning)
+        with without_warnings():
             # Without pyopencl's cache: what a compiler could do once, before a driver or a CPU changed, proves nothing.
             cl.Program(cl.Context([device]), _EMPTY_PROGRAM).build(["-cl-std=CL1.2"], cache_dir=False)
     except cl.Error as error:

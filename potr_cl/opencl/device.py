@@ -26,8 +26,8 @@ from potr_cl.opencl.source import kernel_source
 
 logger = logging.getLogger("potr_cl")
 
-#: Threads that build programs at a time.
-_BUILDERS = 8
+#: Threads that load programs at a time; drivers build one after another, whatever the threads.
+_BUILDERS = 2
 
 #: Bytes that the driver fills; more are filled by a kernel, with work-groups of so many work-items.
 _FILLED, _FILLING = 1 << 30, 256

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import importlib
 import math
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
 from potr_cl.host.installation import install_command
+from potr_cl.host.silence import without_warnings
 
 #: SSIM's Gaussian window: 11 x 11 pixels, sigma 1.5; the weights from its centre outwards along one axis.
 _RADIUS = 5
@@ -39,6 +39,9 @@ def _clamped(image: NDArray[Any]) -> NDArray[np.float64]:
 def psnr(image: NDArray[Any], reference: NDArray[Any]) -> float:
     """Peak signal-to-noise ratio in decibels, of the squared error's mean over pixels and channels.
 
+    Args:
+        image, reference: (H, W, 3), from 0 to 1; what lies beyond is clamped.
+
     Returns:
         Infinity where the pictures are identical.
     """
@@ -47,7 +50,7 @@ def psnr(image: NDArray[Any], reference: NDArray[Any]) -> float:
 
 
 def ssim(image: NDArray[Any], reference: NDArray[Any]) -> float:
-    """Structural similarity (Wang et al. 2004), averaged over all pixels and channels.
+    """Structural similarity (Wang et al. 2004) of pictures (H, W, 3), averaged over all pixels and channels.
 
     The window is a Gaussian of 11 x 11 pixels with sigma 1.5 and the pictures are continued with zeros beyond their
     borders, as the original 3DGS implementation does. Statistics are taken in float64.
@@ -104,8 +107,7 @@ class Lpips:
         if not weights.is_file():
             raise UsageError(f"LPIPS is left out: put torchvision's weights '{weights.name}' into '{folder}'")
         self._torch = torch
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # lpips calls torchvision in a deprecated way
+        with without_warnings():  # lpips calls torchvision in a deprecated way
             try:
                 self._network = lpips.LPIPS(net="vgg", verbose=False)
             except Exception as error:

@@ -18,6 +18,7 @@ from potr_cl.opencl.memory import Owner
 from potr_cl.quality.figures import ViewFigures
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.quality.judging import Judging, JudgingPart, Looks
+from potr_cl.quality.metrics_device import in_batches
 from potr_cl.raster.carried import Carried, HostScene, LentScene
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
@@ -28,9 +29,8 @@ from potr_cl.workers.pool import Pool
 
 #: A larger uncompressed scene is not sent to another computer to be judged there: its pictures take less time here.
 _SENT_ANYWAY = 1 << 28
-#: How often several devices meet while they judge, so that one can tell how far they are; and views that a GPU renders
-#: from one time to the next at least.
-_MEETINGS, _LEAST_GPU = 16, 4
+#: About how often several devices meet while they judge, so that one can tell how far they are.
+_MEETINGS = 16
 
 _log = logging.getLogger("potr_cl")
 
@@ -71,9 +71,9 @@ class SharedJudging(Owner):
         if isinstance(reference, KeptScene):
             here = reference.drawable(device, reference.scene)
             there = isinstance(here, SceneBuffers)
-            # What is not kept there takes too much of what the user allows.
+            large = reference.is_large_for(device)
             self._groups = groups_worth_it(
-                device, reference.scene, views, looks.rules.near, there, not there, reference.groups
+                device, reference.scene, views, looks.rules.near, there, large, reference.groups
             )
         else:
             here = reference
@@ -165,9 +165,10 @@ class SharedJudging(Owner):
         for camera in views:
             dealt[self._places.get(camera.name, -1)].append(camera)
         *theirs, mine = dealt
-        least = _LEAST_GPU if self._device.family == "gpu" else 1
         most = max(map(len, dealt))
-        some = max(least, -(-most // _MEETINGS))
+        # Views that are rendered together are not torn apart: that would take longer.
+        together = max(len(next(in_batches(self._device, views), ())), 1)
+        some = together * max(round(most / (together * _MEETINGS)), 1)
         try:
             _asked(partial(parts.begin, "take", sent, anew=True))
             self._take(stack, candidate)
@@ -230,7 +231,8 @@ class SharedJudging(Owner):
         return scene if there or self._anyway else None
 
     def _lose_parts(self, error: DeviceError) -> None:
-        _log.warning("nobody else can judge (%s): %s does", error, self._device.info)
+        # What else the line says is how to mend it, which nobody has to.
+        _log.warning("nobody else can judge (%s): %s does", str(error).split(":")[0], self._device.info)
         self._parts, self._pool, self._places = None, None, {}
         self._left.close()
 

@@ -17,7 +17,7 @@ LARGEST_SCALE = 1e12
 
 
 def activated_scales(log_scales: FloatArray) -> F64:
-    """Standard deviations, world units, of their natural logarithms."""
+    """(N, 3) standard deviations, world units, of their natural logarithms."""
     return np.minimum(np.exp(np.minimum(log_scales.astype(np.float64), 100)), LARGEST_SCALE)
 
 
@@ -35,7 +35,7 @@ def unit_quaternions(quaternions: FloatArray) -> F64:
 
 
 def log2_opacities(logits: FloatArray) -> F64:
-    """Logarithms to base 2 of the opacities that have these logits."""
+    """(N,) logarithms to base 2 of the opacities that have these logits, (N,)."""
     wide = logits.astype(np.float64)
     # log(sigmoid(logit)): logaddexp says the same, and takes eight times as long.
     logarithms: F64 = (np.minimum(wide, 0) - np.log1p(np.exp(-np.abs(wide)))) / np.log(2)

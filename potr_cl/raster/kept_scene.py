@@ -19,11 +19,13 @@ from potr_cl.model.splat_groups import SplatGroups
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
 from potr_cl.raster.carried import Carried
-from potr_cl.raster.scene_buffers import Drawable, SceneBuffers, gathered, uploaded
+from potr_cl.raster.scene_buffers import Drawable, SceneBuffers, copied, gathered, uploaded
 from potr_cl.raster.view_shares import Excerpt
 
 #: A scene that takes more than this part of the device's memory is not kept: others may need the room.
 _PART = 10
+#: Nor is it there for a while if it takes more than this one.
+_AWHILE = 3
 #: The whole scene is on the device too where that has so many times as much memory.
 _WHOLE = 3
 
@@ -43,19 +45,28 @@ class KeptScene(Owner):
 
     def __init__(self, device: Device, scene: Scene, memory: int | None = None) -> None:
         self._device, self._scene, self._memory = device, scene, memory
-        self._buffers = self._uploaded(device)
+        self._buffers: SceneBuffers | None = None
+        self._buffers = self._placed(device)
         self._elsewhere: dict[Device, Future[SceneBuffers | None]] = {}
         self._lock = threading.Lock()
         self.groups: SplatGroups | None = None
 
-    def _uploaded(self, device: Device) -> SceneBuffers | None:
-        most = device.info.memory
-        if self._memory is not None and (device.info.kind == "cpu" or device.info.integrated):
-            most = min(most, self._memory)
-        if _PART * self._scene.nbytes <= most:
+    def _placed(self, device: Device) -> SceneBuffers | None:
+        if _PART * self._scene.nbytes <= self._allowed(device):
             with suppress(DeviceMemoryError):
-                return uploaded(device, self._scene)
+                # To make a scene ready on the host takes many times as long as to copy it from device to device.
+                return uploaded(device, self._scene) if self._buffers is None else copied(device, self._buffers)
         return None
+
+    def _allowed(self, device: Device) -> int:
+        """Bytes of a device's memory that there are, or that the user would have taken."""
+        if self._memory is not None and (device.info.kind == "cpu" or device.info.integrated):
+            return min(device.info.memory, self._memory)
+        return device.info.memory
+
+    def is_large_for(self, device: Device) -> bool:
+        """Whether the scene had better not lie whole on a device even for a while."""
+        return _AWHILE * self._scene.nbytes > self._allowed(device)
 
     @property
     def scene(self) -> Scene:
@@ -66,10 +77,6 @@ class KeptScene(Owner):
         """Whether it is this scene."""
         return scene is self._scene
 
-    def subset(self, splats: NDArray[np.int64]) -> Scene:
-        """Some of its splats, on the host."""
-        return self._scene.subset(splats)
-
     def drawable(self, device: Device, scene: Scene) -> Drawable:
         """What to give to a rasterizer for a scene: what is kept, if it is this scene and on this device."""
         if self._buffers is not None and self.is_of(scene) and device is self._device:
@@ -77,11 +84,11 @@ class KeptScene(Owner):
         return scene
 
     def bring_to(self, device: Device) -> Future[SceneBuffers | None]:
-        """Begin to upload it to another device as well, to be kept there too, and do not wait for it."""
+        """Begin to bring it to another device as well, to be kept there too, and do not wait for it."""
         with self._lock:
             if device not in self._elsewhere:
                 # In a thread of its own: what this thread takes may belong to something that fails.
-                self._elsewhere[device] = in_background(self._uploaded, device)
+                self._elsewhere[device] = in_background(self._placed, device)
             return self._elsewhere[device]
 
     def on(self, device: Device) -> Drawable:
@@ -119,7 +126,7 @@ class PartOfKept:
     @cached_property
     def scene(self) -> Scene:
         """The same splats on the host, copied when somebody asks for them."""
-        return self.kept.subset(self.splats)
+        return self.kept.scene.subset(self.splats)
 
 
 @contextmanager

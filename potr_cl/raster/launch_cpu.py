@@ -6,6 +6,7 @@ import pyopencl as cl
 
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.kernel import Kernel
+from potr_cl.raster.long_lists import LongLists
 from potr_cl.raster.rules import RasterRules
 from potr_cl.raster.scene_buffers import SPLAT_GROUP
 from potr_cl.raster.view_set import View, ViewSet, camera_struct
@@ -47,7 +48,13 @@ class CpuLauncher:
         self._scan.launch((1,), (1,))
 
     def enqueue_lists(
-        self, views: ViewSet, bounds: cl.Buffer, counts: cl.Buffer, keys: cl.Buffer, for_frame: bool
+        self,
+        views: ViewSet,
+        bounds: cl.Buffer,
+        counts: cl.Buffer,
+        keys: cl.Buffer,
+        for_frame: bool,
+        long_lists: LongLists | None = None,
     ) -> None:
         (view,) = views.views
         camera, capacity = camera_struct(view.camera), views.capacity

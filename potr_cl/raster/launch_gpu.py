@@ -9,6 +9,7 @@ import pyopencl as cl
 
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.kernel import Kernel
+from potr_cl.raster.long_lists import LONGEST, LongLists
 from potr_cl.raster.rules import RasterRules
 from potr_cl.raster.scene_buffers import SPLAT_GROUP
 from potr_cl.raster.view_set import ViewSet
@@ -55,7 +56,13 @@ class GpuLauncher:
         self._scan.launch((_SCAN, len(views.views)), (_SCAN, 1))
 
     def enqueue_lists(
-        self, views: ViewSet, bounds: cl.Buffer, counts: cl.Buffer, keys: cl.Buffer, for_frame: bool
+        self,
+        views: ViewSet,
+        bounds: cl.Buffer,
+        counts: cl.Buffer,
+        keys: cl.Buffer,
+        for_frame: bool,
+        long_lists: LongLists | None = None,
     ) -> None:
         self._fill.bind(
             views=views.table,
@@ -74,8 +81,11 @@ class GpuLauncher:
             intersections=views.intersections,
             counts=counts,
             capacity=views.capacity,
+            longest=0xFFFFFFFF if long_lists is None else LONGEST,
         )
         _over_tiles(self._sort, views, _SORT)
+        if long_lists is not None:
+            long_lists.enqueue(keys, views.intersections)
         if for_frame:
             return
         self._subtiles.bind(

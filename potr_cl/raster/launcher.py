@@ -12,6 +12,7 @@ import pyopencl as cl
 from potr_cl.opencl.device import Device
 from potr_cl.raster.launch_cpu import CpuLauncher
 from potr_cl.raster.launch_gpu import GpuLauncher
+from potr_cl.raster.long_lists import LongLists
 from potr_cl.raster.rules import RasterRules
 from potr_cl.raster.view_set import ViewSet
 
@@ -44,7 +45,13 @@ class RasterLauncher(Protocol):
         """
 
     def enqueue_lists(
-        self, views: ViewSet, bounds: cl.Buffer, counts: cl.Buffer, keys: cl.Buffer, for_frame: bool
+        self,
+        views: ViewSet,
+        bounds: cl.Buffer,
+        counts: cl.Buffer,
+        keys: cl.Buffer,
+        for_frame: bool,
+        long_lists: LongLists | None = None,
     ) -> None:
         """Enqueue tile lists, depth order and sub-tiles of views that have offsets and room.
 
@@ -53,6 +60,7 @@ class RasterLauncher(Protocol):
             keys: room for the sort keys.
             for_frame: whether the view will only be composited, once. Then sub-tiles are left out if
                 :meth:`enqueue_composite` does not need them.
+            long_lists: sorts long lists, which it has found; None: they are sorted as others are.
         """
 
     def enqueue_composite(

@@ -164,6 +164,10 @@ class Picks:
             DeviceError: the device has no room.
         """
         found = memory.allocate(4 * self.counts[choice], "the numbers of a view's splats")
-        write = self._write.bind(**self._arguments, choice=choice, starts=self._starts, numbers=found)
-        write.launch((self._items,), (_GROUP,))
+        self.numbers_into(found, 0, choice)
         return found
+
+    def numbers_into(self, buffer: cl.Buffer, first: int, choice: int) -> None:
+        """Enqueue the same, from a place in a buffer on."""
+        write = self._write.bind(**self._arguments, choice=choice, starts=self._starts, first=first, numbers=buffer)
+        write.launch((self._items,), (_GROUP,))

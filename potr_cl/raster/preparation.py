@@ -59,7 +59,7 @@ class Preparation(Owner):
                 views.found_offsets = views.read_offsets()
                 found = _accepted(views, [int(offsets[-1]) for offsets in views.found_offsets])
                 views.make_room(found)
-                self._enqueue_lists(views, for_frame=False)
+                self._enqueue_lists(views, for_frame=False, known=True)
         except BaseException:
             if len(cameras) > 1:
                 self._rest()
@@ -130,10 +130,19 @@ class Preparation(Owner):
         self._projection.enqueue(views, bounds)
         self._launcher.enqueue_offsets(views, bounds, counts)
 
-    def _enqueue_lists(self, views: ViewSet, for_frame: bool) -> None:
+    def _enqueue_lists(self, views: ViewSet, for_frame: bool, known: bool = False) -> None:
+        """Enqueue what follows the offsets, which the host may know."""
         memory = self.memory
         memory.keys.reserve(self._launcher.key_bytes * views.capacity)
-        self._launcher.enqueue_lists(views, memory.bounds.buffer, memory.counts.buffer, memory.keys.buffer, for_frame)
+        some_are_long = known and self._launcher.whole_sets and memory.long_lists.find(views)
+        self._launcher.enqueue_lists(
+            views,
+            memory.bounds.buffer,
+            memory.counts.buffer,
+            memory.keys.buffer,
+            for_frame,
+            memory.long_lists if some_are_long else None,
+        )
 
     def _rest(self) -> None:
         self._prepared_several = False

@@ -7,6 +7,7 @@ import pyopencl as cl
 
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner, Scratch
+from potr_cl.raster.long_lists import LongLists
 
 
 class PreparingMemory(Owner):
@@ -17,6 +18,7 @@ class PreparingMemory(Owner):
 
     Attributes:
         bounds, counts, keys: the tiles that splats touch, the tiles' counters, and the lists while they are sorted.
+        long_lists: sorts those that one work-group would be long with.
         image, transmittance: of pictures.
     """
 
@@ -25,6 +27,7 @@ class PreparingMemory(Owner):
         self.bounds = Scratch(device, "the projected splats' bounds")
         self.counts = Scratch(device, "the tile counts")
         self.keys = Scratch(device, "the tile lists' sort keys")
+        self.long_lists = LongLists(device)
         self.image = Scratch(device, "the image")
         self.transmittance = Scratch(device, "the transmittance")
 
@@ -36,8 +39,8 @@ class PreparingMemory(Owner):
 
     def rest(self) -> None:
         """Give all back but the pictures."""
-        for scratch in (self.bounds, self.counts, self.keys):
-            scratch.close()
+        for owner in (self.bounds, self.counts, self.keys, self.long_lists):
+            owner.close()
 
     def close(self) -> None:
         self.rest()

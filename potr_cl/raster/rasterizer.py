@@ -172,6 +172,11 @@ class Rasterizer(Owner):
             image, _ = self.render_device(camera)
             copied(image, camera.width * camera.height)
 
+    def pictures_into(self, views: ViewSet, target: cl.Buffer, start: int = 0) -> None:
+        """Enqueue the pictures of prepared views, one behind the other into a buffer from byte ``start`` on."""
+        self._enqueue_composite(views)
+        cl.enqueue_copy(self.device.queue, target, self._image.buffer, byte_count=12 * views.pixels, dst_offset=start)
+
     def prepare(self, camera: Camera) -> View:
         """Find projection, tile lists and depth order of a view, which :meth:`composite` can use any number of times.
 

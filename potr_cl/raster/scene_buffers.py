@@ -14,6 +14,7 @@ from potr_cl.model.scene import LOW_PASS, SH_COEFFICIENTS, FloatArray, Scene
 from potr_cl.opencl import sending
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
+from potr_cl.opencl.relay import Lent, Relay
 from potr_cl.raster.activation import activated_scales, log2_opacities, unit_quaternions
 
 #: Splats are padded to a multiple of this and handled in work-groups of it. CPUs are told the work-group too: left to
@@ -383,6 +384,24 @@ def uploaded(device: Device, scene: Scene) -> SceneBuffers:
     buffers = SceneBuffers(device, len(scene), scene.sh.shape[1], scene.antialiased, scene.low_pass)
     try:
         buffers.write(scene, colours=bool(scene.sh.any()))  # new ones are black
+    except BaseException:
+        buffers.close()
+        raise
+    return buffers
+
+
+def copied(device: Device, scene: SceneBuffers) -> SceneBuffers:
+    """The same parameters on another device of this process.
+
+    Raises:
+        DeviceError: the scene does not fit the device, or one of the two failed.
+    """
+    buffers = SceneBuffers(device, scene.splats, scene.sh_count, scene.antialiased, scene.low_pass)
+    try:
+        with Relay(device) as relay:
+            for name in ("means", "scales", "quaternions", "log2_opacities", "sh"):
+                own, its = getattr(buffers, name), getattr(scene, name)
+                relay.fetch(own, Lent(scene.device, its, its.size))
     except BaseException:
         buffers.close()
         raise

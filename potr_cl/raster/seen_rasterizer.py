@@ -9,6 +9,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
+from potr_cl.errors import DeviceMemoryError
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
@@ -17,19 +18,21 @@ from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner, Reused
 from potr_cl.raster.culling import part_seen
 from potr_cl.raster.kept_scene import fits_whole, whole_on_device
-from potr_cl.raster.picked_splats import PickedSplats, Picker, Picks
+from potr_cl.raster.picked_splats import NO_SPLAT, PickedSplats, Picker, Picks
 from potr_cl.raster.preparing_memory import PreparingMemory
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA, RasterRules
-from potr_cl.raster.scene_buffers import Drawable, SceneBuffers, gathered
+from potr_cl.raster.scene_buffers import SPLAT_GROUP, Drawable, SceneBuffers, gathered
 
 #: Smaller scenes are projected whole before their groups are found, and so are scenes of which a view sees more.
 _LEAST_SPLATS, _MOST_SEEN = 1 << 21, 1 / 2
 #: To find the groups takes about as long as a GPU takes to project the whole scene into so many views.
 _VIEWS = 48
-#: On a CPU a view's splats are not gathered faster than all are projected, but they take less memory: they are where a
-#: scene takes more than this part of it.
-_PART = 1 / 20
+#: On a CPU it takes longer to gather a view's splats than to project all, but less memory: so it is done where the
+#: scene takes more than this part of it, once on the host and once for the device.
+_PART = 1 / 6
+#: Views that a GPU renders together at most, and splats of all of them, padding included.
+_TOGETHER, _PROJECTED = 8, 1 << 24
 
 
 class SeenRasterizer(Owner):
@@ -85,17 +88,57 @@ class SeenRasterizer(Owner):
         assert self._picker is not None, "only of scenes that lie on a GPU"
         return Picks(memory, self._picker, seen)
 
-    def draw(self, picks: Picks, number: int, camera: Camera, target: cl.Buffer, start: int) -> None:
-        """Render a view of these into a buffer, from a byte on, without waiting for it.
+    def draw(
+        self, picks: Picks, numbers: Sequence[int], cameras: Sequence[Camera], target: cl.Buffer, start: int = 0
+    ) -> None:
+        """Render some of these views into a buffer, some at a time, without waiting for the last ones.
 
         Args:
             picks: the views' splats.
-            number: of the view among them.
-            camera: the view.
+            numbers: of the views among them.
+            cameras: the views.
             target, start: as of :meth:`render_into`.
+
+        Raises:
+            DeviceError: a view does not fit the device, or the device failed.
         """
-        with self._picked(picks, number) as rasterizer:
-            rasterizer.render_into([camera], target, start, self._passing)
+        first = 0
+        while first < len(numbers):
+            # Together: the longest tile lists of one view keep few work-groups busy.
+            count = self._together([max(picks.counts[number], 1) for number in numbers[first : first + _TOGETHER]])
+            while True:
+                some = slice(first, first + count)
+                try:
+                    start = self._draw_together(picks, numbers[some], cameras[some], target, start)
+                    break
+                except DeviceMemoryError:
+                    if count == 1:
+                        raise
+                    count //= 2
+            first += count
+
+    def _together(self, counts: Sequence[int]) -> int:
+        """How many of the first views are rendered together: each has as much room as the one that shows most."""
+        return max(n for n in range(1, len(counts) + 1) if n == 1 or n * max(counts[:n]) <= _PROJECTED)
+
+    def _draw_together(
+        self, picks: Picks, numbers: Sequence[int], cameras: Sequence[Camera], target: cl.Buffer, start: int
+    ) -> int:
+        """Render views with one launch of each kernel; returns the byte where they end."""
+        assert isinstance(self._scene, SceneBuffers)
+        stride = -(-max(1, *(picks.counts[number] for number in numbers)) // SPLAT_GROUP) * SPLAT_GROUP
+        try:
+            picked = self._passing.allocate(4 * stride * len(numbers), "the numbers of views' splats")
+            self.device.fill(picked, np.uint32(NO_SPLAT), 4 * stride * len(numbers))
+            for place, number in enumerate(numbers):
+                if picks.counts[number]:
+                    picks.numbers_into(picked, place * stride, number)
+            with self._rasterizer(PickedSplats(self._scene, picked, stride, apart=stride)) as rasterizer:
+                views = rasterizer.prepare_set(cameras, self._passing)
+                rasterizer.pictures_into(views, target, start)
+                return start + 12 * views.pixels
+        finally:
+            self._passing.close()
 
     @contextmanager
     def _picked(self, picks: Picks, number: int) -> Iterator[Rasterizer]:
@@ -138,13 +181,13 @@ class SeenRasterizer(Owner):
         seen = self._groups.visible_by(cameras, self.rules.near)
         with Memory(self.device) as memory:
             picks = None if self._picker is None else self.picks(memory, seen)
-            for number, camera in enumerate(cameras):
-                if picks is not None:
-                    self.draw(picks, number, camera, target, start)
-                else:
-                    with self._gathered(seen[number]) as rasterizer:
+            if picks is not None:
+                self.draw(picks, range(len(cameras)), cameras, target, start)
+            else:
+                for own, camera in zip(seen, cameras, strict=True):
+                    with self._gathered(own) as rasterizer:
                         rasterizer.render_into([camera], target, start)
-                start += 12 * camera.width * camera.height
+                    start += 12 * camera.width * camera.height
             with self.device.errors("failed while rendering"):
                 self.device.queue.finish()
 

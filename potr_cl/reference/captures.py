@@ -22,7 +22,7 @@ Capture = tuple[Scene, list[Camera]]
 
 
 def looking(position: F64, at: F64, up: Sequence[float] = (0.0, 0.0, 1.0), name: str = "", wide: float = 0.7) -> Camera:
-    """A camera at a position that looks at a point; ``wide`` is the tangent of half its field of view."""
+    """A camera at a position (3,) that looks at a point (3,); ``wide`` is the tangent of half its field of view."""
     forward = np.asarray(at, np.float64) - position
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, np.asarray(up, np.float64))

@@ -108,7 +108,12 @@ class Pace:
             self._telling.append(usual)
         last = max(took, key=lambda place: took[place])
         others = [seconds for place, seconds in took.items() if place != last]
-        if others and took[last] > _SLOW * median(others) * len(took) / len(others):
+        slow = bool(others) and took[last] > _SLOW * median(others) * len(took) / len(others)
+        # One that something else has kept busy for a moment is forgiven when it has kept up as long.
+        for place, waited in self._waited.items():
+            if place != last or not slow:
+                self._waited[place] = max(waited - usual, 0.0)
+        if slow:
             waited = at.began + took[last] - max(since, at.began + max(others))
             self._waited[last] = self._waited.get(last, 0.0) + max(waited, 0.0)
         work: dict[str, float] = {}

@@ -123,6 +123,12 @@ def test_sizes_as_people_write_them(text, size):
     assert size_in_bytes(text) == size
 
 
+@pytest.mark.parametrize("text", ["8", "1.5", "99 "])
+def test_a_size_without_its_unit(text):
+    with pytest.raises(UsageError, match=f"would be {text.strip()} bytes: give a unit, as in {text.strip()}MB"):
+        size_in_bytes(text)
+
+
 def test_encode_report_page(tmp_path, excerpt, capsys):
     page = tmp_path / "page.html"
     encode = [*excerpt, "--iterations", "4", "-o", tmp_path / "a.potr"]

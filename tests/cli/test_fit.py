@@ -136,7 +136,7 @@ def interrupted(words, times):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals")
-@pytest.mark.parametrize("command", ["encode", "fit"])
+@pytest.mark.parametrize("command", ["encode", pytest.param("fit", marks=pytest.mark.slow)])
 def test_an_interrupted_fit_keeps_its_last_whole_round(paths, command):
     if command == "encode":
         words = ["encode", paths / "scene.ply", "--cameras", paths / "cameras.json", "--keep", "0.5"]

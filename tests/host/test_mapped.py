@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import subprocess
@@ -120,3 +121,52 @@ def test_a_full_disk_is_told_before_anything_is_written(tmp_path):
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("PotrError no room for 0.0 GB of numbers")
     assert not list(tmp_path.iterdir())
+
+
+@linux
+@pytest.mark.parametrize(("left", "first"), [(1 << 62, True), (5_000_000, False), (1 << 62, False)])
+def test_what_finds_no_room_later_is_kept_in_memory_where_there_is_plenty(left, first, monkeypatch, caplog):
+    """But what the work begins with, whose loss is none, and what there is no memory for."""
+
+    def full(descriptor: int, offset: int, nbytes: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    monkeypatch.setattr(mapped, "memory_left", lambda: left)
+    with mapped.bounded(1_000_000):
+        if first or left < 1 << 62:
+            with pytest.raises(PotrError, match=r"no room for 0\.0 GB of numbers"):
+                mapped.array((1_000_000,), np.float32, "numbers", first)
+            assert caplog.text == ""
+        else:
+            array = mapped.array((1_000_000,), np.float32, "numbers", first)
+            assert array.shape == (1_000_000,)
+            assert not in_a_file(array)
+            mapped.array((1_000_000,), np.float32, "others")
+            assert len(caplog.records) == 1  # it is said once
+            assert "no room for 0.0 GB of numbers" in caplog.text
+            assert "it and what follows takes memory beyond --memory now" in caplog.text
+
+
+def test_an_encode_whose_disk_is_full_after_the_scene_was_read_ends_well(
+    plush_excerpt, plush_excerpt_cameras, tmp_path, monkeypatch, caplog
+):
+    plush_excerpt.save(tmp_path / "scene.ply")
+    monkeypatch.setattr(mapped, "_PART", 1e-9)
+    choices = {"preset": "fast", "iterations": 2, "memory": 0.25}
+    wanted = potr_cl.encode(tmp_path / "scene.ply", plush_excerpt_cameras[:4], **choices).data
+    if not hasattr(os, "posix_fallocate"):
+        pytest.skip("the system takes no room beforehand")
+    takes, calls = os.posix_fallocate, []
+
+    def nearly_full(descriptor: int, offset: int, nbytes: int) -> None:
+        calls.append(nbytes)
+        if len(calls) > 1:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        takes(descriptor, offset, nbytes)
+
+    monkeypatch.setattr(os, "posix_fallocate", nearly_full)
+    monkeypatch.setattr(mapped, "memory_left", lambda: 1 << 40)
+    assert potr_cl.encode(tmp_path / "scene.ply", plush_excerpt_cameras[:4], **choices).data == wanted
+    assert len(calls) > 1
+    assert "no room for" in caplog.text

@@ -55,7 +55,7 @@ def test_no_right_cameras_of_the_excerpt_are_refused(plush_excerpt, plush_excerp
     assert not judge_cameras(scene, place_cameras(scene, 40)).suspicious
 
 
-@pytest.mark.parametrize("degree", [3, 0])
+@pytest.mark.parametrize("degree", [3, pytest.param(0, marks=pytest.mark.slow)])
 def test_an_excerpt_belongs_to_the_cameras_of_the_whole_scene(plush_excerpt, plush_views, degree):
     """It is nearly nothing of any picture, and all of them see it."""
     scene = plush_excerpt if degree else without_directions(plush_excerpt)

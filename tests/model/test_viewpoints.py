@@ -117,7 +117,9 @@ def seen(scene: Scene, camera) -> float:
     return float(np.mean((view[:, 2] > 0.2) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)))
 
 
-@pytest.mark.parametrize("scale", [0.01, pytest.param(1.0, marks=pytest.mark.slow), 1000.0])
+@pytest.mark.parametrize(
+    "scale", [pytest.param(0.01, marks=pytest.mark.slow), pytest.param(1.0, marks=pytest.mark.slow), 1000.0]
+)
 def test_a_turntable_turns_evenly_around_the_scene(scale):
     scene = house()
     larger = dataclasses.replace(

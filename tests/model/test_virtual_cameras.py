@@ -189,7 +189,7 @@ def upper_centres(count: int, distance: float) -> np.ndarray:
     return distance * centres / np.linalg.norm(centres, axis=1, keepdims=True)
 
 
-@pytest.mark.parametrize("degree", [2, 3])
+@pytest.mark.parametrize("degree", [pytest.param(2, marks=pytest.mark.slow), 3])
 def test_colours_tell_the_side_that_was_photographed(around_ball, degree):
     centres = camera_centres(place_cameras(trained(BALL, BALL.means, upper_centres(60, 3), degree)))
     elevation = np.degrees(np.arcsin(centres[:, 2] / np.linalg.norm(centres, axis=1)))

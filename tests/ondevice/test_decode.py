@@ -226,6 +226,7 @@ def compiled():
         pytest.skip("the compiled library is not there: python -m tools.make.native, or pip install -e .")
 
 
+@pytest.mark.one_family
 @pytest.mark.parametrize("pinned", [False, True])
 @pytest.mark.parametrize(("beside", "threads"), [(0, 1), (0, 3), (1, 2)])
 def test_memory_that_bundles_take_turns_in(beside, threads, pinned, device, monkeypatch, compiled):

@@ -144,13 +144,17 @@ def test_constant_colours_make_up_for_coarse_coefficients(plush_excerpt, plush_e
 @pytest.mark.parametrize("suffix", [".spz", ".compressed.ply"])
 def test_a_size_is_met(suffix, plush_excerpt, plush_excerpt_cameras, device):
     goal = {".spz": 40_000, ".compressed.ply": 84_000}[suffix]
-    encoded = potr_cl.encode(plush_excerpt, plush_excerpt_cameras, to=suffix, max_size=goal, device=device)
+    encoded = potr_cl.encode(
+        plush_excerpt, plush_excerpt_cameras, to=suffix, max_size=goal, iterations=8, device=device
+    )
     assert 0.9 * goal < encoded.nbytes <= goal
 
 
 @pytest.mark.parametrize(("suffix", "least"), [(".spz", 48), (".compressed.ply", 62)])
 def test_a_psnr_is_met(suffix, least, plush_excerpt, plush_excerpt_cameras, device):
-    encoded = potr_cl.encode(plush_excerpt, plush_excerpt_cameras, to=suffix, min_psnr=least, device=device)
+    encoded = potr_cl.encode(
+        plush_excerpt, plush_excerpt_cameras, to=suffix, min_psnr=least, iterations=8, device=device
+    )
     assert least <= psnr(device, plush_excerpt, encoded.scene, plush_excerpt_cameras) < least + 1.5
 
 

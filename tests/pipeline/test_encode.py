@@ -74,6 +74,7 @@ def test_each_on_its_own(device, plush_excerpt, views):
     assert not np.array_equal(compacted.sh, plush_excerpt.sh)
 
 
+@pytest.mark.one_family
 @pytest.mark.parametrize("compact_at", [0.0, Compact.at, 1.0])
 def test_a_small_memory_budget_gives_the_same_scene(device, plush_excerpt, views, compact_at):
     results = []

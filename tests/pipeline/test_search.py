@@ -85,7 +85,9 @@ class HalfOpaque(Stage):
         return dataclasses.replace(state, scene=scene, geometry=None)
 
 
-@pytest.mark.parametrize("place", [0, pytest.param(-2, marks=pytest.mark.slow), -1])
+@pytest.mark.parametrize(
+    "place", [pytest.param(0, marks=pytest.mark.slow), pytest.param(-2, marks=pytest.mark.slow), -1]
+)
 def test_a_stage_of_ones_own_takes_part_in_a_search_as_in_an_encode(device, plush_excerpt, cameras, place):
     stages = list(EncodeOptions.for_preset("best", prune={"iterations": 4}, refit={"steps": 3}).stages)
     stages.insert(place, HalfOpaque())

@@ -58,8 +58,15 @@ def clusters(seed: int, splats: int = 30_000) -> Scene:
     return dataclasses.replace(scene, means=means.astype(np.float32), log_scales=log_scales.astype(np.float32))
 
 
-@pytest.mark.parametrize("rules", [INRIA, GSPLAT], ids=["inria", "gsplat"])
-@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize(
+    ("rules", "antialiased"),
+    [
+        pytest.param(INRIA, False, id="inria"),
+        pytest.param(GSPLAT, True, id="gsplat, antialiased"),
+        pytest.param(INRIA, True, id="inria, antialiased", marks=pytest.mark.slow),
+        pytest.param(GSPLAT, False, id="gsplat", marks=pytest.mark.slow),
+    ],
+)
 def test_nothing_that_is_drawn_is_left_out(device, rules, antialiased):
     scene = clusters(1).rendered(antialiased)
     groups = SplatGroups.of(scene, 64)

@@ -115,6 +115,7 @@ def test_the_refit_finds_the_least_squares_solution(device):
     assert np.linalg.norm(x - solution) < 1e-3 * np.linalg.norm(solution - exact.start)
 
 
+@pytest.mark.one_family
 @pytest.mark.parametrize("low_pass", LOW_PASSES)
 @pytest.mark.parametrize("preset", ["paper", pytest.param("fast", marks=pytest.mark.slow), "best"])
 def test_a_file_keeps_how_its_scene_is_rendered(device, preset, low_pass):
@@ -134,6 +135,7 @@ def test_a_file_keeps_how_its_scene_is_rendered(device, preset, low_pass):
     assert errors[0] < 0.2 * errors[1]
 
 
+@pytest.mark.one_family
 def test_encoded_as_antialiased_it_looks_better_than_encoded_as_classic(device, plush_excerpt, plush_excerpt_cameras):
     """The same scene at about the same bytes, judged by antialiased pictures of views that no encoder has seen."""
     options = EncodeOptions.for_preset("fast", q=0.5)

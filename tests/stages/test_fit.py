@@ -73,7 +73,11 @@ def test_views_that_judge_find_the_mean_squared_error(device):
         assert found == pytest.approx(mean_error(device, targets, scene, [cameras[k] for k in held_out]), rel=1e-5)
 
 
-@pytest.mark.parametrize("only", [*((name,) for name in PARAMETERS), PARAMETERS], ids=lambda names: "+".join(names))
+@pytest.mark.parametrize(
+    "only",
+    [*(pytest.param((name,), marks=pytest.mark.one_family) for name in PARAMETERS), PARAMETERS],
+    ids=lambda names: "+".join(names),
+)
 def test_errors_of_every_kind_are_mended(device, only):
     """On views that the fit has not seen, too."""
     source = visible_scene(60, 2, seed=3)
@@ -93,6 +97,7 @@ def test_an_antialiased_scene_is_mended(family_device):
     assert result.errors[-1] < 0.3 * result.errors[0]
 
 
+@pytest.mark.one_family
 def test_the_errors_are_those_of_the_views_held_out(family_device):
     source = visible_scene(60, 1, seed=3)
     cameras = ring_of_cameras(9, size=40)
@@ -105,6 +110,7 @@ def test_the_errors_are_those_of_the_views_held_out(family_device):
     assert min(result.errors) == pytest.approx(mean_error(family_device, source, result.scene, judges), rel=1e-4)
 
 
+@pytest.mark.one_family
 def test_splats_that_no_view_sees_stay_as_they_are(family_device):
     source = visible_scene(60, 1, seed=3)
     source.quaternions[:] *= 3  # of no unit length
@@ -119,6 +125,7 @@ def test_splats_that_no_view_sees_stay_as_they_are(family_device):
         assert not np.array_equal(before[6:], after[6:]), name
 
 
+@pytest.mark.one_family
 def test_the_same_bits_every_time_and_others_from_another_seed(family_device):
     source = visible_scene(60, 1, seed=3)
     cameras = ring_of_cameras(8, size=40)
@@ -165,6 +172,7 @@ def test_no_splat_leaves_the_range_of_sizes_and_opacities(family_device):
     assert result.scene.opacity_logits[changed].min() >= -5.5
 
 
+@pytest.mark.one_family
 def test_views_of_several_sizes(family_device):
     source = visible_scene(60, 1, seed=3)
     cameras = [*ring_of_cameras(8, size=40)[::2], *ring_of_cameras(8, size=72)[1::2]]
@@ -172,6 +180,7 @@ def test_views_of_several_sizes(family_device):
     assert result.errors[-1] < 0.3 * result.errors[0]
 
 
+@pytest.mark.one_family
 def test_targets_need_not_all_be_kept(family_device):
     source = visible_scene(60, 1, seed=3)
     cameras = ring_of_cameras(8, size=40)
@@ -233,6 +242,7 @@ def bench_of(device):
     return Workbench(HyperParameters.from_quality(0.5, "best"), device=device)
 
 
+@pytest.mark.one_family
 def test_the_stage_mends_what_pruning_has_left(family_device):
     source = visible_scene(120, 1, seed=3)
     left = np.arange(0, 120, 2)
@@ -294,6 +304,7 @@ def small_views(plush_excerpt_cameras):
     return [resized(camera, 120, 90) for camera in plush_excerpt_cameras if camera.split == "train"]
 
 
+@pytest.mark.one_family
 def test_splats_are_removed_for_the_fit_to_make_up_for(family_device, plush_excerpt, small_views):
     before = priced(plush_excerpt, small_views, PRICE)
     after = priced_fit(2).run(before, bench_of(family_device))
@@ -317,6 +328,7 @@ def priced_fit(further, **options):
     return fit
 
 
+@pytest.mark.one_family
 def test_of_a_given_number_of_splats_none_are_removed(family_device, plush_excerpt, small_views):
     before = dataclasses.replace(State.of(plush_excerpt, small_views), scene=shaken(plush_excerpt, only=("sh",)))
     after = Fit(steps=30).run(before, bench_of(family_device))
@@ -347,6 +359,7 @@ def test_the_threshold_grows_faster_than_what_it_follows():
     assert [Fit(further=0).limit(price) for price in (1e-9, 1e-3)] == [1e-9, 1e-3]
 
 
+@pytest.mark.one_family
 def test_the_best_of_all_cycles_is_kept(family_device, plush_excerpt, small_views):
     """The last one, from too few splats, is not."""
     start, further = priced(plush_excerpt, small_views, PRICE), 12
@@ -359,6 +372,7 @@ def test_the_best_of_all_cycles_is_kept(family_device, plush_excerpt, small_view
     assert len(after.scene) > 1.2 * len(fewest.scene)
 
 
+@pytest.mark.one_family
 def test_views_between_are_its_own(family_device, plush_excerpt, small_views):
     fits = [priced_fit(2, between=between, steps=20) for between in (0, 2)]
     states = [fit.run(priced(plush_excerpt, small_views, PRICE), bench_of(family_device)) for fit in fits]

@@ -59,6 +59,7 @@ def peak(device, source, scene, views, memory):
     return device.most
 
 
+@pytest.mark.one_family
 def test_the_peak_is_what_is_said(device, many_splats, views):
     scene = many_splats.subset(np.arange(20_000))
     with Rasterizer(device, scene) as rasterizer:
@@ -82,6 +83,7 @@ def test_a_budget_of_memory_is_kept(device, many_splats, views):
     assert peak(device, many_splats, many_splats, larger, 10**9) > least + 4 * picture + 100
 
 
+@pytest.mark.one_family
 @pytest.mark.parametrize("own", [False, True], ids=["the host's memory", "memory of its own"])
 def test_the_forecast_knows_of_the_fit(device, own, many_splats, views):
     """Where no view is kept; what kept views take may be more than the fit, which begins when they are gone."""

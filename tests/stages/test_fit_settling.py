@@ -53,6 +53,7 @@ def error_of(device, source, scene, views):
         return np.mean([np.mean((one.render(c)[0] - other.render(c)[0]) ** 2) for c in views])
 
 
+@pytest.mark.one_family
 def test_what_moves_makes_up_for_what_is_rounded(device, plush_excerpt, views):
     before, then, errors, bench = settled(device, plush_excerpt, views, Settling(0, 0.5, 1.0))
     assert isinstance(then.geometry, Geometry)
@@ -99,6 +100,7 @@ def test_coefficients_are_chosen_and_the_rest_moves(device, plush_excerpt, views
     assert not np.array_equal(then.scene.means, plush_excerpt.means)
 
 
+@pytest.mark.one_family
 def test_the_refit_takes_no_coefficient_back(device, plush_excerpt, views):
     """Unless it is asked for other steps, which other coefficients may suit."""
     _, then, _, bench = settled(device, plush_excerpt, views, Settling(0.5, 0.5, 0.1))
@@ -125,6 +127,7 @@ def test_other_kinds_of_files_round_at_once(device, plush_excerpt, views):
     assert errors == ()
 
 
+@pytest.mark.one_family
 def test_the_stage_hands_its_geometry_on(device, plush_excerpt, views):
     bench = Workbench(HyperParameters.from_quality(0.5, "best"), device=device)
     start = State.of(plush_excerpt, views).having_learnt("price", 3e-8)  # about half of the splats are worth it
@@ -139,6 +142,7 @@ def test_the_stage_hands_its_geometry_on(device, plush_excerpt, views):
     assert "as in the file" in str(told)
 
 
+@pytest.mark.one_family
 def test_where_no_splats_were_spared_nothing_is_rounded_yet(device, plush_excerpt, views):
     """The file then has coarser steps than the fit was told."""
     smaller = plush_excerpt.subset(np.arange(0, len(plush_excerpt), 2))

@@ -63,8 +63,8 @@ def crowded(splats: int = 800, degree: int = 1):
     return dataclasses.replace(scene, log_scales=scene.log_scales + 0.5, opacity_logits=logits, sh=sh), cameras
 
 
-def case_of(device, degree: int = 1):
-    scene, cameras = crowded(degree=degree)
+def case_of(device, degree: int = 1, splats: int = 400):
+    scene, cameras = crowded(splats, degree)
     other = dataclasses.replace(scene, sh=scene.sh[::-1].copy())
     return Case(device, scene, other, cameras, background=(0.2, 0.1, 0.0))
 
@@ -108,7 +108,7 @@ def test_not_where_views_reach_much(device, monkeypatch):
 
 
 #: Bytes that all lists fit and some geometry, that some views fit, and none.
-@pytest.mark.parametrize("memory", [None, 700_000, 300_000, 0])
+@pytest.mark.parametrize("memory", [None, 400_000, 150_000, 0])
 def test_products(device, picked, memory):
     with case_of(device, 3) as case:
         direction = np.random.default_rng(5).normal(size=case.scene.sh.shape)
@@ -169,14 +169,13 @@ def test_a_solution(device, picked, way, slices, monkeypatch):
             return result
 
         whole = fitted(False, None)
-        assert same(fitted(True, None), whole)
-        assert same(fitted(True, 500_000), whole)
+        assert same(fitted(True, 300_000), whole)
     assert whole.steps > 3
 
 
 def test_more_views_stay(device, picked):
     """In the memory that two thirds of them fit with all splats."""
-    with case_of(device) as case:
+    with case_of(device, splats=800) as case:
         room = {}
         for on in (False, True):
             picked(on)
@@ -185,6 +184,7 @@ def test_more_views_stay(device, picked):
     assert 10**8 - room[True] < 0.6 * (10**8 - room[False])
 
 
+@pytest.mark.slow
 @pytest.mark.one_runtime
 @pytest.mark.parametrize("part", [0.3, 0.6])
 def test_little_memory_is_enough(device, picked, part, monkeypatch):

@@ -408,7 +408,7 @@ def test_nobody_waits_for_a_device_that_others_read_from(case, monkeypatch):
     with (
         rasterizer,
         Coefficients(device, layout) as vectors,
-        ColourMap(launcher, rasterizer, vectors, case.scene.means, case.cameras, helpers=others) as colour_map,
+        ColourMap(launcher, rasterizer, vectors, case.cameras, helpers=others) as colour_map,
     ):
         x, result = vectors.vector(), vectors.vector()
         vectors.write_sh(x, case.scene.sh)

@@ -50,6 +50,7 @@ def test_a_small_memory_budget_changes_the_time_and_nothing_else(case, memory):
     assert everything.errors == little.errors
 
 
+@pytest.mark.one_family
 @pytest.mark.one_runtime
 @pytest.mark.parametrize(
     "share", [pytest.param(share, marks=[] if share == 0.6 else pytest.mark.slow) for share in (0.2, 0.4, 0.6, 0.9)]

@@ -66,7 +66,7 @@ def sweep(device, scene, cameras, tolerance=0.0, background=(0.0, 0.0, 0.0)):
         yield removal
 
 
-@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 0.3, 0.0)])
+@pytest.mark.parametrize("background", [pytest.param((0.0, 0.0, 0.0), marks=pytest.mark.one_family), (1.0, 0.3, 0.0)])
 def test_single_removals(device, background):
     scene = visible_scene(60, 1)
     cameras = ring_of_cameras(3, size=48)
@@ -143,6 +143,7 @@ def test_sums_kept_over_removals_are_those_of_a_new_sweep(device, plush_excerpt,
         assert np.array_equal(a[left], b[left])
 
 
+@pytest.mark.one_family
 @pytest.mark.one_runtime
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.7])
 def test_a_small_memory_budget_changes_the_time_and_nothing_else(device, plush_excerpt, plush_excerpt_cameras, share):
@@ -346,6 +347,7 @@ def test_views_of_different_sizes_count_the_same(device):
         assert np.allclose(together[i], (separate[0][i] + separate[1][i]) / 2, rtol=1e-5, atol=1e-13)
 
 
+@pytest.mark.one_family
 @pytest.mark.one_runtime
 def test_the_memory_budget_is_used_and_not_exceeded(device):
     """Lists first, then geometry of as many views as there is room for; the effects are the same whatever is kept."""

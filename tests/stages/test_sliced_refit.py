@@ -108,6 +108,7 @@ def test_any_number_of_splats(device, count):
     assert same(sliced, whole)
 
 
+@pytest.mark.one_family
 @pytest.mark.one_runtime
 @pytest.mark.parametrize("own", [False, True], ids=["the host's memory", "memory of its own"])
 def test_little_memory_is_enough(device, own, monkeypatch):
@@ -135,6 +136,7 @@ def test_slices_of_nothing():
         RefitOptions(slices=0)
 
 
+@pytest.mark.one_family
 @pytest.mark.one_runtime
 def test_the_same_file(device, plush_excerpt, plush_excerpt_cameras, monkeypatch):
     """Of a whole encode: with the vectors on the device, or with them and the target pictures on the host."""
@@ -168,6 +170,7 @@ def test_memory_is_that_of_vectors_and_views_together(device, monkeypatch):
     assert room[0] < 3 * one_piece
 
 
+@pytest.mark.one_family
 @pytest.mark.one_runtime
 def test_with_many_views(device):
     """Of which some steps look at every second one."""

@@ -37,6 +37,7 @@ def both(device, half_seen, plush_excerpt_cameras):
     return encode(half_seen, plush_excerpt_cameras, EncodeOptions.for_preset("fast", prune=FEW), device=device)
 
 
+@pytest.mark.one_family
 def test_they_are_kept_and_told_of(both, half_seen, plush_excerpt):
     encoded = both
     kept = encoded.order[encoded.order >= len(plush_excerpt)]
@@ -50,6 +51,7 @@ def test_they_are_kept_and_told_of(both, half_seen, plush_excerpt):
     np.testing.assert_allclose(back.means[beyond], half_seen.means[encoded.order[beyond]], atol=0.2)
 
 
+@pytest.mark.one_family
 def test_the_seen_ones_are_pruned_as_without_the_others(device, both, plush_excerpt, plush_excerpt_cameras):
     options = EncodeOptions.for_preset("fast", prune=FEW)
     alone = encode(plush_excerpt, plush_excerpt_cameras, options, device=device)
@@ -61,6 +63,7 @@ def test_the_seen_ones_are_pruned_as_without_the_others(device, both, plush_exce
     assert alone.unseen.splats == 0
 
 
+@pytest.mark.one_family
 @pytest.mark.parametrize(
     "prune", [{"unseen": "drop"}, pytest.param({"count": 1000}, marks=pytest.mark.slow), {"keep": 0.5}]
 )

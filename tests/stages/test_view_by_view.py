@@ -45,13 +45,14 @@ SOME, TARGETS = 1_600_000, 1_100_000
 
 
 @pytest.mark.parametrize(
-    "memory", [None, SOME, TARGETS, 0], ids=["all fits", "some fits", "targets fit", "nothing fits"]
+    ("memory", "tolerance"),
+    [(None, 0.0), (None, 0.05), (SOME, 0.0), (TARGETS, 0.0), (0, 0.0)],
+    ids=["all fits", "all fits, tolerance", "some fits", "targets fit", "nothing fits"],
 )
-@pytest.mark.parametrize("tolerance", [0.0, 0.05])
 def test_the_same_bits(device, memory, tolerance):
     """While splats go and colours change. Which views are kept is another matter: so none may be skipped there."""
     scene, cameras = street()
-    options = SweepOptions(tolerance if memory is None else 0.0, memory=memory)
+    options = SweepOptions(tolerance, memory=memory)
     rng = np.random.default_rng(1)
     with (
         uploaded(device, scene) as whole,

@@ -100,6 +100,7 @@ def test_from_a_scene_on_the_device(device):
     assert np.array_equal(effects[0], found[0])
 
 
+@pytest.mark.one_family
 def test_spared_splats_stay(device):
     scene, cameras = street()
     spared = np.random.default_rng(2).random(len(scene)) < 0.3
@@ -146,6 +147,7 @@ def test_groups_are_made_only_where_they_can_be_of_use(device, monkeypatch):
     assert 0.2 < visible_parts.seen_part(*street(5, 900)) < 0.45
 
 
+@pytest.mark.one_family
 def test_a_whole_encode_has_the_same_bytes(device, monkeypatch):
     scene, cameras = street(5, 900)
     options = EncodeOptions.for_preset("best", between=False, prune={"iterations": 6}, refit={"steps": 2})

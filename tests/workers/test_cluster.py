@@ -20,8 +20,11 @@ from potr_cl.errors import DeviceError, UsageError
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model import splat_groups
 from potr_cl.opencl.device import Device
+from potr_cl.outputs.coded_scene import CodedScene
+from potr_cl.outputs.potr import Potr
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.stages.pruning import visible_parts
 from potr_cl.workers import pace
 from potr_cl.workers.cluster import ClusterPool
@@ -83,7 +86,9 @@ def expected(scene, cameras, device):
 def test_the_same_bytes(workers, scene, cameras, device, expected):
     with local_cluster(workers) as cluster:
         with ClusterPool(cluster.scheduler_address, device) as pool:
+            assert not pool.has(scene)
             found = encode(scene, cameras, OPTIONS, device=device, pool=pool)
+            assert pool.has(scene)  # to judge by
             again = encode(scene, cameras, OPTIONS, device=device, pool=pool)
         assert found.data == again.data == expected
         assert found.shared is not None
@@ -113,6 +118,55 @@ def test_workers_get_what_their_views_see(device, monkeypatch):
     assert some.shared.sent < every.shared.sent - 0.4 * scene.nbytes
 
 
+@pytest.fixture(scope="module")
+def judged(scene, cameras, device):
+    """A file, views to judge it by, and how it is judged here."""
+    coded = CodedScene(Potr(), encode(scene, None, OPTIONS.changed(prune=False, refit=False, compact=False)).data)
+    views = EvaluationViews.of([dataclasses.replace(c, split="test" if k else "train") for k, c in enumerate(cameras)])
+    with Evaluator(device, scene, views, (0, 0, 0)) as evaluator, coded.on(device) as candidate:
+        return coded, views, evaluator.judge(candidate, lambda what, done: None)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lost", [0, 1, 2])
+def test_the_same_figures(lost, scene, device, judged, caplog):
+    """Workers decode the file, and one that is killed leaves its views to the other, or both to this computer."""
+    coded, views, expected = judged
+
+    with local_cluster(2) as cluster, ClusterPool(cluster.scheduler_address, device) as pool:
+        left = [process_of(worker) for worker in cluster.workers.values()][:lost]
+
+        def killing_at_once(what, done):
+            while done and left:
+                os.kill(left.pop(), signal.SIGKILL)
+
+        with Evaluator(device, scene, views, (0, 0, 0), pool) as evaluator, coded.on(device) as candidate:
+            assert evaluator.judge(candidate, killing_at_once, coded) == expected
+            sent = pool.traffic.sent
+            if not lost:
+                assert evaluator.judge(candidate, lambda what, done: None, coded) == expected
+        assert not left
+    if lost == 0:
+        # The scene went to each once, the file twice.
+        assert 2 * scene.nbytes <= sent < 2 * scene.nbytes + 2 * len(coded.data) + 1000
+        assert 2 * len(coded.data) <= pool.traffic.sent - sent < 2 * len(coded.data) + 1000
+    assert ("its views go to" in caplog.text) == (lost == 1)
+    assert ("nobody else can judge" in caplog.text) == (lost == 2)
+
+
+def test_scenes_are_compared_by_a_cluster(scene, cameras, device, judged, tmp_path):
+    coded, _, _ = judged
+    (tmp_path / "b.potr").write_bytes(coded.data)
+    alone = potr_cl.compare(scene, tmp_path / "b.potr", cameras, device=device)
+    with local_cluster(1) as cluster:
+        for a, b in ((scene, tmp_path / "b.potr"), (coded.data, scene)):
+            found = potr_cl.compare(a, b, cameras, device=device, cluster=cluster.scheduler_address)
+            assert found.psnr == alone.psnr
+            assert [view.figures["b_against_a"].psnr for view in found.figures.views] == [
+                view.figures["b_against_a"].psnr for view in alone.figures.views
+            ]
+
+
 def looks(dask_worker):
     """On a worker: milliseconds between two looks at itself."""
     return [dask_worker.periodic_callbacks[name].callback_time for name in ("tick", "monitor", "profile")]
@@ -123,7 +177,9 @@ def looks_of_scheduler(dask_scheduler):
     return [dask_scheduler.periodic_callbacks[name].callback_time for name in names], list(dask_scheduler.plugins)
 
 
-@pytest.mark.parametrize("own", [True, False], ids=["address", "client"])
+@pytest.mark.parametrize(
+    "own", [pytest.param(True, id="address", marks=pytest.mark.slow), pytest.param(False, id="client")]
+)
 def test_dask_looks_at_its_processes_seldom_meanwhile(own, device):
     with local_cluster(1) as cluster, distributed.Client(cluster, set_as_default=False) as watching:
 

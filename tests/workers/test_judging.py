@@ -20,7 +20,7 @@ from potr_cl.quality.by_photographs import judge_by_photographs
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.quality.judging import JudgingPart
-from potr_cl.raster import culling, seen_rasterizer
+from potr_cl.raster import culling, kept_scene, seen_rasterizer
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rasterizer import Rasterizer, render
 from potr_cl.raster.scene_buffers import SceneBuffers, uploaded
@@ -188,6 +188,11 @@ def test_photographs_are_judged_by_together(plush_excerpt, cameras, coded, tmp_p
     for kind in (HostPool, ElsewherePool):
         with kind(devices) as pool, coded.on(devices[0]) as candidate:
             assert judge_by_photographs(truth, cameras, (plush_excerpt, candidate), devices[0], pool=pool) == expected
+    alone, together = (
+        potr_cl.compare(plush_excerpt, coded.data, cameras, truth=tmp_path, device=some) for some in (device, devices)
+    )
+    assert "b_against_truth" in alone.worst.figures
+    assert together.figures == alone.figures
     assert [device.allocated for device in devices] == [0] * 2
 
 
@@ -275,3 +280,37 @@ def test_pictures_of_what_views_see(family, where, rules):
     if isinstance(drawable, SceneBuffers):
         drawable.close()
     assert device.allocated == 0
+
+
+def test_scenes_are_compared_together(plush_excerpt, cameras, coded, family, monkeypatch):
+    """Scenes of the host and scenes of files."""
+    alone = open_device(family)
+    worse = coded.output.read(coded.data)
+    expected = potr_cl.compare(plush_excerpt, coded.data, cameras, device=alone)
+    assert potr_cl.compare(plush_excerpt, worse, cameras, device=alone).figures == expected.figures
+    done = []
+    figures = JudgingPart.figures
+    monkeypatch.setattr(JudgingPart, "figures", lambda self, some: done.append(len(some)) or figures(self, some))
+    devices = [open_device(family) for _ in range(2)]
+    for a, b in ((plush_excerpt, coded.data), (plush_excerpt, worse)):
+        found = potr_cl.compare(a, b, cameras, device=devices)
+        assert found.figures == expected.figures
+        assert found.worst == expected.worst
+    assert sum(done) == 2 * 2
+    swapped = potr_cl.compare(coded.data, plush_excerpt, cameras, device=devices)
+    assert swapped.psnr == expected.psnr
+    assert [device.allocated for device in devices] == [0] * 2
+
+
+def test_a_ladder_keeps_the_scene_on_the_devices(plush_excerpt, cameras, tmp_path, monkeypatch):
+    options = EncodeOptions.for_preset("fast", prune={"iterations": 2}, between=False)
+    expected = potr_cl.encode_ladder(plush_excerpt, tmp_path / "alone", "0.2,0.4", cameras, options)
+    sent = []
+    upload = kept_scene.uploaded
+    monkeypatch.setattr(kept_scene, "uploaded", lambda device, scene: sent.append(device) or upload(device, scene))
+    devices = [open_device("cpu") for _ in range(2)]
+    found = potr_cl.encode_ladder(plush_excerpt, tmp_path / "together", "0.2,0.4", cameras, options, device=devices)
+    assert found.rungs == expected.rungs
+    assert set(sent) == set(devices)
+    assert len(sent) == 2
+    assert [device.allocated for device in devices] == [0] * 2

@@ -5,13 +5,13 @@
 Scenes of any size are drawn from a trained one (tools.make.large_scene). Each encode runs in a process of its own, so
 that its peak is its own; the host's is the kernel's figure (Linux only) less what the process held before the encode,
 the device's is what was allocated at most. On CPU devices the device's memory is the host's and counts there too. The
-peaks are fitted by
+peaks, of the views that are given and none between them, are fitted by
 
     bytes = constant + a splats + b views + c splats views
 
 --memory is what the views may take, in pruning and in the re-fit each: by so much may the device's peak of a stage
 exceed that of an encode that keeps no view.
-Prints Markdown; --json keeps the figures.
+Prints Markdown; --json keeps the tables.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from tools.bench.memory import reset_peak, resident
 from tools.make.large_scene import DEFAULT_SCENE, EXCERPT, cameras_beside, large_scene, more_views
-from tools.results import circumstances, write_json
+from tools.results import Column, Results
 
 #: Parts of what the views would take that --memory is tried with.
 SHARES = (0.0, 0.1, 0.3, 0.6, 0.9)
@@ -83,7 +83,8 @@ def measure(point: Point, like: Path, size: tuple[int, int], preset: Preset, rou
         path.write_text(json.dumps(entries))
         cameras = load_cameras(path)
     device = CountingDevice(spec)
-    options = EncodeOptions.for_preset(preset, prune={"iterations": rounds}, memory=point.memory)
+    # As many views as are said: of few views, others between them would be looked at too.
+    options = EncodeOptions.for_preset(preset, between=False, prune={"iterations": rounds}, memory=point.memory)
     before = resident("VmRSS")
     reset_peak()
     encode(scene, cameras, options, device.enter, device)
@@ -115,30 +116,48 @@ def fitted(points: Sequence[Point], key: str) -> tuple[list[float], float]:
     return solution.tolist(), float(np.abs(columns @ solution / peaks - 1).max())
 
 
-def print_growth(points: Sequence[Point]) -> None:
-    """The table and the lines."""
-    print("| splats | views | scene MB | host peak MB | device peak MB |\n|---|---|---|---|---|")
+def keep_growth(points: Sequence[Point], results: Results, what: str) -> None:
+    """The tables of peaks and of the lines through them."""
+    table = results.table(
+        "growth",
+        f"Peaks of memory by splats and views, {what}",
+        Column("splats", format=","),
+        Column("views"),
+        Column("scene", "MB", ".1f"),
+        Column("host peak", "MB", ".1f"),
+        Column("device peak", "MB", ".1f"),
+    )
     for p in points:
-        print(f"| {p.splats:,} | {p.views} | {p.scene / 1e6:.1f} | {p.host / 1e6:.1f} | {p.device / 1e6:.1f} |")
-    print("\n| peak | constant MB | bytes a splat | kB a view | bytes a splat and view | largest deviation |")
-    print("|---|---|---|---|---|---|")
+        table.add(p.splats, p.views, p.scene / 1e6, p.host / 1e6, p.device / 1e6)
+    table = results.table(
+        "growth_fit",
+        "A fit of those peaks: constant, by splats, by views, by both",
+        Column("peak"),
+        Column("constant", "MB", ".1f"),
+        Column("bytes a splat", format=".0f"),
+        Column("a view", "kB", ".1f"),
+        Column("bytes a splat and view", format=".1f"),
+        Column("largest deviation", "%", ".1f"),
+    )
     for key in ("host", "device"):
         (constant, a, b, c), deviation = fitted(points, key)
-        print(f"| {key} | {constant / 1e6:.1f} | {a:.0f} | {b / 1e3:.1f} | {c:.1f} | {100 * deviation:.1f} % |")
+        table.add(key, constant / 1e6, a, b / 1e3, c, 100 * deviation)
 
 
-def print_budgets(points: Sequence[Point], unlimited: Point) -> None:
-    """What the views took, against what they might."""
+def keep_budgets(points: Sequence[Point], unlimited: Point, results: Results) -> None:
+    """The table of what the views took, against what they might. The first point is that of views that keep nothing."""
     nothing = points[0]
-    print(
-        f"\n{unlimited.splats:,} splats, {unlimited.views} views, which take "
-        f"{most_taken(unlimited, nothing) / 1e6:.1f} MB if they may"
+    taken = most_taken(unlimited, nothing) / 1e6
+    table = results.table(
+        "budget",
+        f"{unlimited.splats:,} splats, {unlimited.views} views, which take {taken:.1f} MB if they may",
+        Column("`--memory`", "MB", ".1f"),
+        Column("device peak of a stage above that without any view", "MB", ".1f"),
+        Column("of the budget", "%", ".0f"),
     )
-    print("\n| --memory MB | device peak of a stage above that without any view MB | of the budget |\n|---|---|---|")
     for p in points[1:]:
-        taken = most_taken(p, nothing)
         assert p.memory is not None
-        print(f"| {p.memory / 1e6:.1f} | {taken / 1e6:.1f} | {100 * taken / p.memory:.0f} % |")
+        table.add(p.memory / 1e6, most_taken(p, nothing) / 1e6, 100 * most_taken(p, nothing) / p.memory)
 
 
 def most_taken(point: Point, nothing: Point) -> float:
@@ -173,16 +192,9 @@ def main() -> None:
     budgets = [in_process(Point(middle.splats, middle.views, 0), passed)]
     whole = most_taken(middle, budgets[0])
     budgets += [in_process(Point(middle.splats, middle.views, int(s * whole)), passed) for s in SHARES if s]
-    device = Device(args.device)
-    print(
-        f"{device.info}, {args.size} pixels a view, splats drawn from {args.like.parent.name}, preset {args.preset}\n"
-    )
-    print_growth(points)
-    print_budgets(budgets, middle)
-    if args.json:
-        content = {"growth": points, "budgets": budgets}
-        figures = {name: [dataclasses.asdict(point) for point in points] for name, points in content.items()}
-        write_json(args.json, {**circumstances(device.info), **figures})
+    results = Results(Device(args.device).info, args.json)
+    keep_growth(points, results, f"{args.size.replace('x', ' x ')} pixels a view, preset {args.preset}")
+    keep_budgets(budgets, middle, results)
 
 
 if __name__ == "__main__":

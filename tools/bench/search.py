@@ -11,6 +11,7 @@ between them PSNR and time are interpolated in the logarithm of the size. Prints
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
 import time
 from collections import Counter
@@ -70,6 +71,12 @@ def _against(
     return psnr - usual, took.clock / clock, took.processors / processors
 
 
+def _halfway(a: _Plain, b: _Plain) -> tuple[Target, Target]:
+    """A size (to 10 kB) and a PSNR (to 0.1 dB) between two plain encodes."""
+    size = round(math.exp((a.size + b.size) / 2) / 1e4) * 10_000
+    return Target(max_bytes=max(size, 10_000)), Target(min_psnr=round((a.psnr + b.psnr) / 2, 1))
+
+
 @dataclass(frozen=True)
 class _Tables:
     """What all scenes' rows go to."""
@@ -97,6 +104,8 @@ def bench(folder: Path, device: Device, tables: _Tables, args: argparse.Namespac
             plain.append(_Plain(math.log(encoded.nbytes), measured(encoded), took.clock, took.processors))
             tables.plain.add(folder.name, q, encoded.nbytes, plain[-1].psnr, took.clock, took.processors)
         targets = [Target(max_bytes=int(size)) for size in args.sizes] + [Target(min_psnr=psnr) for psnr in args.psnrs]
+        if args.halfway:
+            targets = [target for pair in itertools.pairwise(plain) for target in _halfway(*pair)]
         for target in targets:
             try:
                 with Timed() as took:
@@ -119,6 +128,9 @@ def main() -> None:
     parser.add_argument("--sizes", nargs="*", type=float, default=[1.2e6, 2e6, 3e6, 5e6], help="bytes")
     parser.add_argument("--psnrs", nargs="*", type=float, default=[38, 42, 45], help="dB")
     parser.add_argument("--qualities", nargs="*", type=float, default=[0, 0.05, *(k / 10 for k in range(1, 11))])
+    parser.add_argument(
+        "--halfway", action="store_true", help="instead: a size and a PSNR between each two neighbouring qualities"
+    )
     parser.add_argument("--preset", choices=PRESETS, default="best")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="only every N-th view")
     args = parser.parse_args()

@@ -95,8 +95,8 @@ SENTENCES: Sequence[tuple[str, Sequence[Figure]]] = (
         ],
     ),
     (
-        "lego is at least {} and plush {} times smaller than that format's file, with preset `smallest` {} and {} "
-        "times, and with the training photographs, which one of these formats has seen too, {} and {} times",
+        "lego is at least {} and plush {} times smaller than that format's file. With preset `smallest` it is {} and "
+        "{} times. With the training photographs, which one of these formats has seen too, it is {} and {} times.",
         (
             _smaller("lego", _TUNED),
             _smaller("plush", _PLAIN),
@@ -123,6 +123,13 @@ SENTENCES: Sequence[tuple[str, Sequence[Figure]]] = (
                 "the package without extras",
                 *(f"extra `{extra}`, besides" for extra in ("intel-cpu", "pocl", "convert")),
             )
+        ],
+    ),
+    (
+        "about {} bytes a splat, most of it the re-fit's, and {} bytes a splat and view",
+        [
+            Figure("memory/growth_fit", {"peak": "host"}, column)
+            for column in ("bytes a splat", "bytes a splat and view")
         ],
     ),
     ("`[view]` {} MB", (Figure("install/sizes", {"": "extra `view`, besides"}, "size"),)),

@@ -88,6 +88,7 @@ def test_rounding_moves_a_result_and_not_far():
     assert 0 < np.abs(other.depth / true.depth - 1).max() < 1e-6
 
 
+@pytest.mark.one_family
 def test_a_sound_device_is_not_accused(device):
     for measure, (error, expected) in views.check(device, CASE).items():
         assert error <= 20 * expected, measure

@@ -53,7 +53,8 @@ void count_wanted(
         counts[get_group_id(0)] = sum;
 }
 
-/* starts[w] is where the numbers of work-group w begin. Of several choices of groups it is that of number `choice`. */
+/* starts[w] is where the numbers of work-group w begin, `first` places further on. Of several choices of groups it is
+   that of number `choice`. */
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void write_wanted(
     global const uint *groups,
@@ -65,12 +66,13 @@ void write_wanted(
     uint group_count,
     uint choice,
     global const uint *starts,
+    uint first,
     global uint *numbers)
 {
     local uint sums[GROUP];
     const uint lid = get_local_id(0);
     wanted += (size_t)choice * group_count;
-    uint start = starts[(size_t)choice * get_num_groups(0) + get_group_id(0)];
+    uint start = first + starts[(size_t)choice * get_num_groups(0) + get_group_id(0)];
     for (uint round = 0; round < ROUNDS; ++round) {
         const size_t splat = get_group_id(0) * CHUNK + round * GROUP + lid;
         const uint flag = splat < splats ? is_wanted(groups, wanted, states, by_state, state, splat) : 0;

@@ -58,7 +58,8 @@ void sort_tiles(
     global const uint *offsets,
     global uint *intersections,
     global uint *counts,
-    uint capacity)
+    uint capacity,
+    uint longest)
 {
     local ulong piece_keys[SORT_CAPACITY];
     const uint lid = get_local_id(0);
@@ -74,6 +75,8 @@ void sort_tiles(
     keys += begin;
     if (lid == 0)
         counts[(views->first_tile + tile) * COUNTER_STRIDE] = 0; /* ready for the next view */
+    if (n > longest) /* sort_long_gpu.cl does these */
+        return;
 
     /* Pieces that fit local memory are sorted one by one. */
     for (uint piece = 0; piece < n; piece += SORT_CAPACITY) {

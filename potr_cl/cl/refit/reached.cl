@@ -1,4 +1,4 @@
-/* Which splats a view reaches, for GPUs: one work-group a tile; get_group_id(1) is the view's number in its set.
+/* Which splats a view of a set reaches, for GPUs: one work-group a tile.
 
    A tile's list is walked from front to back until all pixels have ended (subtile_lists.clh). What is behind that makes
    no difference to any bit of what is composited, or of what goes back to splats: nobody fetches it.
@@ -7,10 +7,11 @@
 
 #include "include/subtile_lists.clh"
 
-/* marks[k] = 1 for each splat k that is fetched. The others' marks stay. */
+/* marks[k] = 1 for each splat k that is fetched for view `number`. The others' marks stay. */
 kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1)))
 void mark_reached(
     global const SetView *views,
+    uint number,
     uint stride,
     global const float4 *shapes,
     global const float4 *colours,
@@ -24,7 +25,7 @@ void mark_reached(
     local int unfinished[2];
 
     const int lid = get_local_id(0);
-    const uint tile = get_group_id(0), number = get_group_id(1);
+    const uint tile = get_group_id(0);
     views += number;
     const int2 picture = (int2)(views->view.width, views->view.height);
     const int columns = views->view.columns;
@@ -32,7 +33,6 @@ void mark_reached(
         return;
     shapes += 2 * (size_t)stride * number;
     colours += (size_t)stride * number;
-    marks += (size_t)stride * number;
     offsets += views->first_offset + tile;
     const uint length = offsets[1] - offsets[0];
     intersections += views->first_intersection + offsets[0];

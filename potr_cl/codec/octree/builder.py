@@ -122,7 +122,7 @@ def _build_in_numpy(
 
 
 def leaf_order(means: NDArray[np.float32], tolerance: F64 | float) -> NDArray[np.int64]:
-    """The order that :func:`build` returns, without the streams."""
+    """(N,) the order that :func:`build` returns, without the streams; centres and tolerances as it takes them."""
     functions = native()
     if functions is not None:
         *_, words = _words_of(functions.octree_build, means, tolerance)

@@ -155,7 +155,7 @@ def unfilled(splats: int, coefficients: int) -> Scene:
         np.empty((splats, 3), np.float32),
         np.empty((splats, 4), np.float32),
         np.empty(splats, np.float32),
-        mapped.array((splats, coefficients, 3), np.float32, "SH coefficients"),
+        mapped.array((splats, coefficients, 3), np.float32, "SH coefficients", first=True),
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from functools import cached_property
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,23 +82,35 @@ class GivenViews:
             return None
         return float((sizes.sum(axis=0) ** 2 / (len(sizes) * (sizes**2).sum(axis=0))).mean())
 
-    def recall(self) -> None:
-        """Find out what colours remember, which :meth:`allow` asks, before several threads do."""
-        _ = self._memory
-
-    def allow(self, camera: Camera, beside: int) -> bool:
-        """Whether a camera might have been here.
+    def allow(self, cameras: Sequence[Camera], beside: Sequence[int], run: Run = map) -> list[bool]:
+        """Whether cameras might have been where they are.
 
         That is: not in matter, not where the colours do not remember that they were looked at from there, and not where
-        it would show what no given view shows.
+        they would show what no given view shows.
 
         Args:
-            camera: the view.
-            beside: number of the given view that it lies beside.
+            cameras: the views. To look at many together takes a small part of the time.
+            beside: number of the given view that each lies beside.
+            run: in place of :func:`map`, to work with several threads.
         """
-        if not np.isfinite(camera.translation).all():
-            return False
-        (shown,), (blocked,) = self._look([camera])
+        _ = self._memory  # before several threads ask for it
+        finite = [number for number, camera in enumerate(cameras) if np.isfinite(camera.translation).all()]
+
+        def allowed(first: int) -> list[bool]:
+            some = finite[first : first + _AT_ONCE]
+            shown, blocked = self._look([cameras[number] for number in some])
+            return [
+                self._allows(cameras[number], beside[number], *seen)
+                for number, *seen in zip(some, shown, blocked, strict=True)
+            ]
+
+        found = [False] * len(cameras)
+        fits = chain.from_iterable(run(allowed, range(0, len(finite), _AT_ONCE)))
+        for number, fit in zip(finite, fits, strict=True):
+            found[number] = fit
+        return found
+
+    def _allows(self, camera: Camera, beside: int, shown: F32, blocked: float) -> bool:
         total = float(shown.sum())
         if blocked > self._crowded or total < _FULL * float(self._shown[beside].sum()):
             return False

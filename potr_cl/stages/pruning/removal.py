@@ -145,7 +145,7 @@ class RemovalSweep(Owner):
         return totals
 
     def remove(self, splats: Indices) -> None:
-        """Take splats out of all lists; note how much each tile loses."""
+        """Take splats, (n,) by number, out of all lists; note how much each tile loses."""
         self._cached.settle()
         self._survivors.remove(splats)
         self._cached.note_removal()

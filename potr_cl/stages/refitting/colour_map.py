@@ -24,7 +24,6 @@ import pyopencl as cl
 
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera
-from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.view_set import TABLE_ENTRY, ViewSet
@@ -75,7 +74,6 @@ class ColourMap(Owner):
         launcher: runs the sweeps.
         rasterizer: of the scene's geometry and opacities; its colours are never looked at. It stays the caller's.
         coefficients: whose vectors the map takes and gives.
-        means: (N, 3) float32, the splats' centres.
         cameras: the views that count, all the same whatever their size.
         background: R, G, B behind the splats.
         memory: bytes of device memory that prepared views and targets may take; None: two fifths of
@@ -100,7 +98,6 @@ class ColourMap(Owner):
         launcher: Launcher,
         rasterizer: Rasterizer,
         coefficients: VectorSpace,
-        means: FloatArray,
         cameras: Sequence[Camera],
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         memory: int | None = None,
@@ -123,7 +120,7 @@ class ColourMap(Owner):
         self._views_of_all = len(cameras)
         self.parts = parts_of(len(cameras))
         own_numbers = range(len(cameras)) if numbers is None else numbers
-        reach = reach or reached_splats(rasterizer, cameras, own_numbers)
+        reach = reach or reached_splats(rasterizer, cameras, own_numbers, memory)
         seen = {} if reach is None else {number: len(splats) for number, splats in reach.of.items()}
         # Launches, and what is gathered together, are of one part. Views of a launch have about as many splats.
         self._numbers = sorted(own_numbers, key=lambda each: (each % self.parts, -seen.get(each, 0), each))
@@ -135,9 +132,7 @@ class ColourMap(Owner):
         self._memory = Memory(device)
         self._owned: list[Owner] = [self._memory]
         try:
-            columns = np.zeros((3, layout.stride), np.float32)
-            columns[:, : layout.splats] = means.T
-            self._means = self._memory.upload(columns, "the centres")
+            self._means = rasterizer.parameters.means
             self._view_colours = ViewColours(device, layout, self._means)
             # To render a picture takes many times as long as to project a view, and it takes less room.
             pictures = sum(nbytes(camera) for camera in cameras)

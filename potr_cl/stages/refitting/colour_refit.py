@@ -127,7 +127,7 @@ class ColourRefit(Owner):
             if place is not None:
                 scene = arrived(scene)  # the host has no room for vectors beside what rounds the geometry
                 rasterizer = owned.enter_context(Rasterizer(device, colourless(scene), rules))
-                reach = reached_splats(rasterizer, cameras, range(len(cameras)))
+                reach = reached_splats(rasterizer, cameras, range(len(cameras)), memory)
                 if reach is not None:
                     place = placed(device, layout.splats, layout.sh_count, memory, slices, reach) or place
                 memory = place.views
@@ -149,7 +149,7 @@ class ColourRefit(Owner):
                 rasterizer = owned.enter_context(Rasterizer(device, colourless(here), rules))
             self.colour_map = owned.enter_context(
                 ColourMap(
-                    launcher, rasterizer, self.coefficients, here.means, cameras, background, memory, own, helpers,
+                    launcher, rasterizer, self.coefficients, cameras, background, memory, own, helpers,
                     reach,
                 )
             )  # fmt: skip

@@ -107,7 +107,7 @@ class ColourPart(Part):
             here = arrived(scene)
             rasterizer = owned.enter_context(Rasterizer(device, colourless(here), rules))
             self._map = owned.enter_context(
-                ColourMap(launcher, rasterizer, self._coefficients, here.means, cameras, background, memory, numbers)
+                ColourMap(launcher, rasterizer, self._coefficients, cameras, background, memory, numbers)
             )
             self._targets: Targets = of_source
             if ahead is not None:

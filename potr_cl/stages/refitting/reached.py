@@ -14,6 +14,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
+from potr_cl.errors import DeviceMemoryError
 from potr_cl.model.camera import Camera
 from potr_cl.opencl.memory import Memory, Reused
 from potr_cl.raster.picked_splats import Picker
@@ -26,6 +27,9 @@ LEAST_SPLATS = 1 << 19
 WORTH_IT = 1 / 5
 #: So many views tell.
 _SAMPLED = 12
+#: Views that are looked at together, at most, and in which part of the memory. Bytes of a view for each splat of the
+#: scene: shape, colour, bounds, and few intersections.
+_TOGETHER, _ROOM, _VIEW = 8, 1 / 4, 80
 #: Work-items of a tile's work-group.
 _GROUP = 128
 
@@ -51,13 +55,16 @@ class Reach:
         return max(map(len, self.of.values()))
 
 
-def reached_splats(rasterizer: Rasterizer, cameras: Sequence[Camera], numbers: Sequence[int]) -> Reach | None:
+def reached_splats(
+    rasterizer: Rasterizer, cameras: Sequence[Camera], numbers: Sequence[int], memory: int | None = None
+) -> Reach | None:
     """The splats that each of some views reaches.
 
     Args:
         rasterizer: of the scene.
         cameras: all views.
         numbers: of those that are meant.
+        memory: bytes of the device's memory that the user would have taken; None: as much as there is.
 
     Returns:
         None where views had better share all splats: there are few, or views reach many of them, or it is no GPU.
@@ -71,17 +78,31 @@ def reached_splats(rasterizer: Rasterizer, cameras: Sequence[Camera], numbers: S
     device = rasterizer.device
     passing = Reused(device)
     try:
-        with Memory(device) as memory, Picker(device, np.zeros(rasterizer.splats, np.uint32)) as picker:
-            marks = memory.allocate(rasterizer.stride, "the splats that a view reaches")
+        with Memory(device) as own, Picker(device, np.zeros(rasterizer.splats, np.uint32)) as picker:
+            marks = own.allocate(rasterizer.stride, "the splats that a view reaches")
             some = numbers[:: -(-len(numbers) // _SAMPLED)]
-            for number in (*some, *sorted(set(numbers) - set(some))):
-                if len(found) == len(some) and not _worth_it(found, rasterizer.splats):
+            room = min((device.info.memory if memory is None else memory), device.info.memory - device.allocated)
+            most = int(min(max(room * _ROOM / (_VIEW * rasterizer.stride), 1), _TOGETHER))
+            for views in (some, sorted(set(numbers) - set(some))):
+                left = list(views)
+                while left:
+                    together = left[:most]
+                    of_these = [cameras[number] for number in together]
+                    try:
+                        splats = _reached(rasterizer, of_these, picker, marks, passing)
+                    except DeviceMemoryError:
+                        if len(together) == 1:
+                            raise
+                        most = len(together) // 2
+                        continue
+                    found.update(zip(together, splats, strict=True))
+                    del left[:most]
+                if views is some and not _worth_it(found, rasterizer.splats):
                     return None
-                found[number] = _reached(rasterizer, cameras[number], picker, marks, passing)
     finally:
         passing.give_back()
         rasterizer.rest()
-    return Reach(found) if _worth_it(found, rasterizer.splats) else None
+    return Reach(found)
 
 
 def _worth_it(found: dict[int, NDArray[np.uint32]], splats: int) -> bool:
@@ -89,33 +110,37 @@ def _worth_it(found: dict[int, NDArray[np.uint32]], splats: int) -> bool:
 
 
 def _reached(
-    rasterizer: Rasterizer, camera: Camera, picker: Picker, marks: cl.Buffer, passing: Reused
-) -> NDArray[np.uint32]:
-    device = rasterizer.device
+    rasterizer: Rasterizer, cameras: Sequence[Camera], picker: Picker, marks: cl.Buffer, passing: Reused
+) -> list[NDArray[np.uint32]]:
+    device, rules = rasterizer.device, rasterizer.rules
+    mark = device.shared_kernel(
+        "refit/reached.cl",
+        "mark_reached",
+        ALPHA_CAP=float(rules.alpha_cap),
+        TRANSMITTANCE_THRESHOLD=rules.transmittance_threshold,
+        NATIVE_EXP2=int(device.native_exp2),
+    )
+    found: list[NDArray[np.uint32]] = []
     try:
-        views = rasterizer.prepare_set([camera], passing)
-        device.fill(marks, np.uint8(0))
-        rules = rasterizer.rules
-        mark = device.shared_kernel(
-            "refit/reached.cl",
-            "mark_reached",
-            ALPHA_CAP=float(rules.alpha_cap),
-            TRANSMITTANCE_THRESHOLD=rules.transmittance_threshold,
-            NATIVE_EXP2=int(device.native_exp2),
-        )
-        mark.bind(
-            views=views.table,
-            stride=views.stride,
-            shapes=views.shapes,
-            colours=views.colours,
-            offsets=views.offsets,
-            intersections=views.intersections,
-            subtiles=views.subtiles,
-            marks=marks,
-        )
-        mark.launch((views.tiles * _GROUP, 1), (_GROUP, 1))
-        numbers, count = picker.pick(passing, np.ones(1, bool), marks, 1)
-        found: NDArray[np.uint32] = device.download(numbers, (count,), np.uint32)
+        # Together: the longest tile list of one keeps few work-groups busy.
+        views = rasterizer.prepare_set(cameras, passing)
+        for number, view in enumerate(views.views):
+            device.fill(marks, np.uint8(0))
+            mark.bind(
+                views=views.table,
+                number=number,
+                stride=views.stride,
+                shapes=views.shapes,
+                colours=views.colours,
+                offsets=views.offsets,
+                intersections=views.intersections,
+                subtiles=views.subtiles,
+                marks=marks,
+            )
+            mark.launch((view.tiles * _GROUP,), (_GROUP,))
+            with Memory(device) as memory:
+                numbers, count = picker.pick(memory, np.ones(1, bool), marks, 1)
+                found.append(device.download(numbers, (count,), np.uint32))
     finally:
         passing.close()
     return found

@@ -42,11 +42,7 @@ class VisibleTargets(Owner):
 
     def into(self, numbers: Sequence[int], buffer: cl.Buffer) -> None:
         """See :meth:`potr_cl.stages.refitting.targets.Targets.into`."""
-        start = 0
-        for number in numbers:
-            camera = self._cameras[number]
-            self._pictures.draw(self._picks, number, camera, buffer, start)
-            start += 12 * camera.width * camera.height
+        self._pictures.draw(self._picks, numbers, [self._cameras[number] for number in numbers], buffer)
 
     def close(self) -> None:
         """Give all device memory back."""

@@ -1,0 +1,36 @@
+"""Warnings of libraries that tell a user nothing, not shown while something is done: :func:`without_warnings`.
+
+Python has one list of filters for all threads, and :class:`warnings.catch_warnings` puts back the one that it has
+found. Where two threads use it at overlapping times, the first to end has the other's warnings shown, and the second
+one leaves its own filters behind for good. So all of this package use one block, which is counted.
+"""
+
+from __future__ import annotations
+
+import threading
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+_lock = threading.Lock()
+_silences: list[warnings.catch_warnings[None]] = []
+_blocks = 0
+
+
+@contextmanager
+def without_warnings() -> Iterator[None]:
+    """Show no warning, of any thread, until the last of all blocks that overlap has ended; then all is as before."""
+    global _blocks
+    with _lock:
+        _blocks += 1
+        if _blocks == 1:
+            _silences.append(silence := warnings.catch_warnings())
+            silence.__enter__()
+            warnings.simplefilter("ignore")
+    try:
+        yield
+    finally:
+        with _lock:
+            _blocks -= 1
+            if _blocks == 0:
+                _silences.pop().__exit__(None, None, None)

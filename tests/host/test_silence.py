@@ -1,0 +1,61 @@
+"""Warnings that are not shown while something is done, also where threads do such things at overlapping times."""
+
+from __future__ import annotations
+
+import warnings
+from contextlib import ExitStack
+
+import pytest
+from PIL import Image
+
+from potr_cl.formats.images import opened_image
+from potr_cl.host.silence import without_warnings
+from potr_cl.opencl.building import building
+
+
+def test_nothing_is_shown_until_the_last_block_ends():
+    with warnings.catch_warnings(record=True) as shown:
+        warnings.simplefilter("always")
+        before = list(warnings.filters)
+        first, second = ExitStack(), ExitStack()
+        first.enter_context(without_warnings())
+        second.enter_context(without_warnings())
+        warnings.warn("one", stacklevel=1)
+        first.close()
+        warnings.warn("two", stacklevel=1)
+        second.close()
+        assert list(warnings.filters) == before
+        warnings.warn("three", stacklevel=1)
+    assert [str(each.message) for each in shown] == ["three"]
+
+
+def test_an_error_ends_a_block():
+    with warnings.catch_warnings(record=True) as shown:
+        warnings.simplefilter("always")
+        with pytest.raises(KeyError), without_warnings():
+            raise KeyError
+        warnings.warn("shown", stacklevel=1)
+    assert len(shown) == 1
+
+
+def test_a_photograph_that_is_read_beside_a_build(tmp_path):
+    """One thread reads photographs while another builds kernels, whose compiler chats."""
+    Image.new("RGB", (4, 4)).save(tmp_path / "a.png")
+    with warnings.catch_warnings(record=True) as shown:
+        warnings.simplefilter("always")
+        before = list(warnings.filters)
+        reader, builder = ExitStack(), ExitStack()
+        with pytest.MonkeyPatch.context() as patch:
+
+            def opened(*arguments, **choices):
+                builder.enter_context(building("a program", alone=False))
+                return opened_by_pillow(*arguments, **choices)
+
+            opened_by_pillow = Image.open
+            patch.setattr(Image, "open", opened)
+            reader.enter_context(opened_image(tmp_path / "a.png", ["PNG"]))
+        warnings.warn("chat of a compiler", stacklevel=1)
+        builder.close()
+        reader.close()
+        assert list(warnings.filters) == before
+    assert shown == []

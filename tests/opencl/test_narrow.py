@@ -1,0 +1,67 @@
+"""Integers arrive as they were, in the bytes that they need."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from potr_cl.opencl.memory import Memory
+from potr_cl.opencl.narrow import Narrowed, Narrowing
+from tests.devices import KERNELS, open_device
+
+
+def integers(count, seed):
+    """Runs of all widths, with the least and the greatest of each."""
+    rng = np.random.default_rng(seed)
+    bits = np.repeat(rng.integers(0, 64, -(-count // 64)), 64)[:count]
+    values = np.array([int(rng.integers(-(1 << b), 1 << b)) if b < 63 else int(rng.integers(-(2**63), 2**63 - 1))
+                       for b in bits.tolist()], np.int64)  # fmt: skip
+    values[:: max(count // 7, 1)] = np.resize([0, -1, 127, -128, 128, 2**63 - 1, -(2**63), 2**31, -(2**39) - 1],
+                                              len(values[:: max(count // 7, 1)]))  # fmt: skip
+    values[64:128] = 0
+    return values
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+@pytest.mark.parametrize("count", [1, 63, 64, 65, 128, 5000])
+def test_integers_arrive_as_they_were(kernels, count):
+    values = integers(count, count)
+    device = open_device(kernels)
+    with Memory(device) as memory, Narrowing(device) as there, Narrowing(device) as here:
+        narrowed = there.download(memory.upload(np.concatenate([[7, 8, 9], values]), "a test"), (count,), 3)
+        assert np.array_equal(narrowed.widened(), values)
+        assert narrowed.nbytes <= values.nbytes + -(-count // 64)
+        arrived = memory.upload(np.full(count + 2, 5), "a test")
+        here.upload(arrived, narrowed)
+        assert np.array_equal(device.download(arrived, (count + 2,), np.int64), [*values, 5, 5])
+    assert device.allocated == 0
+
+
+def test_small_integers_need_few_bytes():
+    device = open_device("gpu")
+    values = np.random.default_rng(1).integers(-(2**30), 2**30, (20, 640))
+    with Memory(device) as memory, Narrowing(device) as narrowing:
+        narrowed = narrowing.download(memory.upload(values, "a test"), (20, 640))
+        assert narrowed.nbytes <= 0.51 * values.nbytes
+        assert np.array_equal(narrowed.widened(), values)
+        assert narrowing.download(memory.upload(values, "a test"), (0, 2)).nbytes == 0
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"shape": (65,)},
+        {"widths": np.array([9], np.uint8)},
+        {"widths": np.array([2, 2], np.uint8)},
+        {"widths": np.zeros(0, np.uint8)},
+        {"data": np.zeros(127, np.uint8)},
+    ],
+    ids=["more", "too wide", "more runs", "no run", "too short"],
+)
+def test_what_does_not_fit_is_refused(changes):
+    good = Narrowed((64,), np.array([2], np.uint8), np.zeros(128, np.uint8))
+    assert not good.widened().any()
+    with pytest.raises(ValueError, match="are not"):
+        dataclasses.replace(good, **changes).starts()

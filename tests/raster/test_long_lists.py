@@ -1,0 +1,58 @@
+"""Long lists of tiles, sorted by many work-groups: the same order."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from potr_cl.raster import launch_gpu, long_lists
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.reference.scenes import ring_of_cameras, visible_scene
+from tests.devices import KERNELS, open_device
+
+
+@pytest.fixture(scope="module", params=[kernels for kernels in KERNELS if "gpu" in str(kernels)])
+def device(request):
+    device = open_device(request.param)
+    yield device
+    assert device.allocated == 0
+
+
+def lists_of(device, scene, cameras):
+    with Rasterizer(device, scene) as rasterizer, rasterizer.prepare_set(cameras) as views:
+        return device.download(views.intersections, (views.capacity,), np.uint32), views.found_offsets
+
+
+@pytest.mark.parametrize(("count", "longest"), [(2500, 16), (2500, 700), (9000, 700), (9000, 2048)])
+def test_the_same_order(device, monkeypatch, count, longest):
+    """Of lists of any length: shorter than a piece, some pieces, and some that stay as they were."""
+    scene = visible_scene(count, 0)
+    scene = dataclasses.replace(scene, log_scales=scene.log_scales - 1)
+    cameras = ring_of_cameras(3, size=40)
+    wanted, offsets = lists_of(device, scene, cameras)
+    lengths = np.concatenate([np.diff(each.astype(np.int64)) for each in offsets])
+    assert lengths.max() > longest
+    sorted_apart = []
+
+    class Noting(long_lists.LongLists):
+        def enqueue(self, *args: object) -> None:
+            sorted_apart.append(self)
+            super().enqueue(*args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("potr_cl.raster.preparing_memory.LongLists", Noting)
+    monkeypatch.setattr(long_lists, "LONGEST", longest)
+    monkeypatch.setattr(launch_gpu, "LONGEST", longest)
+    got, _ = lists_of(device, scene, cameras)
+    assert sorted_apart
+    assert np.array_equal(got, wanted)
+    monkeypatch.setattr(long_lists, "PIECE", 64)
+    got, _ = lists_of(device, scene, cameras)
+    assert np.array_equal(got, wanted)
+
+
+def test_lists_as_others(device, monkeypatch):
+    """None is long: nothing is sorted apart."""
+    monkeypatch.setattr(long_lists.LongLists, "enqueue", lambda *args: pytest.fail("there is no long list"))
+    lists_of(device, visible_scene(500, 0), ring_of_cameras(2, size=40))
