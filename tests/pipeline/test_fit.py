@@ -85,7 +85,8 @@ def test_what_makes_up_for_splats_rounds_finer(device, plush_excerpt, plush_exce
     assert plain.sf_sh < encoded.parameters.sf_sh < 1.5 * plain.sf_sh
     assert plain.drop > encoded.parameters.drop
     assert encoded.parameters.delta_mse_max == plain.delta_mse_max
-    assert options.changed(q=1).parameters == options.changed(q=1, fit=False).parameters
+    for q in (0, 1):
+        assert options.changed(q=q).parameters == options.changed(q=q, fit=False).parameters
 
 
 def test_what_only_fits_rounds_as_q_says(device, plush_excerpt, plush_excerpt_cameras):
