@@ -42,8 +42,9 @@ from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
 #: threshold, and for others as much more as its root is larger, because a fit brings the more, the fewer splats are
 #: left; but not more than the most.
 FURTHER, _AT_THRESHOLD, _MOST_FURTHER = 3.5, 10**-9.3, 20.0
-#: By how much of its way to 1 the q is higher whose steps give about the PSNR that q has without a fit.
-FINER = 0.18
+#: By how much of its way to 1 the q is higher whose steps suit a fit, from that q on; below it less, with the square:
+#: few splats are left there, and finer steps for these cost more than they bring (docs/benchmarks/fit.md).
+FINER, _FINER_FROM = 0.18, 0.5
 #: Steps that "auto" stands for.
 STEPS: dict[Family, int] = {"cpu": 800, "gpu": 1300}
 #: Views between for each given one that a fit looks at: they keep it from fitting the given ones too closely.
@@ -117,7 +118,8 @@ class Fit(Stage):
         steps: the most steps of the fit; with 0 it is left out. "auto": as many as pay on the device.
         further: times the ΔMSE_MAX of the pruning before it up to which splats are removed for the fit to make up for,
             where that is 10^-9.3; with its root more for a larger one. 0: none are removed.
-        finer: by how much of its way to 1 the q is higher whose hyper-parameters the re-fit and the coder take.
+        finer: by how much of its way to 1 the q is higher whose hyper-parameters the re-fit and the coder take, if it
+            is 0.5 or higher; below that less.
         cycles: how often splats are removed and a fit follows, each time up to a higher threshold; before the first of
             several, none are.
         iterations: of the pruning in each of them.
@@ -196,7 +198,7 @@ class Fit(Stage):
         return self.on and self.steps != 0
 
     def quality(self, q: float) -> float:
-        return q + self.finer * (1 - q)
+        return q + self.finer * min(q / _FINER_FROM, 1.0) ** 2 * (1 - q)
 
     def steps_on(self, family: Family) -> int:
         """The most steps on a device of a family."""

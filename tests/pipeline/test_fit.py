@@ -11,11 +11,13 @@ from potr_cl.model.virtual_cameras import place_cameras
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.pipeline.run import as_done
 from potr_cl.pipeline.search import encode_to_target
 from potr_cl.pipeline.target import Target
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.stages.fit import LeftOut
 from potr_cl.stages.fitting.fit import Fitted
+from potr_cl.stages.stage import State
 
 #: Half of the splats, so that there is something to make up for; with coarser steps files would not show it.
 HALF = EncodeOptions(q=0.5).changed(prune={"keep": 0.5, "iterations": 8}, fit={"steps": 30, "rounds": 3})
@@ -83,7 +85,8 @@ def test_what_makes_up_for_splats_rounds_finer(device, plush_excerpt, plush_exce
     assert plain.sf_sh < encoded.parameters.sf_sh < 1.5 * plain.sf_sh
     assert plain.drop > encoded.parameters.drop
     assert encoded.parameters.delta_mse_max == plain.delta_mse_max
-    assert options.changed(q=1).parameters == options.changed(q=1, fit=False).parameters
+    for q in (0, 1):
+        assert options.changed(q=q).parameters == options.changed(q=q, fit=False).parameters
 
 
 def test_what_only_fits_rounds_as_q_says(device, plush_excerpt, plush_excerpt_cameras):
@@ -94,18 +97,12 @@ def test_what_only_fits_rounds_as_q_says(device, plush_excerpt, plush_excerpt_ca
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("target", "kept"),
-    [
-        (Target(max_bytes=13_000), 0.3),
-        (
-            Target(min_psnr=46),
-            0.5,
-        ),  # files say at the first q that the fit pays, and would not at the one that is found
-    ],
+    ("target", "kept", "steps"),
+    [(Target(max_bytes=13_000), 0.3, 60), (Target(min_psnr=44), 0.3, 60)],
     ids=str,
 )
-def test_a_search_fits(device, plush_excerpt, plush_excerpt_cameras, target, kept):
-    options = HALF.changed(prune={"keep": kept}, fit={"steps": 60 if kept == 0.3 else 30})
+def test_a_search_fits(device, plush_excerpt, plush_excerpt_cameras, target, kept, steps):
+    options = HALF.changed(prune={"keep": kept}, fit={"steps": steps})
     found = encode_to_target(plush_excerpt, plush_excerpt_cameras, target, options, device=device)
     assert isinstance(found.encoded.fitted, Fitted)
     low, high = target.window
@@ -117,6 +114,18 @@ def test_a_search_fits(device, plush_excerpt, plush_excerpt_cameras, target, kep
         assert reached >= target.min_psnr
     else:
         assert round(math.exp(found.value)) == again.nbytes <= target.max_bytes
+
+
+def test_what_files_said_of_one_quality_is_not_asked_of_another(device, plush_excerpt, plush_excerpt_cameras):
+    """A search goes on with other qualities from what has been fitted: its last options have to make the same file."""
+    coarse = HALF.changed(q=0.3)
+    asked = encode(plush_excerpt, plush_excerpt_cameras, coarse, device=device)
+    assert isinstance(asked.fitted, LeftOut)
+    taken = encode(plush_excerpt, plush_excerpt_cameras, HALF.changed(fit={"steps": 60}), device=device).fitted
+    assert isinstance(taken, Fitted)
+    assert taken.files is not None
+    known = as_done(coarse, State.of(plush_excerpt).having_learnt("fit", taken))
+    assert isinstance(encode(plush_excerpt, plush_excerpt_cameras, known, device=device).fitted, Fitted)
 
 
 @pytest.mark.slow

@@ -401,6 +401,18 @@ def test_an_option_of_the_stage_that_is_out_of_range(wrong):
         Fit(**wrong)
 
 
+def test_steps_are_finer_the_more_splats_are_left():
+    """By a fifth of the way to 1 for a usual quality, by little for a low one; and a higher quality stays a higher one."""
+    shares = [(Fit().quality(q) - q) / (1 - q) for q in (0.0, 0.2, 0.3, 0.5, 0.9)]
+    assert np.diff(shares).min() > -1e-9
+    assert shares[0] == 0
+    assert shares[2] < 0.5 * shares[3]
+    assert shares[3:] == pytest.approx([0.18, 0.18])
+    qualities = [Fit().quality(q) for q in np.linspace(0, 1, 101)]
+    assert (np.diff(qualities) > 0).all()
+    assert Fit(finer=0).quality(0.4) == 0.4
+
+
 def test_automatic_steps_and_what_they_are_on_each_family():
     assert Fit(steps="auto").asked_for
     assert 0 < Fit(steps="auto").steps_on("cpu") < Fit(steps="auto").steps_on("gpu")
