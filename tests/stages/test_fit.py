@@ -402,7 +402,7 @@ def test_an_option_of_the_stage_that_is_out_of_range(wrong):
 
 
 def test_steps_are_finer_the_more_splats_are_left():
-    """By a fifth of the way to 1 for a usual quality, by little for a low one; and a higher quality stays a higher one."""
+    """By a fifth of the way to 1 for a usual quality, by little for a low one; a higher quality stays a higher one."""
     shares = [(Fit().quality(q) - q) / (1 - q) for q in (0.0, 0.2, 0.3, 0.5, 0.9)]
     assert np.diff(shares).min() > -1e-9
     assert shares[0] == 0
