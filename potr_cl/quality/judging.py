@@ -11,6 +11,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TypeAlias
 
 from potr_cl.formats.images import Colour
 from potr_cl.host.threads import Ahead
@@ -71,7 +72,7 @@ class Judging(Owner):
         self._against = Against(device, looks.background, looks.ground_truth, looks.lpips)
         self._reference: Rasterizer | SeenRasterizer | None = None
         self._candidate: Rasterizer | None = None
-        self._pictures: dict[str, Picture] = {}
+        self._pictures: dict[_Seen, Picture] = {}
         self._kept = ExitStack()
         self._room = min(CACHED_PICTURES, device.info.memory // 16) if looks.remember else 0
 
@@ -131,7 +132,7 @@ class Judging(Owner):
     @contextmanager
     def _references(self, cameras: Sequence[Camera]) -> Iterator[list[Picture]]:
         """The uncompressed scene's pictures; kept from one candidate to the next while there is room."""
-        missing = [camera for camera in cameras if camera.name not in self._pictures]
+        missing = [camera for camera in cameras if _seen(camera) not in self._pictures]
         with ExitStack() as stack:
             new: list[Picture] = []
             if missing:
@@ -140,9 +141,9 @@ class Judging(Owner):
                 new = (self._kept if keep else stack).enter_context(rendered(self._original, missing))
                 if keep:
                     self._room -= nbytes
-                    self._pictures |= {camera.name: picture for camera, picture in zip(missing, new, strict=True)}
+                    self._pictures |= {_seen(camera): picture for camera, picture in zip(missing, new, strict=True)}
             rest = iter(new)
-            yield [self._pictures.get(camera.name) or next(rest) for camera in cameras]
+            yield [self._pictures.get(_seen(camera)) or next(rest) for camera in cameras]
 
     def _close_reference(self) -> None:
         if self._reference is not None:
@@ -154,6 +155,15 @@ class Judging(Owner):
         self._close_reference()
         self._kept.close()
         self._pictures = {}
+
+
+#: What a view's picture depends on. From Python, several views may have the same name.
+_Seen: TypeAlias = "tuple[float | bytes, ...]"
+
+
+def _seen(camera: Camera) -> _Seen:
+    intrinsics = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+    return *intrinsics, camera.rotation.tobytes(), camera.translation.tobytes()
 
 
 class JudgingPart(Part):

@@ -81,7 +81,7 @@ class SharedJudging(Owner):
                 self._groups = groups_worth_it(device, here, views, looks.rules.near)
         self._own = Judging(device, here, looks, self._groups)
         self._parts: Parts | None = None
-        self._places: dict[str, int] = {}  # who has a view, by its name; the others are this device's
+        self._part_of: dict[str, int] = {}  # who has a view, by its name; the others are this device's
         self._left = ExitStack()
 
     def figures(
@@ -130,11 +130,11 @@ class SharedJudging(Owner):
         progress: Callable[[int], None],
         *args: Any,
     ) -> list[Any]:
-        found: dict[str, Any] = {}
+        found: dict[int, Any] = {}  # by place among the views: from Python, several may have the same name
 
-        def note(cameras: Sequence[Camera], results: Iterable[Any]) -> None:
-            for camera, result in zip(cameras, results, strict=True):
-                found[camera.name] = result
+        def note(places: Sequence[int], results: Iterable[Any]) -> None:
+            for place, result in zip(places, results, strict=True):
+                found[place] = result
                 progress(len(found))
 
         with ExitStack() as stack:
@@ -143,9 +143,9 @@ class SharedJudging(Owner):
             if sent is not None and self._open_parts() is not None:
                 self._shared_out(command, sent, views, args, note)
             # All of them, if nobody helps; or what those who are lost have left.
-            left = [camera for camera in views if camera.name not in found]
-            note(left, getattr(self._own, command)(left, *args))
-        return [found[camera.name] for camera in views]
+            left = [place for place in range(len(views)) if place not in found]
+            note(left, getattr(self._own, command)([views[place] for place in left], *args))
+        return [found[place] for place in range(len(views))]
 
     def _shared_out(
         self,
@@ -153,14 +153,14 @@ class SharedJudging(Owner):
         sent: Carried,
         views: Sequence[Camera],
         args: Sequence[Any],
-        note: Callable[[Sequence[Camera], Iterable[Any]], None],
+        note: Callable[[Sequence[int], Iterable[Any]], None],
     ) -> None:
         """Do the views together; if all others are lost, some are left."""
         parts = self._parts
         assert parts is not None
-        dealt: list[list[Camera]] = [[] for _ in range(len(parts) + 1)]
-        for camera in views:
-            dealt[self._places.get(camera.name, -1)].append(camera)
+        dealt: list[list[int]] = [[] for _ in range(len(parts) + 1)]
+        for place, camera in enumerate(views):
+            dealt[self._part_of.get(camera.name, -1)].append(place)
         *theirs, mine = dealt
         most = max(map(len, dealt))
         # Views that are rendered together are not torn apart: that would take longer.
@@ -170,11 +170,12 @@ class SharedJudging(Owner):
             _asked(partial(parts.begin, "take", sent, anew=True))
             for first in range(0, most, some):
                 now = [each[first : first + some] for each in theirs]
-                pending = _asked(partial(parts.begin, command, Each(now), *args, logged=False))
+                cameras = Each([[views[place] for place in each] for each in now])
+                pending = _asked(partial(parts.begin, command, cameras, *args, logged=False))
                 own = mine[first : first + some]
-                note(own, getattr(self._own, command)(own, *args))
-                for cameras, results in zip(now, _asked(pending.results), strict=True):
-                    note(cameras, results)
+                note(own, getattr(self._own, command)([views[place] for place in own], *args))
+                for places, results in zip(now, _asked(pending.results), strict=True):
+                    note(places, results)
             _asked(partial(parts.begin, "forget", anew=True)).results()
         except _NobodyElse as lost:
             self._lose_parts(lost.error)
@@ -203,12 +204,12 @@ class SharedJudging(Owner):
             thing = self._left.enter_context(pool.shared(shared))
             given = [(thing, self._looks, self._groups)] * len(dealt.others)
             if given:
-                self._parts = self._left.enter_context(Parts(pool, JudgingPart, given))
+                self._parts = self._left.enter_context(Parts(pool, JudgingPart, given, names=dealt.names))
         except DeviceError as error:
             self._lose_parts(error)
             return None
         for place, numbers in enumerate(dealt.others):
-            self._places |= {self._views[number].name: place for number in numbers}
+            self._part_of |= {self._views[number].name: place for number in numbers}
         return self._parts
 
     def _shared(self, pool: Pool) -> Scene | KeptScene | Carried | None:
@@ -228,8 +229,8 @@ class SharedJudging(Owner):
 
     def _lose_parts(self, error: DeviceError) -> None:
         # What else the line says is how to mend it, which nobody has to.
-        _log.warning("nobody else can judge (%s): %s does", str(error).split(":")[0], self._device.info)
-        self._parts, self._pool, self._places = None, None, {}
+        _log.warning("nobody else can judge (%s): %s does", str(error).split(": ")[0], self._device.info)
+        self._parts, self._pool, self._part_of = None, None, {}
         abandoned = _Abandoned()
         self._left.__exit__(type(abandoned), abandoned, None)
 

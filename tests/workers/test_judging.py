@@ -123,6 +123,23 @@ def test_a_candidate_of_the_host_is_judged_too(plush_excerpt, cameras, coded, fa
         assert [device.allocated for device in devices] == [0] * 2
 
 
+def test_views_of_the_same_name(plush_excerpt, cameras, coded, family):
+    """As cameras made in Python may have it."""
+    alike = [dataclasses.replace(camera, name="view", split="test") for camera in cameras[:4]]
+    device, another = open_device(family), open_device(family)
+    settings = {"background": BACKGROUND}
+    expected = [potr_cl.compare(plush_excerpt, coded.data, [c], device=device, **settings).psnr for c in alike]
+    assert len(set(expected)) == 4
+    for devices in (device, [device, another]):
+        found = potr_cl.compare(plush_excerpt, coded.data, alike, device=devices, **settings)
+        assert [view.figures["b_against_a"].psnr for view in found.figures.views] == expected
+    with Evaluator(device, plush_excerpt, EvaluationViews.of(alike), BACKGROUND) as remembering:
+        for _ in range(2):
+            with coded.on(device) as candidate:
+                assert remembering.psnr(candidate) == pytest.approx(np.mean(expected))
+    assert [device.allocated, another.allocated] == [0, 0]
+
+
 @pytest.mark.parametrize("kind", [HostPool, ElsewherePool])
 @pytest.mark.parametrize("command", ["__init__", "take", "figures"])
 @pytest.mark.parametrize("lost", ["one", "all"])
