@@ -113,10 +113,14 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
 
 def _tell_of_wide_views(path: Path, cameras: list[Camera]) -> None:
     """Log one line if views are wider than any pinhole's: their focal lengths are hardly pixels."""
-    wide = [camera for camera in cameras if max(camera.width / camera.fx, camera.height / camera.fy) > _WIDE]
+
+    def across(camera: Camera) -> float:
+        return max(camera.width / camera.fx, camera.height / camera.fy)
+
+    wide = [camera for camera in cameras if across(camera) > _WIDE]
     if wide:
-        one = max(wide, key=lambda camera: camera.width / camera.fx)
-        degrees = 2 * math.degrees(math.atan(one.width / 2 / one.fx))
+        one = max(wide, key=across)
+        degrees = 2 * math.degrees(math.atan(across(one) / 2))
         _log.warning(
             "'%s': %d of %d views are very wide, up to %.0f degrees: are their focal lengths in pixels of %d x %d?",
             path, len(wide), len(cameras), degrees, one.width, one.height,

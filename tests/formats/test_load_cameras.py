@@ -89,6 +89,8 @@ def test_views_that_are_too_wide_for_a_pinhole_are_told(
     assert (
         "2 of 3 views are very wide, up to 174 degrees: are their focal lengths in pixels of 990 x 742?" in caplog.text
     )
+    load_cameras(write_json(tmp_path / "tall.json", [view() | {"width": 90, "height": 990, "fx": 28.0, "fy": 28.0}]))
+    assert "up to 174 degrees: are their focal lengths in pixels of 90 x 990?" in caplog.text
 
 
 def test_any_file_name(data: Path, tmp_path: Path) -> None:
