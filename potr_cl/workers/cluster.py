@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 _CONNECT, _COME, _HELLO = 5.0, 60.0, 120.0
 #: Seconds between two looks at whether a worker that has not answered yet is alive, and at whether to go on waiting.
 _ALIVE, _POLL = 3.0, 0.1
-#: Seconds between two looks at whether workers have come.
-_NEW = 2.0
 #: The second of them grows by this factor from look to look, up to so much: each look wakes the client's event loop.
 _POLL_GROWS, _MOST_POLL = 1.5, 1.0
+#: Seconds between two looks at whether workers have come.
+_NEW = 2.0
 #: Seconds in which the handle of a part arrives once it is made.
 _FETCH = 30.0
 #: Threads that wait for workers.

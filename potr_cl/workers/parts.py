@@ -163,14 +163,16 @@ class Parts(Owner):
         self._pace.rate([worker for worker in self._by if worker is not None])
         held, self._held = self._held, [None] * len(self._given)
         making, self._making = self._making, None
-        for each in making.futures.values() if making is not None else ():  # an error came between
-            with suppress(PotrError):
-                if not abandoned:
-                    held.append(each.result())
-        for part in held:
+        for place, each in making.futures.items() if making is not None else ():  # an error came between
+            if _is_left(self._by[place]):
+                each.add_done_callback(_abandon_made)
+            elif not abandoned:
+                with suppress(PotrError):
+                    held[place] = each.result()
+        for part, by in zip(held, self._by, strict=True):
             if part is not None:
                 with suppress(PotrError):
-                    part.abandon() if abandoned else part.close()
+                    part.abandon() if abandoned or _is_left(by) else part.close()
         for closing in self._closing:
             with suppress(PotrError):
                 closing.result()
@@ -374,6 +376,11 @@ class _Piece:
     by: Worker
     held: Held
     found: Any = None
+
+
+def _is_left(worker: Worker | None) -> bool:
+    """Whether nobody waits for a worker any more: another work may have found that it stands still, or is slow."""
+    return worker is not None and (worker.lost or worker.is_behind)
 
 
 def _abandon_made(making: Future[Held]) -> None:

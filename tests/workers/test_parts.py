@@ -135,6 +135,21 @@ def test_who_should_do_it_instead_is_silent_too():
     assert course(FakePool(*workers, patience=0.2)) == EXPECTED
 
 
+@pytest.mark.parametrize("how", ["lost", "behind"])
+def test_who_stands_still_in_another_work_is_not_waited_for_in_the_end(how, monkeypatch):
+    ended = []
+    monkeypatch.setattr(FakeHeld, "close", lambda held: ended.append((held.worker.name, "waited")))
+    monkeypatch.setattr(FakeHeld, "abandon", lambda held: ended.append((held.worker.name, "left")), raising=False)
+    still, other = FakeWorker("a"), FakeWorker("b")
+    with Parts(FakePool(still, other), Sum, [(0, 1), (0, 2)]) as parts:
+        assert parts.tell("add", 1) == [1, 2]
+        if how == "lost":
+            still.lost = True
+        else:
+            still.behind = Future()
+    assert ended == [("a", "left"), ("b", "waited")]
+
+
 @pytest.mark.parametrize("lost_at", [None, 1, 2, 3, 4])
 def test_parts_can_be_told_different_things(lost_at):
     """And those that are made again are told again what was theirs."""
