@@ -53,18 +53,14 @@ class GroundTruth:
         """
         return read_photograph(self._paths[camera.name], camera, self._background)
 
-    def psnrs(self, rasterizer: Rasterizer, cameras: Sequence[Camera]) -> list[float]:
-        """PSNR of a scene's picture of each view against the photograph, in decibels.
+    def psnr(self, rasterizer: Rasterizer, cameras: Sequence[Camera]) -> float:
+        """Mean PSNR of a scene's pictures of some views against the photographs, in decibels.
 
         Raises:
             UsageError, DataError: a photograph cannot be read.
             DeviceError: a view does not fit the device.
         """
-        return [psnr(rasterizer.render(camera)[0], self.picture(camera)) for camera in cameras]
-
-    def psnr(self, rasterizer: Rasterizer, cameras: Sequence[Camera]) -> float:
-        """Mean of :meth:`psnrs`."""
-        return float(np.mean(self.psnrs(rasterizer, cameras)))
+        return float(np.mean([psnr(rasterizer.render(camera)[0], self.picture(camera)) for camera in cameras]))
 
 
 @dataclass(frozen=True)
