@@ -306,8 +306,11 @@ def test_a_ladder_keeps_the_scene_on_the_devices(plush_excerpt, cameras, tmp_pat
     options = EncodeOptions.for_preset("fast", prune={"iterations": 2}, between=False)
     expected = potr_cl.encode_ladder(plush_excerpt, tmp_path / "alone", "0.2,0.4", cameras, options)
     sent = []
-    upload = kept_scene.uploaded
-    monkeypatch.setattr(kept_scene, "uploaded", lambda device, scene: sent.append(device) or upload(device, scene))
+    for how in ("uploaded", "copied"):  # to the first device, and from there to the other one
+        bring = getattr(kept_scene, how)
+        monkeypatch.setattr(
+            kept_scene, how, lambda device, scene, bring=bring: sent.append(device) or bring(device, scene)
+        )
     devices = [open_device("cpu") for _ in range(2)]
     found = potr_cl.encode_ladder(plush_excerpt, tmp_path / "together", "0.2,0.4", cameras, options, device=devices)
     assert found.rungs == expected.rungs
