@@ -29,6 +29,7 @@ from potr_cl.stages.fit import Fit
 from potr_cl.stages.fitting.memory import fit_bytes
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.pruning.sweep_options import default_memory
+from potr_cl.stages.pruning.visible_parts import LEAST_SPLATS
 from potr_cl.stages.refit import Refit
 from potr_cl.stages.views_between import Between
 
@@ -153,6 +154,9 @@ def forecast(
         memory = max(memory, needed)
     if device.info.kind == "cpu":
         memory += _PROCESS + len(scene) * _HOST_SPLAT
+        if options.memory is not None and len(scene) >= LEAST_SPLATS:
+            # Views of large scenes leave room for the host's arrays, and the largest of these lie in files.
+            memory = min(memory, options.memory + _PROCESS)
     return Forecast(work * (_SEARCH if search else 1), memory, seconds, pictures)
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from potr_cl.model.camera import train_views
 from potr_cl.opencl.device import Device
+from potr_cl.pipeline import forecast as forecasts
 from potr_cl.pipeline.forecast import forecast
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import Rasterizer
@@ -94,6 +95,19 @@ def test_memory_is_that_of_views_and_stays_within_the_budget(device, plush_excer
     assert memory(views * 20, memory=0) < few
     large = [dataclasses.replace(view, width=4 * view.width, height=4 * view.height) for view in views]
     assert memory(large) > few + 12 * 15 * 9 * 240 * 180
+
+
+def test_memory_of_a_large_scene_is_what_is_allowed(device, plush_excerpt, plush_excerpt_cameras, monkeypatch):
+    if device.info.kind != "cpu":
+        pytest.skip("a GPU's memory is not the host's")
+    views = train_views(plush_excerpt_cameras)[:3] * 100
+    allowed = EncodeOptions().changed(memory=1 << 20)
+    monkeypatch.setattr(forecasts, "LEAST_SPLATS", len(plush_excerpt) + 1)
+    small = forecast(plush_excerpt, views, allowed, device).memory
+    monkeypatch.setattr(forecasts, "LEAST_SPLATS", len(plush_excerpt))
+    large = forecast(plush_excerpt, views, allowed, device).memory
+    assert large < small - 1e6, "what the host has of the scene lies in files"
+    assert large < forecast(plush_excerpt, views, EncodeOptions(), device).memory
 
 
 def test_half_of_what_takes_the_time_is_seen(device, plush_excerpt, plush_excerpt_cameras):
