@@ -6,6 +6,7 @@ Whoever asks a pool for work (the *master*) has a device too, the pool's ``first
 
 from __future__ import annotations
 
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from concurrent.futures import Future
@@ -111,12 +112,21 @@ class Shared:
         return thing if self.part is None else thing.subset(self.part)
 
 
+_counting = threading.Lock()
+
+
 @dataclass
 class Traffic:
     """What went between the master and the workers, in bytes: arrays, without what their transport adds."""
 
     sent: int = 0
     received: int = 0
+
+    def add(self, sent: int = 0, received: int = 0) -> None:
+        """Count what has gone, from any thread."""
+        with _counting:
+            self.sent += sent
+            self.received += received
 
 
 class Pool(ABC):

@@ -135,6 +135,13 @@ def test_who_should_do_it_instead_is_silent_too():
     assert course(FakePool(*workers, patience=0.2)) == EXPECTED
 
 
+def test_what_several_threads_count_is_all_counted():
+    traffic = Traffic()
+    with ThreadPoolExecutor(8) as threads:
+        list(threads.map(lambda _: [traffic.add(1, 2) for _ in range(5000)], range(8)))
+    assert traffic == Traffic(sent=40_000, received=80_000)
+
+
 @pytest.mark.parametrize("how", ["lost", "behind"])
 def test_who_stands_still_in_another_work_is_not_waited_for_in_the_end(how, monkeypatch):
     ended = []
