@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from potr_cl.errors import DeviceMemoryError
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import Output
 from potr_cl.raster.rasterizer import Rasterizer
@@ -74,7 +75,10 @@ def only_if_it_pays(before: State, after: State, trial: Trial) -> State:
     if not isinstance(told, Fitted) or not told.in_doubt or told.ended_early or told.photographs is not None:
         return after
     left_out = LeftOut(_NO_SMALLER)
-    files = TwoFiles(trial.of(before.having_learnt(Fit.name, left_out)), trial.of(after))
+    try:
+        files = TwoFiles(trial.of(before.having_learnt(Fit.name, left_out)), trial.of(after))
+    except DeviceMemoryError:  # where there is no room to compare files, the fit's own judgement has to do
+        return after
     if files.pays:
         return after.having_learnt(Fit.name, dataclasses.replace(told, files=files))
     return before.having_learnt(Fit.name, dataclasses.replace(left_out, files=files))

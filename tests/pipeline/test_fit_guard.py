@@ -7,9 +7,11 @@ import math
 import numpy as np
 import pytest
 
+from potr_cl.errors import DeviceMemoryError
 from potr_cl.model.camera import test_views as views_to_judge
 from potr_cl.model.camera import train_views
 from potr_cl.opencl.device import Device
+from potr_cl.pipeline import fit_trial
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
@@ -68,6 +70,17 @@ def test_what_pays_is_taken(judged, plush_excerpt_cameras):
     made, _ = judged(train_views(plush_excerpt_cameras), options)
     assert not isinstance(made.fitted, LeftOut)
     assert made.fitted.spared == 0, "where as many splats go as a fit is to make up for, it does not pay here"
+
+
+def test_without_room_to_compare_files_the_fit_judges_itself(judged, plush_excerpt_cameras, monkeypatch):
+    def no_room(*anything):
+        raise DeviceMemoryError("two scenes at a time do not fit")
+
+    monkeypatch.setattr(fit_trial, "held_out_error", no_room)
+    options = EncodeOptions(q=0.5).changed(prune={"delta_mse_max": 3e-9}, fit={"steps": "auto"})
+    made, _ = judged(train_views(plush_excerpt_cameras), options)
+    assert not isinstance(made.fitted, LeftOut)
+    assert made.fitted.files is None
 
 
 @pytest.mark.parametrize(("threshold", "doubt"), [(3e-9, True), (3e-7, False)])
