@@ -73,7 +73,6 @@ class Geometry:
         """Fill all but the colours of some splats of a scene; ``order`` (N,) are their numbers there."""
         parameters, n = self.parameters, len(order)
         version = VERSIONS[parameters.version]
-
         found = octree.parse(self.tree, n, run, -(-n // BLOCK)) if self.centres is None else self.centres
 
         def fill(start: int) -> None:
@@ -212,7 +211,9 @@ def quantise_in_world_units(
         tolerance = np.maximum(world.gamma, world.beta * nearest[own])
         tree = octree.begin(scene.means[own], tolerance, absolute, run)
         if may_be_coarse(tree.depth):
-            check_positions(scene.means[own], scene.log_scales[own], tolerance, tree.streams(), tree.order)
+            streams = tree.streams()
+            check_positions(scene.means[own], scene.log_scales[own], tolerance, streams, tree.order)
+            tree = replace(tree, streams=partial(_itself, streams))
         return tree
 
     def made(

@@ -6,6 +6,7 @@ import os
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -85,7 +86,7 @@ class Ferry(Owner):
                 place = self._place()
                 event, self._sent[place] = self._sent[place], None
                 if event is not None:
-                    event.wait()
+                    self._wait_for(event)
                 filling.append((place, self._in_thread(self._fill, place, pieces[number][0])))
             if number >= self._lag:
                 place, filled = filling.popleft()
@@ -111,7 +112,7 @@ class Ferry(Owner):
                 arriving.append((array, self._copy(buffer, array, start, pitch, to_device=False)))
             if number >= self._lag:
                 array, event = arriving[number - self._lag]
-                event.wait()
+                self._wait_for(event)
                 taken.append(self._in_thread(np.copyto, pieces[number - self._lag][0], array))
         for future in taken:
             future.result()
@@ -119,6 +120,10 @@ class Ferry(Owner):
     def _place(self) -> int:
         self._turn = (self._turn + 1) % self._places
         return self._turn
+
+    def _wait_for(self, event: cl.Event) -> None:
+        with self._device.errors("failed while computing"):
+            event.wait()
 
     def _few(self, cargo: Sequence[Cargo]) -> bool:
         return self._direct or sum(each.part.nbytes for each in cargo) < LEAST
@@ -168,7 +173,8 @@ class Ferry(Owner):
             self._threads = None
         for event in self._sent:
             if event is not None:
-                event.wait()
+                with suppress(cl.Error):  # a device that has failed: whoever looks at its results is told
+                    event.wait()
         self._sent = [None] * self._places
         for staging in self._staging:
             staging.close()

@@ -6,6 +6,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
+from potr_cl.errors import DeviceMemoryError
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner, Scratch
 from potr_cl.opencl.structs import struct_dtype
@@ -34,10 +35,10 @@ class LongLists(Owner):
         """Look for long lists in views whose offsets are known to the host, and make ready to sort them.
 
         Returns:
-            Whether there are any.
+            Whether there are any, and room to sort them here. Without room they are sorted as others are, only slower.
 
         Raises:
-            DeviceError: the device has no room.
+            DeviceError: the device failed.
         """
         keys: list[NDArray[np.int64]] = []
         lengths: list[NDArray[np.int64]] = []
@@ -55,8 +56,12 @@ class LongLists(Owner):
         pieces["others"] = np.repeat(np.cumsum(of_length) - of_length, of_pieces)
         pieces["length"] = np.repeat(of_length, of_pieces)
         pieces["start"] = PIECE * (np.arange(len(pieces)) - np.repeat(np.cumsum(of_pieces) - of_pieces, of_pieces))
-        self._others.reserve(8 * int(of_length.sum()))
-        self._pieces.reserve(pieces.nbytes)
+        try:
+            self._others.reserve(8 * int(of_length.sum()))
+            self._pieces.reserve(pieces.nbytes)
+        except DeviceMemoryError:
+            self.close()
+            return False
         self._longest, self._count = int(of_length.max()), len(pieces)
         with self._device.errors("cannot hold the pieces of long tile lists"):
             cl.enqueue_copy(self._device.queue, self._pieces.buffer, pieces, is_blocking=True)

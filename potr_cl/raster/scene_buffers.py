@@ -399,9 +399,8 @@ def copied(device: Device, scene: SceneBuffers) -> SceneBuffers:
     buffers = SceneBuffers(device, scene.splats, scene.sh_count, scene.antialiased, scene.low_pass)
     try:
         with Relay(device) as relay:
-            for name in ("means", "scales", "quaternions", "log2_opacities", "sh"):
-                own, its = getattr(buffers, name), getattr(scene, name)
-                relay.fetch(own, Lent(scene.device, its, its.size))
+            for name, its in scene.parameters.items():
+                relay.fetch(buffers.parameters[name], Lent(scene.device, its, its.size))
     except BaseException:
         buffers.close()
         raise

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from potr_cl.codec import octree
 from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import decode
 from potr_cl.codec.encoder import code_scene
@@ -146,3 +147,26 @@ def test_a_splat_in_the_eye_of_a_camera_is_no_reason_to_refuse(preset):
     camera = dataclasses.replace(ring_of_cameras(1)[0], translation=np.zeros(3), split="train")
     geometry = quantise_geometry(scene, HyperParameters.from_quality(0.9, preset), [camera])
     assert np.abs(geometry.decoded(scene.sh).means[0]).max() < 1e-6
+
+
+def test_a_deep_octree_is_written_once(monkeypatch):
+    """What is looked at to see that all centres are exact enough is what the file gets."""
+    scene = some_scene("any")
+    scene.means[0] = 1e11
+    written = []
+    begin = octree.begin
+
+    def noting(*args: object) -> octree.Begun:
+        begun = begin(*args)  # type: ignore[arg-type]
+
+        def streams() -> octree.OctreeStreams:
+            written.append(begun)
+            return begun.streams()
+
+        return dataclasses.replace(begun, streams=streams)
+
+    monkeypatch.setattr(octree, "begin", noting)
+    geometry = quantise_geometry(scene, EncodeOptions(q=0.3).parameters, [])
+    assert geometry.tree.depth > 44
+    assert np.array_equal(octree.parse(geometry.tree, len(scene)), geometry.centres)
+    assert len(written) == 1

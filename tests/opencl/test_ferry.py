@@ -5,8 +5,10 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pyopencl as cl
 import pytest
 
+from potr_cl.errors import DeviceError
 from potr_cl.opencl import ferry
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.ferry import Cargo, Ferry
@@ -71,3 +73,23 @@ def test_what_was_sent_may_change(device):
         own.to_device(buffer, [Cargo(sent)])
         sent[:] = 0
         assert np.array_equal(device.download(buffer, (5000,), np.float32), wanted)
+
+
+class Failed:
+    """A copy that comes to nothing."""
+
+    def wait(self) -> None:
+        raise cl.RuntimeError("clWaitForEvents failed: EXEC_STATUS_ERROR_FOR_EVENTS_IN_WAIT_LIST")
+
+
+@pytest.mark.parametrize("device", [True], indirect=True, ids=["in pieces"])
+@pytest.mark.parametrize("to_device", [True, False], ids=["to the device", "to the host"])
+def test_a_device_that_fails(device, monkeypatch, to_device):
+    """Whoever copies is told in the project's words; what is closed afterwards is closed."""
+    cargo = [Cargo(values(5000))]
+    with Memory(device) as memory:
+        buffer = memory.upload(cargo[0].values, "numbers")
+        with Ferry(device) as own:
+            monkeypatch.setattr(cl, "enqueue_copy", lambda *args, **kwargs: Failed())
+            with pytest.raises(DeviceError, match="failed while computing"):
+                own.to_device(buffer, cargo) if to_device else own.to_host(cargo, buffer)

@@ -52,6 +52,28 @@ def test_the_same_order(device, monkeypatch, count, longest):
     assert np.array_equal(got, wanted)
 
 
+def test_without_room_the_same_order(device, monkeypatch):
+    """Long lists are sorted as others are then: a view that the device has room for is prepared."""
+    scene, cameras = visible_scene(2500, 0), ring_of_cameras(3, size=40)
+    wanted, _ = lists_of(device, scene, cameras)
+
+    class WithoutRoom(long_lists.LongLists):
+        def find(self, views: object) -> bool:
+            with monkeypatch.context() as full:
+                full.setattr(device, "info", dataclasses.replace(device.info, memory=device.allocated))
+                found = super().find(views)  # type: ignore[arg-type]
+            asked.append(found)
+            return found
+
+    asked: list[bool] = []
+    monkeypatch.setattr("potr_cl.raster.preparing_memory.LongLists", WithoutRoom)
+    monkeypatch.setattr(long_lists, "LONGEST", 16)
+    monkeypatch.setattr(launch_gpu, "LONGEST", 16)
+    got, _ = lists_of(device, scene, cameras)
+    assert asked == [False]
+    assert np.array_equal(got, wanted)
+
+
 def test_lists_as_others(device, monkeypatch):
     """None is long: nothing is sorted apart."""
     monkeypatch.setattr(long_lists.LongLists, "enqueue", lambda *args: pytest.fail("there is no long list"))

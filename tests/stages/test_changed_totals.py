@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pyopencl as cl
 import pytest
 
+from potr_cl.errors import DeviceMemoryError
 from potr_cl.opencl.memory import Memory
 from potr_cl.stages.pruning.changed_totals import AddedChanges, ChangedTotals, changes_on_host
 from potr_cl.stages.pruning.survivors import SplatState
@@ -60,3 +63,26 @@ def test_changes_that_do_not_fit_their_bits_are_refused():
         sums = memory.upload(np.zeros((64, 2), np.int64), "a test")
         with pytest.raises(ValueError, match="do not fit"):
             added.add(sums, (np.array([7], np.uint64), np.ones((2, 2), np.int64)), 64)
+
+
+@pytest.mark.parametrize("words", [1, 3])
+def test_bits_of_other_splats_are_refused(words):
+    device = open_device("gpu")
+    with Memory(device) as memory, AddedChanges(device) as added:
+        sums = memory.upload(np.zeros((128, 2), np.int64), "a test")
+        masks = np.zeros(words, np.uint64)
+        masks[0] = 1
+        with pytest.raises(ValueError, match="128 splats"):
+            added.add(sums, (masks, np.ones((1, 2), np.int64)), 128)
+
+
+def test_without_room_nothing_stays_on_the_device(monkeypatch):
+    device, splats = open_device("gpu"), 6400
+    with Memory(device) as memory:
+        states = memory.upload(states_of(np.ones(splats, bool)), "a test")
+        before = device.allocated
+        # The bits and the runs have room, the totals have not.
+        monkeypatch.setattr(device, "info", dataclasses.replace(device.info, memory=before + 16 * splats))
+        with pytest.raises(DeviceMemoryError):
+            ChangedTotals(device, splats, states)
+        assert device.allocated == before

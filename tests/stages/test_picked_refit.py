@@ -133,6 +133,24 @@ def test_not_where_views_reach_much(device, monkeypatch):
         assert reached_splats(rasterizer, cameras, range(5)) is None
 
 
+@pytest.mark.parametrize("slices", [None, 256], ids=["in one piece", "in slices"])
+def test_what_views_reach_is_found_once(device, monkeypatch, slices):
+    """Also where it is not worth it."""
+    made = []
+
+    class Noting(reached.Picker):
+        def __init__(self, *args: object) -> None:
+            made.append(self)
+            super().__init__(*args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(reached, "Picker", Noting)
+    monkeypatch.setattr(reached, "LEAST_SPLATS", 1)
+    monkeypatch.setattr(reached, "WORTH_IT", 0.0)
+    scene, cameras = crowded(200)
+    with ColourRefit(device, scene, cameras, slices=slices):
+        assert len(made) == 1
+
+
 #: Bytes that all lists fit and some geometry, that some views fit, and none.
 @pytest.mark.parametrize("memory", [None, 400_000, 150_000, 0])
 def test_products(device, picked, memory):

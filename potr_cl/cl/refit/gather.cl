@@ -61,8 +61,9 @@ inline vlong to_fixed_lanes(vfloat value)
 }
 
 /* The totals of some of a set's views, times the view's scale, onto the coefficients: result += basis x (Y, Co, Cg) of
-   the free channels' sums, view by view. What views have lies `apart`. With WEIGHTS also blocks += the sum of w^2 x basis x basis, for `block_stride` splats from
-   number `first_block` on. Both are columns of integers; the scales say what is 1. Leaves the totals zero. */
+   the free channels' sums, view by view. What views have lies `apart`. With WEIGHTS also blocks += the sum of
+   w^2 x basis x basis, for `block_stride` splats from number `first_block` on. Both are columns of integers; the scales
+   say what is 1. Leaves the totals zero. */
 kernel void gather(
     global long *totals,
     global const float *means,

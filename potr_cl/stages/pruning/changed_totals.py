@@ -44,11 +44,11 @@ class ChangedTotals(Owner):
     def __init__(self, device: Device, splats: int, states: cl.Buffer) -> None:
         self._device, self._splats, self._states = device, splats, states
         self._find, self._take = (device.kernel(_SOURCE, name, NUMBERED=0) for name in ("changed_runs", "take_changes"))
-        self._runs = _Runs(device, splats)
         self._changes = Scratch(device, _WHAT)
         self._masks, self._narrowing = Staging(device), Narrowing(device)
         self._memory = Memory(device)
         with device.all_or_nothing():
+            self._runs = _Runs(device, splats)
             self._before = self._memory.allocate(_TOTALS * splats, _WHAT)
             device.fill(self._before, np.uint64(0))
 
@@ -69,6 +69,7 @@ class ChangedTotals(Owner):
         """Give the device's memory back."""
         self._runs.close()
         self._changes.close()
+        self._masks.close()
         self._narrowing.close()
         self._memory.close()
 
@@ -98,6 +99,10 @@ class AddedChanges(Owner):
             changes: of so many splats as :class:`ChangedTotals` counts them, not more than N.
             splats: how many these are.
             numbers: (splats,) uint32, their numbers among all; None: the same.
+
+        Raises:
+            ValueError: the changes are not of so many splats, or their parts do not fit each other.
+            DeviceError: the device has no room, or failed.
         """
         masks, found = changes
         changed = found.shape[0]
@@ -107,6 +112,8 @@ class AddedChanges(Owner):
         if splats not in self._runs:
             self._runs[splats] = _Runs(device, splats)
         runs = self._runs[splats]
+        if len(masks) != runs.count:
+            raise ValueError(f"{len(masks)} words of bits are not those of {splats} splats")
         self._changes.reserve(_TOTALS * changed)
         with device.errors("failed while computing"):
             cl.enqueue_copy(device.queue, runs.masks, masks, is_blocking=True)

@@ -198,8 +198,8 @@ class _SharedSteering(Owner):
                 assert own is None, "changes are added to the totals, which therefore are those of the others alone"
                 self._added = AddedChanges(device)
                 for origin, numbers in enumerate(shared._numbers or ()):
-                    own = self._memory.upload(numbers.astype(np.uint32), "the splats of workers")
-                    self._numbers[origin] = len(numbers), own
+                    buffer = self._memory.upload(numbers.astype(np.uint32), "the splats of workers")
+                    self._numbers[origin] = len(numbers), buffer
 
     @property
     def alive(self) -> NDArray[np.bool_]:

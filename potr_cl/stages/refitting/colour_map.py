@@ -34,7 +34,7 @@ from potr_cl.stages.refitting.gathering import Gathered, Gathering
 from potr_cl.stages.refitting.launcher import Launcher
 from potr_cl.stages.refitting.picked_views import PickedViews
 from potr_cl.stages.refitting.prepared_views import PreparedViews, SweptViews
-from potr_cl.stages.refitting.reached import Reach, reached_splats
+from potr_cl.stages.refitting.reached import Reach
 from potr_cl.stages.refitting.sliced_blocks import SlicedBlocks
 from potr_cl.stages.refitting.targets import TargetCache, Targets, nbytes
 from potr_cl.stages.refitting.vector_space import Vector, VectorSpace
@@ -80,7 +80,7 @@ class ColourMap(Owner):
             what is free, or a quarter where that is the host's memory.
         numbers: of the views that are done here, ascending; None: all.
         helpers: do the others.
-        reach: of the views that are done here, if it is known.
+        reach: of the views that are done here, where each has splats of its own; None: they share all splats.
 
     Attributes:
         sums: (3 M, stride) int64 in the device's memory, what the views have added to coefficients; 0 between products.
@@ -120,7 +120,6 @@ class ColourMap(Owner):
         self._views_of_all = len(cameras)
         self.parts = parts_of(len(cameras))
         own_numbers = range(len(cameras)) if numbers is None else numbers
-        reach = reach or reached_splats(rasterizer, cameras, own_numbers, memory)
         seen = {} if reach is None else {number: len(splats) for number, splats in reach.of.items()}
         # Launches, and what is gathered together, are of one part. Views of a launch have about as many splats.
         self._numbers = sorted(own_numbers, key=lambda each: (each % self.parts, -seen.get(each, 0), each))

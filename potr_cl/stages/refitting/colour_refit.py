@@ -147,6 +147,7 @@ class ColourRefit(Owner):
             here = arrived(scene)
             if place is None:
                 rasterizer = owned.enter_context(Rasterizer(device, colourless(here), rules))
+                reach = reached_splats(rasterizer, cameras, range(len(cameras)) if own is None else own, memory)
             self.colour_map = owned.enter_context(
                 ColourMap(
                     launcher, rasterizer, self.coefficients, cameras, background, memory, own, helpers,

@@ -29,6 +29,7 @@ from potr_cl.stages.refitting.coming_scene import AnyScene, arrived, colourless
 from potr_cl.stages.refitting.launcher import launcher_for
 from potr_cl.stages.refitting.packing import Packing
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
+from potr_cl.stages.refitting.reached import reached_splats
 from potr_cl.stages.refitting.targets import RenderedTargets, Targets
 from potr_cl.stages.refitting.vector_space import Layout
 from potr_cl.stages.refitting.visible_targets import VisibleTargets
@@ -107,8 +108,9 @@ class ColourPart(Part):
                 of_source = RenderedTargets(rendering, cameras)
             here = arrived(scene)
             rasterizer = owned.enter_context(Rasterizer(device, colourless(here), rules))
+            reach = reached_splats(rasterizer, cameras, numbers, memory)
             self._map = owned.enter_context(
-                ColourMap(launcher, rasterizer, self._coefficients, cameras, background, memory, numbers)
+                ColourMap(launcher, rasterizer, self._coefficients, cameras, background, memory, numbers, reach=reach)
             )
             self._targets: Targets = of_source
             if ahead is not None:
