@@ -26,7 +26,8 @@ def without_warnings() -> Iterator[None]:
         if _blocks == 1:
             _silences.append(silence := warnings.catch_warnings())
             silence.__enter__()
-            warnings.simplefilter("ignore")
+        # At each entry: others may have put filters of their own in front since the first.
+        warnings.simplefilter("ignore")
     try:
         yield
     finally:

@@ -59,3 +59,10 @@ def test_a_photograph_that_is_read_beside_a_build(tmp_path):
         reader.close()
         assert list(warnings.filters) == before
     assert shown == []
+
+
+def test_filters_that_others_put_in_front_do_not_count():
+    with warnings.catch_warnings(), without_warnings(), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with without_warnings():
+            warnings.warn("nobody hears it", stacklevel=1)
