@@ -17,6 +17,7 @@ from potr_cl.formats.cameras import view_files
 from potr_cl.model.camera import test_views as views_for_judging
 from potr_cl.model.camera import train_views
 from tests.cases.cameras import assert_same_views, load_or_refuse, nerfstudio, refused, view, write_image, write_json
+from tests.cases.own_warnings import warnings_are_errors
 
 # The same views in different formats ---------------------------------------------------------------------------------
 
@@ -156,7 +157,7 @@ def replace_somewhere(draw: st.DataObject, value: Any) -> Any:
     return copy
 
 
-@pytest.mark.filterwarnings("error")
+@warnings_are_errors
 @pytest.mark.parametrize("content", [[view(), view(img_name="b", split="test")], nerfstudio(["a.png", "b.png"])])
 @given(draw=st.data())
 @settings(max_examples=300, deadline=None)
