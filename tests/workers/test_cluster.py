@@ -99,7 +99,7 @@ def test_the_same_bytes(workers, scene, cameras, device, expected):
         with distributed.Client(cluster, set_as_default=False) as client:
             assert potr_cl.encode(scene, cameras, OPTIONS, device=device, cluster=client).data == expected
             # A caller's client stays the caller's.
-            assert client.submit(sum, [1, 2]).result(timeout=30) == 3
+            assert client.submit(sum, [1, 2]).result(timeout=300) == 3
 
 
 @pytest.mark.slow
@@ -165,7 +165,7 @@ def test_nobody_waits_for_a_judge_that_stands_still(scene, device, judged, caplo
                 began = time.monotonic()
                 judge = evaluator.judge(candidate, lambda what, done: done and os.kill(process, signal.SIGSTOP), coded)
                 assert judge == expected
-            assert time.monotonic() - began < 30
+            assert time.monotonic() - began < 300
         finally:
             os.kill(process, signal.SIGCONT)
     assert "nobody else can judge" in caplog.text
@@ -309,7 +309,7 @@ def test_what_is_printed_when_the_cluster_is_gone(lost, tmp_path, data):
             time.sleep(1)
             for each in [scheduler] if lost == "scheduler" else workers:
                 each.kill()
-            _, said = running.communicate(timeout=120)
+            _, said = running.communicate(timeout=300)
         finally:
             running.kill()
     assert running.returncode == 1
@@ -351,7 +351,7 @@ def seats(dask_worker):
     return len(dask_worker.state.actors)
 
 
-def eventually(check, seconds=60):
+def eventually(check, seconds=300):
     end = time.monotonic() + seconds
     while not check():
         assert time.monotonic() < end, "it does not come to pass"
@@ -373,7 +373,7 @@ def test_ctrl_c_leaves_no_worker_busy(tmp_path, data, scene, cameras, device, ex
             eventually(lambda: sum(client.run(seats).values()) == 2)
             time.sleep(1)
             running.send_signal(signal.SIGINT)
-            _, said = running.communicate(timeout=60)
+            _, said = running.communicate(timeout=300)
         finally:
             running.kill()
         assert running.returncode == 130
@@ -448,8 +448,8 @@ def test_a_slow_worker_does_not_hold_up_the_others(scene, cameras, device, expec
         began = time.monotonic()
         assert encode(scene, cameras, options, device=device, pool=pool).data == same
         assert f"worker {pool.names[0]} is slow: its views go to" in caplog.text
-        # Every command of the slow worker takes a second; 80 are given in each round of pruning alone.
-        assert time.monotonic() - began < 40
+        # Every command of the slow worker takes three seconds, and 80 are given in pruning alone.
+        assert time.monotonic() - began < 180
 
 
 def slow_down():
@@ -459,7 +459,7 @@ def slow_down():
     run = Seat.run
 
     def slowly(self, *args):
-        time.sleep(1.0)
+        time.sleep(3.0)
         return run(self, *args)
 
     Seat.run = slowly
