@@ -84,8 +84,6 @@ class TabHandle:
 
     def _add_panel(self) -> None:
         gui = self._client.gui
-        # The key is in the page alone: only a page that viser serves can find its tab.
-        gui.add_html(f'<div data-potr-key="{escape(self.key)}" hidden></div>', order=-2)
         gui.add_html(_box("error"), order=-1)
         self._mode = gui.add_dropdown(
             "show",
@@ -108,6 +106,13 @@ class TabHandle:
         )
         self._shows_frusta.on_update(lambda _: self._arrange())
         gui.add_html(_box("views"), order=8)
+
+    def show_key(self) -> None:
+        """Give the page the key by which it finds this tab; it asks for it at once, and once only.
+
+        The key is in the page alone: only a page that viser serves can find its tab.
+        """
+        self._client.gui.add_html(f'<div data-potr-key="{escape(self.key)}" hidden></div>', order=-2)
 
     # ------------------------------------------------------------------------------- what the user does
 
