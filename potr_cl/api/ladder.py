@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,7 @@ from potr_cl.formats.ladder import DESCRIPTION, Ladder, Rung, qualities
 from potr_cl.formats.registry import stem_of_scene
 from potr_cl.host.atomic_write import replacing
 from potr_cl.host.mapped import bounded
+from potr_cl.host.rescue import written_or_kept
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
@@ -146,6 +149,9 @@ def make_ladder(
         As :func:`encode_ladder`.
     """
     files = ladder_files(folder, name, steps, options.output.suffix)
+    for file in files:
+        if file.is_dir():
+            raise UsageError(f"cannot write '{file}': it is a directory; write the ladder elsewhere")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -160,8 +166,7 @@ def make_ladder(
             judged_on = None if views is None else encoded.device or device
             with proved(encoded, trust, judged_on) as written:
                 nbytes, splats = len(written.data), len(written.scene)
-                with replacing(file) as opened:
-                    opened.write(written.data)
+                written_or_kept(file, partial(_write, written.data))
                 if views is not None and judged_on is not None:
                     judge = Judge(views, judged_on, options.background, kept=kept, pool=pool)
                     quality, _ = judge(scene, written, Stopwatch(progress))
@@ -171,5 +176,10 @@ def make_ladder(
                 figure = "" if views is None else f", {decibels(psnr)}"
                 tell(f"{file}: q {q:g}, {nbytes:,} bytes, {splats:,} splats{figure}")
     ladder = Ladder(files[-1], name.name, options.source_bytes, "" if views is None else str(views), tuple(rungs))
-    ladder.save()
+    written_or_kept(ladder.path, lambda path: replace(ladder, path=path).save())
     return ladder
+
+
+def _write(data: bytes, path: Path) -> None:
+    with replacing(path) as file:
+        file.write(data)
