@@ -23,7 +23,7 @@ from potr_cl.codec.blocks.file import BlockedFile
 from potr_cl.codec.decoder import decode as decode_file
 from potr_cl.codec.decoder import open_file
 from potr_cl.errors import DataError, UsageError
-from potr_cl.host.atomic_write import replacing
+from potr_cl.host.atomic_write import check_place, replacing
 from potr_cl.host.rescue import written_or_kept
 from potr_cl.model.box import Box
 from potr_cl.model.scene import Scene
@@ -67,13 +67,14 @@ def result_writer(output: str | os.PathLike[str] | None) -> Callable[[Scene], No
         Takes the scene, and raises as :func:`potr_cl.host.rescue.written_or_kept`; None if there is nothing to write.
 
     Raises:
-        UsageError: no scene can be written to a file of this name.
+        UsageError: no scene can be written to a file of this name, or no file there.
     """
     if output is None:
         return None
     from potr_cl.formats import scene_writer
 
     _ = scene_writer(output)  # a wrong name is told before anything is made
+    check_place(output)
     return lambda scene: written_or_kept(output, lambda path: scene_writer(path)(scene))
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,7 @@ from potr_cl.formats.ladder import DESCRIPTION, Ladder, Rung, qualities
 from potr_cl.formats.registry import stem_of_scene
 from potr_cl.host.atomic_write import replacing
 from potr_cl.host.mapped import bounded
-from potr_cl.host.rescue import written_or_kept
+from potr_cl.host.rescue import replacing_or_keeping, written_or_kept
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
@@ -159,7 +158,10 @@ def make_ladder(
     views = EvaluationViews.of(list(cameras)) if cameras is not None and device is not None and judged else None
     rungs = []
     # The uncompressed scene stays on the device from one quality to the next, where there is room.
-    with nullcontext() if device is None else KeptScene(device, scene, options.memory) as kept:
+    with (
+        replacing_or_keeping(files[-1]) as description,  # a folder that takes no file is told before the work
+        nullcontext() if device is None else KeptScene(device, scene, options.memory) as kept,
+    ):
         for q, file in zip(steps, files[:-1], strict=True):
             encoded = run_stages(scene, cameras, options.changed(q=q), progress, device, kept=kept, pool=pool)
             psnr = ssim = None
@@ -175,8 +177,9 @@ def make_ladder(
             if tell is not None:
                 figure = "" if views is None else f", {decibels(psnr)}"
                 tell(f"{file}: q {q:g}, {nbytes:,} bytes, {splats:,} splats{figure}")
-    ladder = Ladder(files[-1], name.name, options.source_bytes, "" if views is None else str(views), tuple(rungs))
-    written_or_kept(ladder.path, lambda path: replace(ladder, path=path).save())
+        judged_by = "" if views is None else str(views)
+        ladder = Ladder(files[-1], name.name, options.source_bytes, judged_by, tuple(rungs))
+        description.write(ladder.encoded())
     return ladder
 
 

@@ -14,8 +14,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Protocol
 
-from potr_cl.cli.guard import StandardOutput, WrittenFile, WrittenFolder
+from potr_cl.cli.guard import StandardOutput, WrittenFile, WrittenFolder, named
 from potr_cl.errors import UsageError, WriteError
+from potr_cl.host.atomic_write import check_place
 from potr_cl.host.rescue import kept_elsewhere, replacing_or_keeping
 from potr_cl.host.standard_files import standard_output_for_data
 
@@ -50,13 +51,14 @@ _SUFFIXES: dict[type[WrittenFile], tuple[tuple[str, ...], str]] = {
 
 def scene_output(text: str) -> Path:
     """A type of arguments: a scene that is written to a file, or to standard output."""
-    return StandardOutput(text) if text == "-" else WrittenScene(text)
+    return StandardOutput(text) if text == "-" else WrittenScene(named(text))
 
 
 def place(text: str) -> Path:
     """A type of arguments: where one scene or several go, a file, a folder or standard output."""
     if text == "-":
         return StandardOutput(text)
+    text = named(text)
     return WrittenFolder(text) if text.endswith((os.sep, "/")) or os.path.isdir(text) else WrittenFile(text)
 
 
@@ -86,11 +88,7 @@ def check_file(path: WrittenFile, option: str = "-o") -> None:
     Raises:
         UsageError: it cannot be written, or not under this name.
     """
-    if os.path.isdir(path):
-        raise UsageError(f"cannot write '{path}': it is a directory; give the name of a file")
-    folder = os.path.dirname(os.path.realpath(path))
-    if not os.path.isdir(folder):
-        raise UsageError(f"cannot write '{path}': the folder '{folder}' does not exist")
+    check_place(path)
     check_name(path, option)
 
 

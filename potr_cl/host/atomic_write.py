@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import secrets
 import stat
@@ -41,7 +42,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         try:
             descriptor = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o666)
         except OSError as error:
-            why = error.strerror if target.parent.is_dir() else f"the folder '{target.parent}' does not exist"
+            why = error.strerror if target.parent.is_dir() else _no_folder(target.parent)
             raise UnwritableError(f"cannot write '{path}': {why}", os.fspath(path)) from error
         try:
             # Closing flushes: a full disk may show only then, so it has to happen before the renaming.
@@ -57,6 +58,31 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
             if not target.parent.is_dir():
                 why = f"the folder '{target.parent}' is gone"
             raise WriteError(f"cannot write '{path}': {why}", os.fspath(path)) from error
+
+
+def check_place(path: str | os.PathLike[str]) -> None:
+    """Refuse a path that no file can be written to, before work for hours begins; nothing is made for the trial.
+
+    Raises:
+        UsageError: ``path`` is a directory or another thing that is no regular file, or no file can be made in its
+            folder.
+    """
+    target = Path(os.path.realpath(path))
+    _mode_of_existing(target, path)
+    if not target.parent.is_dir():
+        raise UnwritableError(f"cannot write '{path}': {_no_folder(target.parent)}", os.fspath(path))
+    if not os.access(target.parent, os.W_OK | os.X_OK, effective_ids=os.access in os.supports_effective_ids):
+        read_only = hasattr(os, "statvfs") and os.statvfs(target.parent).f_flag & os.ST_RDONLY
+        why = os.strerror(errno.EROFS if read_only else errno.EACCES)
+        raise UnwritableError(f"cannot write '{path}': {why}", os.fspath(path))
+
+
+def _no_folder(folder: Path) -> str:
+    """Why no file can be in what is no folder."""
+    if os.path.lexists(folder):
+        return f"'{folder}' is no folder"
+    home = "; '~' is not expanded here: write the home folder out" if "~" in folder.parts else ""
+    return f"the folder '{folder}' does not exist{home}"
 
 
 def _mode_of_existing(target: Path, path: str | os.PathLike[str]) -> int | None:
