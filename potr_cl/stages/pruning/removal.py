@@ -122,6 +122,12 @@ class RemovalSweep(Owner):
         """Whether measurements project splats again; if not, the scene's parameters are not looked at any more."""
         return bool(self._prepared.uncached) or self._prepared.geometry_is_shared
 
+    def give_up_uncached(self) -> list[int]:
+        """Measure no views any more that do not fit the memory budget; returns their numbers among all cameras."""
+        numbers = [self._numbers[place] for places in self._prepared.uncached for place in places]
+        self._prepared.uncached = []
+        return numbers
+
     @property
     def alive(self) -> NDArray[np.bool_]:
         """(N,) which splats are left."""
