@@ -314,7 +314,6 @@ class SceneBuffers(Owner):
             DeviceError: there is no room for some of them beside the scene.
         """
 
-
         def taken(start: int) -> list[tuple[cl.Buffer, FloatArray, str]]:
             some = scene.subset(splats[start : start + _TAKEN])
             return [

@@ -1,4 +1,4 @@
-"""Views of parts that a CPU's memory has no room for, made again whenever they are measured: :class:`PassingParts`."""
+"""Views that a CPU's memory has no room for, made again whenever they are measured: :class:`PassingParts`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
-from potr_cl.raster.culling import ViewPart
 from potr_cl.raster.preparing_memory import PreparingMemory
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers
@@ -33,14 +32,13 @@ from potr_cl.stages.pruning.sweep_options import SweepOptions
 Fill = Callable[[SceneBuffers, Indices], None]
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Part:
     """Views that see much of the same.
 
     Attributes:
         numbers: of the views.
-        splats: a bit for each splat of the scene, packed: those that the views may draw; and once they have been
-            looked at, those of which one has an intersection with any tile.
+        splats: a bit for each splat of the scene, packed: those of which a view has an intersection with any tile.
     """
 
     numbers: list[int]
@@ -65,8 +63,8 @@ class _Ready:
 class PassingParts(Owner):
     """Views of which nothing stays on the device. Their target pictures are kept on the host.
 
-    A part's splats that are left, and that any of its views has in a tile list, are brought to the device, then its
-    views are measured one after the other. That is done when views have lost enough since the last time, as
+    The splats that are left and that any view of a part draws are brought to the device, then the part's views are
+    measured one after the other. That is done when views have lost enough since the last time, as
     :class:`~potr_cl.stages.pruning.passing_views.PassingViews` does.
 
     Args:
@@ -107,11 +105,14 @@ class PassingParts(Owner):
     def views(self) -> int:
         return sum(len(part.numbers) for part in self._parts)
 
-    def take(self, part: ViewPart, numbers: Sequence[int]) -> None:
-        """Measure some views of a part, too."""
-        wanted = np.zeros(len(self._scene), bool)
-        wanted[part.splats] = True
-        self._parts.append(_Part(sorted(numbers), np.packbits(wanted)))
+    def take(self, numbers: Sequence[int], drawn: NDArray[np.bool_]) -> None:
+        """Measure some views, too, together.
+
+        Args:
+            numbers: of the views, ascending.
+            drawn: (N,) the splats of which one of them has an intersection with any tile.
+        """
+        self._parts.append(_Part(list(numbers), np.packbits(drawn)))
 
     def add_to(self, totals: NDArray[np.int64], alive: NDArray[np.bool_]) -> None:
         """Add what the views measure, which is done anew where they have lost enough.
@@ -174,19 +175,11 @@ class PassingParts(Owner):
         with self._ready(part, alive) as ready:
             if ready is None:
                 return
-            drawn = np.zeros(len(ready.splats), bool)
             for number in part.numbers:
-                first = number not in self._targets
-                with self._swept(number, ready) as views:
-                    if first:
-                        count = views.views.views[0].intersection_count
-                        drawn[self._device.download(views.views.intersections, (count,), np.uint32)] = True
+                with self._swept(number, ready):
+                    pass
             measured = self._device.download(ready.buffers.totals, (len(ready.splats), 2), np.int64)
             self._totals[ready.splats] += measured
-        if first:
-            wanted = np.zeros(len(alive), bool)
-            wanted[ready.splats[drawn]] = True
-            part.splats = np.packbits(wanted)
 
     @contextmanager
     def _ready(self, part: _Part, alive: NDArray[np.bool_]) -> Iterator[_Ready | None]:

@@ -122,12 +122,6 @@ class RemovalSweep(Owner):
         """Whether measurements project splats again; if not, the scene's parameters are not looked at any more."""
         return bool(self._prepared.uncached) or self._prepared.geometry_is_shared
 
-    def give_up_uncached(self) -> list[int]:
-        """Measure no views any more that do not fit the memory budget; returns their numbers among all cameras."""
-        numbers = [self._numbers[place] for places in self._prepared.uncached for place in places]
-        self._prepared.uncached = []
-        return numbers
-
     @property
     def alive(self) -> NDArray[np.bool_]:
         """(N,) which splats are left."""
@@ -167,6 +161,11 @@ class RemovalSweep(Owner):
                 self._memory.adopt(former)
         elif former is not None:
             self._device.free(former)
+        self.project_again()
+
+    def project_again(self) -> None:
+        """Continue with the colours that the rasterizer's scene has by now; so with others, if it has got others."""
+        self._cached.settle()
         for views in self._prepared.cached:
             if views.views.shapes is not None:
                 self._rasterizer.project(views.views)

@@ -26,11 +26,8 @@ from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.culling import Sights, ViewPart, part_seen, work
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
-from potr_cl.raster.scene_buffers import SPLAT_GROUP, Drawable, SceneBuffers, stride_of
-from potr_cl.raster.view_cache import GEOMETRY
+from potr_cl.raster.scene_buffers import SPLAT_GROUP, Drawable, SceneBuffers
 from potr_cl.stages.pruning.fixed_point import FixedPoint, zero_totals
-from potr_cl.stages.pruning.kept_views import target_bytes
-from potr_cl.stages.pruning.passing_parts import PassingParts
 from potr_cl.stages.pruning.removal import F64, Indices, RemovalSweep
 from potr_cl.stages.pruning.steering import Steering
 from potr_cl.stages.pruning.survivors import Bits, Survivors
@@ -102,11 +99,6 @@ def first_totals(splats: int, spared: NDArray[np.bool_] | None) -> NDArray[np.in
     return totals
 
 
-def _least(cameras: Sequence[Camera], part: ViewPart) -> int:
-    """Bytes that a part's views leave no room in for any of them to stay prepared."""
-    return GEOMETRY * stride_of(len(part.splats)) + min(map(target_bytes, cameras))
-
-
 @dataclass(frozen=True)
 class _Part:
     """A part at work.
@@ -161,7 +153,7 @@ class PartedRemoval(Owner):
         spared: NDArray[np.bool_] | None = None,
     ) -> None:
         self.splats = len(scene)
-        self._spared = spared
+        self._first_totals = first_totals(self.splats, spared)
         self._device, self._scene, self._whole = device, scene, whole
         self._fixed_point = FixedPoint.of_views(cameras)
         self._alive = np.ones(self.splats, bool)
@@ -173,10 +165,6 @@ class PartedRemoval(Owner):
         self._rest = sum(sizes) > SCENES * left
         left = max(left - (max(sizes) if self._rest else sum(sizes)), 0)
         left -= min(_IN_HAND * max(len(part.splats) for part in parts), int(_MOST_IN_HAND * left))
-        # What others than CPUs do has been measured as it is.
-        self._passing = None
-        if device.family == "cpu":
-            self._passing = PassingParts(device, scene, self._fill, cameras, options, self._fixed_point, background)
         done = 0
 
         def report(some: int, _: int) -> None:
@@ -184,18 +172,10 @@ class PartedRemoval(Owner):
                 progress(done + some, len(cameras))
 
         with ExitStack() as owned:
-            if self._passing is not None:
-                owned.enter_context(self._passing)
             self._memory = owned.enter_context(Memory(device))
             for place, part in enumerate(parts):
                 before = device.allocated
                 room = int(left * work([part]) / max(work(parts[place:]), 1))
-                if self._passing is not None and room < _least([cameras[number] for number in part.numbers], part):
-                    self._passing.take(part, part.numbers)
-                    left += 0 if self._rest else sizes[place]
-                    done += len(part.numbers)
-                    report(0, 0)
-                    continue
                 own = SceneBuffers(device, len(part.splats), scene.sh.shape[1], scene.antialiased, scene.low_pass)
                 owned.enter_context(own)
                 nbytes = own.nbytes
@@ -203,19 +183,12 @@ class PartedRemoval(Owner):
                 rasterizer = owned.enter_context(Rasterizer(device, own, background=background))
                 sweep = RemovalSweep(rasterizer, cameras, replace(options, memory=room), report, part.numbers)
                 owned.enter_context(sweep)
-                done += len(part.numbers)
-                if self._passing is not None and (others := sweep.give_up_uncached()):
-                    self._passing.take(part, others)
-                if not sweep.cached_views and self._passing is not None:
-                    for owner in (sweep, rasterizer, own):
-                        owner.close()
-                    left += 0 if self._rest else nbytes
-                    continue
                 numbers = self._memory.upload(part.splats.astype(np.uint32), "the numbers of a part's splats")
                 self._parts.append(_Part(part.splats, own, rasterizer, sweep, numbers))
                 self._lay_down(self._parts[-1])
                 left = max(left - (device.allocated - before - (0 if own.rests else nbytes)), 0)
-            if self._parts and all(part.sweep.steering is not None for part in self._parts):
+                done += len(part.numbers)
+            if all(part.sweep.steering is not None for part in self._parts):
                 self.steering = owned.enter_context(_PartedSteering(self, device))
             self._owned = owned.pop_all()
         self.kept_views = sum(part.sweep.cached_views for part in self._parts)
@@ -251,9 +224,7 @@ class PartedRemoval(Owner):
 
     def measure_totals(self) -> NDArray[np.int64]:
         """The same as (N, 2) int64 in units of the fixed point: the sums over all parts."""
-        totals = first_totals(self.splats, self._spared)
-        if self._passing is not None:
-            self._passing.add_to(totals, self._alive)
+        totals = self._first_totals.copy()
         for part in self._parts:
             with self.awake(part):
                 totals[part.splats] += part.sweep.measure_totals()
@@ -271,8 +242,6 @@ class PartedRemoval(Owner):
         """Continue with other colours, (N, M, 3) float32 of the same degree. The target pictures stay as they are."""
         # The scenes' own colours are those of the targets: from now on both are needed.
         self._rest = False
-        if self._passing is not None:
-            self._passing.replace_sh(sh)
         for part in self._parts:
             if part.scene.rests:
                 part.scene.wake()
@@ -286,8 +255,6 @@ class PartedRemoval(Owner):
 
     def sweep_everything(self) -> None:
         """Have the next measurement sweep every tile, whatever has changed."""
-        if self._passing is not None:
-            self._passing.forget()
         for part in self._parts:
             part.sweep.sweep_everything()
 
@@ -299,10 +266,7 @@ class PartedRemoval(Owner):
 
     def known_importances(self) -> Iterator[tuple[int, Indices, F64]]:
         """:meth:`view_importances` right after :meth:`sweep_changed`."""
-        found = list(map(self._importances, self._parts))
-        if self._passing is not None:
-            found.append(self._passing.importances(self._alive))
-        yield from heapq.merge(*found, key=lambda each: each[0])
+        yield from heapq.merge(*map(self._importances, self._parts), key=lambda found: found[0])
 
     def _importances(self, part: _Part) -> Iterator[tuple[int, Indices, F64]]:
         known = part.sweep.known_importances()
@@ -329,7 +293,7 @@ class _PartedSteering(Owner):
         self._memory = Memory(device)
         with device.all_or_nothing():
             first = zero_totals(stride)
-            first[: self.splats] = first_totals(self.splats, removal._spared).view(np.uint32)
+            first[: self.splats] = removal._first_totals.view(np.uint32)
             self.totals: cl.Buffer = self._memory.upload(first, "the removal effects")
             self._first = self._memory.upload(first, "the removal effects to begin with")
             self._survivors = Survivors(device, self.splats, stride, device.queue.finish)
