@@ -21,6 +21,7 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.view_shares import Excerpt
 from potr_cl.stages.pruning.alive_packing import AlivePacking
 from potr_cl.stages.pruning.changed_totals import ChangedTotals, Changes, changes_on_host
+from potr_cl.stages.pruning.drawn_removal import DrawnRemoval
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.survivors import Bits
 from potr_cl.stages.pruning.sweep_options import SweepOptions
@@ -64,14 +65,15 @@ class RemovalPart(Part):
         options = SweepOptions(**{**vars(options), "memory": memory})
         with ExitStack() as owned:
             drawable = owned.enter_context(lying_on(device, scene))
-            self._sweep: RemovalSweep | ViewByView | PartedRemoval
+            self._sweep: RemovalSweep | ViewByView | PartedRemoval | DrawnRemoval
             if sights is not None:
                 drawable = owned.enter_context(whole_on_device(device, drawable))
             if sights is not None and can_go_by_view(drawable, device, options):
                 self._sweep = ViewByView(device, drawable, cameras, sights, options, background, numbers=numbers)
             elif sights is not None and isinstance(drawable, Scene):
                 dealt = sights.parts(numbers)
-                self._sweep = PartedRemoval(device, drawable, drawable, cameras, dealt, options, background)
+                by_parts = DrawnRemoval if device.family == "cpu" else PartedRemoval
+                self._sweep = by_parts(device, drawable, drawable, cameras, dealt, options, background)
             else:
                 rasterizer = owned.enter_context(Rasterizer(device, drawable, background=background))
                 self._sweep = RemovalSweep(rasterizer, cameras, options, numbers=numbers)
