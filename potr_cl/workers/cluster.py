@@ -347,7 +347,7 @@ class _ClusterWorker(Worker):
             # Two: the uncompressed scene, and what is worked on now.
             kept = self._known[-1:]
             self.ask("keep", number, thing, [each for each, _ in kept])
-            self._pool.traffic.add(sent=getattr(thing, "nbytes", 0))
+            self._pool.traffic.add(sent=getattr(thing, "nbytes", 0), what=type(thing).__name__)
         else:
             kept = [each for each in self._known if each[1] is not thing]
         self._known = [*kept, (number, thing)]

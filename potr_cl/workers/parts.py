@@ -127,7 +127,7 @@ class Parts(Owner):
         found: list[Any] = [None]
 
         def take(_place: int, result: Any) -> None:
-            self._pool.traffic.add(received=nbytes(result))
+            self._pool.traffic.add(received=nbytes(result), what=command, answers=1)
             found[0] = result
 
         self._collect(Round({place: self._begin(place, command, args)}), take, (command, args))
@@ -191,7 +191,7 @@ class Parts(Owner):
 
     def _send(self, held: Held, origin: int, command: str, args: Sequence[Any]) -> Future[Any]:
         args = [each.args[origin] if isinstance(each, Each) else each for each in args]
-        self._pool.traffic.add(sent=nbytes(args))
+        self._pool.traffic.add(sent=nbytes(args), what=command)
         return held.begin(command, args)
 
     def _take_made(self, place: int, held: Held) -> None:
@@ -432,7 +432,7 @@ class Pending:
         parts, found, since = self._parts, dict[int, Any](), time.monotonic()
 
         def take(place: int, result: Any) -> None:
-            parts._pool.traffic.add(received=nbytes(result))
+            parts._pool.traffic.add(received=nbytes(result), what=self._command, answers=1)
             found[place] = result
 
         try:

@@ -124,7 +124,7 @@ class Packing(Owner):
     def rows(self, sums: cl.Buffer, row: int, rows: int) -> Narrowed:
         """(rows, stride) int64, rows of sums from one on; valid until something else is narrowed."""
         stride = self._coefficients.layout.stride
-        return self._narrowing.download(sums, (rows, stride), stride * row)
+        return self._narrowing.download(sums, (rows, stride), stride * row, turned=True)
 
     def lend_sums(self, columns: cl.Buffer) -> Lent:
         """The same on the device, for others of this process."""
