@@ -107,12 +107,10 @@ class Narrowing(Owner):
         self._device = device
         self._kernels = {name: device.shared_kernel(_SOURCE, name) for name in ("widths_of", "narrow", "widen")}
         self._widths, self._starts = Scratch(device, _WHAT), Scratch(device, _WHAT)
-        self._words = Scratch(device, _WHAT)
+        self._words, self._values = Scratch(device, _WHAT), Scratch(device, _WHAT)
         self._staging = Staging(device)
 
-    def download(
-        self, values: cl.Buffer, shape: tuple[int, ...], start: int = 0, turned: bool = False
-    ) -> Narrowed:
+    def download(self, values: cl.Buffer, shape: tuple[int, ...], start: int = 0, turned: bool = False) -> Narrowed:
         """Integers of a buffer, once all is done that has been enqueued before; valid until the next call.
 
         Args:
@@ -162,6 +160,21 @@ class Narrowing(Owner):
             **_lying(narrowed.shape, narrowed.turned),
         )
 
+    def narrowed(self, values: NDArray[np.int64]) -> Narrowed:
+        """Integers of the host; valid until the next call."""
+        self._copy(self._values, values)
+        return self.download(self._values.buffer, values.shape)
+
+    def widened(self, narrowed: Narrowed) -> NDArray[np.int64]:
+        """Integers for the host, many times as fast as :meth:`Narrowed.widened`.
+
+        Raises:
+            ValueError: their parts do not fit each other.
+        """
+        self._values.reserve(max(8 * narrowed.count, 1))
+        self.upload(self._values.buffer, narrowed)
+        return self._device.download(self._values.buffer, narrowed.shape, np.int64)
+
     def _copy(self, scratch: Scratch, array: NDArray[np.generic]) -> None:
         scratch.reserve(max(array.nbytes, 1))
         if array.nbytes:
@@ -175,7 +188,7 @@ class Narrowing(Owner):
 
     def close(self) -> None:
         """Give the device's memory back."""
-        for scratch in (self._widths, self._starts, self._words):
+        for scratch in (self._widths, self._starts, self._words, self._values):
             scratch.close()
         self._staging.close()
 

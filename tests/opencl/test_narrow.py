@@ -59,6 +59,15 @@ def test_columns_go_beside_each_other(kernels, rows, columns):
             assert narrowed.nbytes < 0.85 * plain
 
 
+@pytest.mark.parametrize("count", [0, 1, 200])
+def test_integers_of_the_host(count):
+    values = integers(2 * max(count, 1), 5)[: 2 * count].reshape(2, count)
+    device = open_device("cpu")
+    with Narrowing(device) as there, Narrowing(device) as here:
+        assert np.array_equal(here.widened(there.narrowed(values)), values)
+    assert device.allocated == 0
+
+
 def test_small_integers_need_few_bits():
     device = open_device("gpu")
     values = np.random.default_rng(1).integers(-(2**18), 2**18, (20, 640))

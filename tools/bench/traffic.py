@@ -15,7 +15,6 @@ import dataclasses
 import hashlib
 import os
 from pathlib import Path
-from typing import Any
 
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model.camera import train_views
@@ -24,11 +23,12 @@ from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.stages.pruning import visible_parts
 from potr_cl.workers.cluster import ClusterPool
+from potr_cl.workers.pool import Went
 from tools.results import Column, Results
 
 
-def seconds_of(dask_worker: Any) -> float:
-    """On a worker: processor time of its process by now."""
+def seconds_of() -> float:
+    """Processor time of this process by now."""
     return sum(os.times()[:2])
 
 
@@ -42,7 +42,7 @@ def main() -> None:
     parser.add_argument("--as-large", action="store_true", help="share a scene of any size out as a large one")
     parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
-    from distributed import LocalCluster  # an extra of the package
+    from distributed import Client, LocalCluster  # an extra of the package
 
     folder = args.scene.is_dir()
     scene = load_scene(args.scene / "point_cloud.ply" if folder else args.scene)
@@ -63,20 +63,21 @@ def main() -> None:
         Column("sent", "MB", ",.2f"),
         Column("came back", "MB", ",.2f"),
     )
+    workers = {"n_workers": args.workers, "threads_per_worker": 1, "memory_limit": None, "dashboard_address": None}
     with (
-        LocalCluster(
-            n_workers=args.workers, threads_per_worker=1, memory_limit=None, dashboard_address=None
-        ) as cluster,
+        LocalCluster(**workers) as cluster,
+        Client(cluster, set_as_default=False) as client,
         ClusterPool(cluster.scheduler_address, device) as pool,
-    ):  # fmt: skip
-        before = sum(pool.client.run(seconds_of).values())
-        own = seconds_of(None)
+    ):
+        before = sum(client.run(seconds_of).values())
+        own = seconds_of()
         found = encode(scene, views, options, device=device, pool=pool)
-        own = seconds_of(None) - own
-        there = sum(pool.client.run(seconds_of).values()) - before
-    for what, went in pool.traffic.of.items():
-        table.add(what, went.answers, went.sent / 1e6, went.received / 1e6)
-    table.add("all", sum(went.answers for went in pool.traffic.of.values()), pool.traffic.sent / 1e6, pool.traffic.received / 1e6)
+        own = seconds_of() - own
+        there = sum(client.run(seconds_of).values()) - before
+        traffic = pool.traffic
+    every = [*traffic.of.items(), ("all", Went(0, traffic.sent, traffic.received))]
+    for what, went in every:
+        table.add(what, went.answers or None, went.sent / 1e6, went.received / 1e6)
     times = results.table(
         "times", "Processor time", Column("of"), Column("time", "s", ".1f"), Column("splats left", "", ",.0f")
     )
