@@ -164,9 +164,10 @@ class Parts(Owner):
         held, self._held = self._held, [None] * len(self._given)
         making, self._making = self._making, None
         for place, each in making.futures.items() if making is not None else ():  # an error came between
-            if _is_left(self._by[place]):
+            if abandoned or _is_left(self._by[place]):
+                # Nobody waits for it, and nobody wants it: its memory is given back as soon as it is made.
                 each.add_done_callback(_abandon_made)
-            elif not abandoned:
+            else:
                 with suppress(PotrError):
                     held[place] = each.result()
         for part, by in zip(held, self._by, strict=True):
