@@ -41,6 +41,12 @@ OPTIONS = EncodeOptions.for_preset(
 )  # fmt: skip
 
 
+@pytest.fixture(autouse=True)
+def patient(monkeypatch):
+    """A scheduler that a busy machine has just begun may take long to answer."""
+    monkeypatch.setattr("potr_cl.workers.cluster._CONNECT", 120.0)
+
+
 @contextlib.contextmanager
 def local_cluster(workers):
     with distributed.LocalCluster(
