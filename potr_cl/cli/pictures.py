@@ -6,7 +6,7 @@ import argparse
 import contextlib
 from pathlib import Path
 
-from potr_cl.api.comparing import SceneComparison, compare_scenes, named
+from potr_cl.api.comparing import SceneComparison, coded_for, compare_scenes, named
 from potr_cl.api.inputs import chosen_views
 from potr_cl.api.pictures import make_folder, picture_files, written_pictures
 from potr_cl.api.views import Viewpoints, told
@@ -42,11 +42,12 @@ from potr_cl.model.scene import Scene
 from potr_cl.model.viewpoints import AXES, SIZE, VIEWS
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import list_devices
+from potr_cl.outputs.coded_scene import CodedScene
 from potr_cl.quality.compare import format_sizes, size_report
 from potr_cl.raster.rules import RULES
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.raster.seen_rasterizer import rasterizer_for
-from potr_cl.workers.opening import open_workers
+from potr_cl.workers.opening import Workers, open_workers
 
 
 def _add_viewpoints(p: argparse.ArgumentParser) -> None:
@@ -151,17 +152,20 @@ def _compare(args: argparse.Namespace) -> None:
     try:
         with contextlib.ExitStack() as stack:
             drawables: list[Drawable] = []
+            coded: list[CodedScene | None] = []
             if cameras is None:
                 scenes = [read_scene(args, path) for path in (args.a, args.b)]
                 cameras = _cameras(args, points, scenes[0], "; a scene encoded with cameras looks best from those")
                 drawables += scenes
                 views = chosen_views(cameras, args.views, args.split)
                 workers = stack.enter_context(open_workers(args.device, args.cluster))
+                coded += [_coded(args, path, workers) for path in (args.a, args.b)]
             else:
                 views = chosen_views(cameras, args.views, args.split)
                 workers = stack.enter_context(open_workers(args.device, args.cluster))
                 for path in (args.a, args.b):
-                    drawable, judged = stack.enter_context(read_to_draw(args, path, workers.device))
+                    coded.append(_coded(args, path, workers))
+                    drawable, judged = stack.enter_context(read_to_draw(args, path, workers.device, coded[-1]))
                     warn_of_frame(path, judged, views)
                     drawables.append(drawable)
             a, b = drawables
@@ -170,7 +174,7 @@ def _compare(args: argparse.Namespace) -> None:
             comparison = compare_scenes(
                 (named(args.a, a), a), (named(args.b, b), b), views,
                 workers=workers, rules=RULES[args.rules], background=background, truth=args.truth, progress=progress,
-                files=_files(args), trust=args.trust,
+                coded=coded,
             )  # fmt: skip
             if picture is not None:
                 comparison.write_picture(picture)
@@ -183,10 +187,10 @@ def _compare(args: argparse.Namespace) -> None:
     _tell(args, comparison.report(), str(comparison))
 
 
-def _files(args: argparse.Namespace) -> list[Path | None]:
-    """What may be sent to other computers as it is."""
-    as_they_say = ANTIALIASED[args.antialiased] is None
-    return [path if as_they_say and not isinstance(path, StandardInput) else None for path in (args.a, args.b)]
+def _coded(args: argparse.Namespace, path: Path, workers: Workers) -> CodedScene | None:
+    """The file for other computers, where it may be sent to them as it is."""
+    as_it_says = ANTIALIASED[args.antialiased] is None and not isinstance(path, StandardInput)
+    return coded_for(workers, path, args.trust) if as_it_says else None
 
 
 def _tell(args: argparse.Namespace, report: dict[str, object], text: str) -> None:

@@ -24,6 +24,7 @@ from potr_cl.model.scene import Scene
 # What computes on a device is imported where it is needed: other commands do without.
 if TYPE_CHECKING:
     from potr_cl.opencl.device import Device
+    from potr_cl.outputs.coded_scene import CodedScene
     from potr_cl.raster.scene_buffers import Drawable
 
 FROM_HELP = 'the format that "-", standard input, brings: .ply, .spz …; default: what its content says'
@@ -84,15 +85,22 @@ def read_scene(args: argparse.Namespace, path: Path) -> Scene:
 
 
 @contextlib.contextmanager
-def read_to_draw(args: argparse.Namespace, path: Path, device: Device) -> Iterator[tuple[Drawable, Scene]]:
+def read_to_draw(
+    args: argparse.Namespace, path: Path, device: Device, coded: CodedScene | None = None
+) -> Iterator[tuple[Drawable, Scene]]:
     """The same to be rendered on a device, and a scene on the host by which cameras can be judged.
+
+    Args:
+        args, path: as of :func:`read_scene`.
+        device: to render on.
+        coded: what the file holds, where it has been read.
 
     Raises:
         As :func:`potr_cl.api.inputs.drawable_to_judge`.
     """
     with (
         as_file(path) as file,
-        drawable_to_judge(file, device, args.trust, ANTIALIASED[args.antialiased]) as found,
+        drawable_to_judge(file, device, args.trust, ANTIALIASED[args.antialiased], coded) as found,
     ):
         yield found
 

@@ -173,8 +173,7 @@ def part_seen(scene: Scene, cameras: Sequence[Camera], near: float) -> float:
         cameras: the views, at least one.
         near: as in the rasterizer's rules.
     """
-    black = replace(scene, sh=np.broadcast_to(np.float32(0), (len(scene), 1, 3)))  # colours are not looked at
-    few = black.subset(np.arange(0, len(scene), _SAMPLED))
+    few = scene.uncoloured().subset(np.arange(0, len(scene), _SAMPLED))
     groups = SplatGroups.of(few, max(splat_groups.LARGEST // _SAMPLED, 1))
     some = [cameras[number] for number in range(0, len(cameras), -(-len(cameras) // _VIEWS))]
     return float((groups.visible_by(some, near) @ groups.counts).mean() / len(few))

@@ -192,6 +192,22 @@ def test_scenes_are_compared_by_a_cluster(scene, cameras, device, judged, tmp_pa
             ]
 
 
+def test_a_file_that_workers_get_is_read_once(scene, cameras, device, judged, tmp_path, monkeypatch):
+    """All judge the same bytes then, whoever writes to the file meanwhile."""
+    path, opened, plainly = tmp_path / "b.potr", [], Path.open
+    path.write_bytes(judged[0].data)
+
+    def noted(self, *args, **keywords):
+        if self == path:
+            opened.append(self)
+        return plainly(self, *args, **keywords)
+
+    monkeypatch.setattr(Path, "open", noted)
+    with local_cluster(1) as cluster:
+        potr_cl.compare(scene, path, cameras, device=device, cluster=cluster.scheduler_address)
+    assert len(opened) == 2  # for its first bytes, which tell what it is, and whole
+
+
 def looks(dask_worker):
     """On a worker: milliseconds between two looks at itself."""
     return [dask_worker.periodic_callbacks[name].callback_time for name in ("tick", "monitor", "profile")]
