@@ -18,13 +18,15 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
-from potr_cl.opencl.memory import Owner
+from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.culling import ViewPart
+from potr_cl.raster.macros import totals_limits
 from potr_cl.raster.preparing_memory import PreparingMemory
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
@@ -37,12 +39,14 @@ from potr_cl.stages.pruning.visible_parts import first_totals
 
 #: Splats that are projected at a time to find which of them views draw.
 _PIECE = 1 << 20
-#: Bytes of a view that stays prepared: of each splat (shape, colour, totals, states, number) and of each intersection
-#: (splat, sub-tiles, sums).
-_SPLAT, _INTERSECTION = 86, 16
+#: Bytes of a view that stays prepared: of each splat (shape, colour, totals, states, two numbers) and of each
+#: intersection (splat, sub-tiles, sums).
+_SPLAT, _INTERSECTION = 84, 16
 #: Bytes of each splat of views that pass, and of each intersection, while they are measured. What they are allowed is
 #: this part of the memory; a view that takes more is measured alone.
 _PASSING_SPLAT, _PASSING = 460, 1 / 4
+#: Work-items of a work-group that adds totals up.
+_GROUP = 64
 #: More than any view takes.
 _PLENTY = 1 << 60
 
@@ -53,12 +57,14 @@ class _View:
 
     Attributes:
         splats: (n,) uint32, the numbers of those that it draws, ascending.
+        numbers: the same in the device's memory.
         scene: these on the device, while they are projected.
         rasterizer: of that scene.
         sweep: measures the view.
     """
 
     splats: NDArray[np.uint32]
+    numbers: cl.Buffer
     scene: SceneBuffers
     rasterizer: Rasterizer
     sweep: RemovalSweep
@@ -115,6 +121,7 @@ class DrawnRemoval(Owner):
         done, left = 0, memory - passing
         with ExitStack() as owned:
             self._owned = owned
+            self._memory = owned.enter_context(Memory(device))
             self._passing = PassingParts(device, scene, self._fill, cameras, options, self._fixed_point, background)
             owned.enter_context(self._passing)
             for part in parts:
@@ -166,7 +173,9 @@ class DrawnRemoval(Owner):
         rasterizer = self._owned.enter_context(Rasterizer(device, own, background=self._background))
         sweep = RemovalSweep(rasterizer, self._cameras, self._options, numbers=[number])
         self._owned.enter_context(sweep)
-        self._views.append(_View(splats.astype(np.uint32), own, rasterizer, sweep))
+        named = splats.astype(np.uint32)
+        numbers = self._memory.upload(named, "the numbers of a view's splats")
+        self._views.append(_View(named, numbers, own, rasterizer, sweep))
         self._lay_down(self._views[-1])
 
     def _lay_down(self, view: _View) -> None:
@@ -212,10 +221,25 @@ class DrawnRemoval(Owner):
     def measure_totals(self) -> NDArray[np.int64]:
         """The same as (N, 2) int64 in units of the fixed point: the sums over the views that are measured here."""
         totals = first_totals(self.splats, self._spared)
-        for view in self._views:
-            totals[view.splats] += view.sweep.measure_totals()
+        self._add_kept(totals)
         self._passing.add_to(totals, self._alive)
         return totals
+
+    def _add_kept(self, totals: NDArray[np.int64]) -> None:
+        """Add what the views that stay prepared measure; the device adds it up."""
+        if not self._views:
+            return
+        device = self._device
+        add = device.shared_kernel("prune/parts.cl", "add_part", **totals_limits(device))
+        with Memory(device) as memory:
+            sums = memory.upload(totals, "the removal effects")
+            for view in self._views:
+                view.sweep.measure_on_device()
+                count = len(view.splats)
+                add.bind(totals=sums, part=view.sweep.totals, numbers=view.numbers, count=count)
+                add.launch((-(-count // _GROUP) * _GROUP,), (_GROUP,))
+            with device.errors("failed while computing"):
+                cl.enqueue_copy(device.queue, totals, sums, is_blocking=True)
 
     def remove(self, splats: Indices) -> None:
         """Take splats out for good."""
