@@ -47,8 +47,40 @@ _SPLAT, _INTERSECTION = 84, 16
 _PASSING_SPLAT, _PASSING = 460, 1 / 4
 #: Work-items of a work-group that adds totals up.
 _GROUP = 64
+#: Bytes of each splat beside these while a view is made that stays prepared: of its scene, and of lists to be sorted.
+_MAKING = 320
 #: More than any view takes.
 _PLENTY = 1 << 60
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """What a view draws.
+
+    Attributes:
+        number: of the view.
+        part: that it belongs to.
+        bits: a bit for each of the part's splats, packed: those that it draws.
+        count: how many these are. intersections: with tiles.
+        camera: of the view.
+    """
+
+    number: int
+    part: ViewPart
+    bits: NDArray[np.uint8]
+    count: int
+    intersections: int
+    camera: Camera
+
+    @property
+    def drawn(self) -> NDArray[np.bool_]:
+        """(n,) which of the part's splats it draws."""
+        return np.unpackbits(self.bits, count=len(self.part.splats)).view(bool)
+
+    @property
+    def nbytes(self) -> int:
+        """What it takes while it stays prepared."""
+        return _SPLAT * self.count + _INTERSECTION * self.intersections + target_bytes(self.camera)
 
 
 @dataclass(frozen=True)
@@ -118,31 +150,33 @@ class DrawnRemoval(Owner):
         self._views: list[_View] = []
         memory = default_memory(device) if options.memory is None else options.memory
         passing = int(_PASSING * memory)
-        done, left = 0, memory - passing
+        left, done = memory - passing, 0
         with ExitStack() as owned:
             self._owned = owned
             self._memory = owned.enter_context(Memory(device))
             self._passing = PassingParts(device, scene, self._fill, cameras, options, self._fixed_point, background)
             owned.enter_context(self._passing)
+            found: list[_Drawn] = []
             for part in parts:
-                others: list[tuple[int, NDArray[np.bool_]]] = []
-                for number, (drawn, count) in zip(part.numbers, self._drawn(part), strict=True):
-                    splats = part.splats[drawn]
-                    nbytes = _SPLAT * len(splats) + _INTERSECTION * count + target_bytes(cameras[number])
-                    if nbytes <= left:
-                        self._keep(number, splats)
-                        left -= nbytes
-                    else:
-                        others.append((number, drawn))
-                    done += 1
-                    if progress is not None:
-                        progress(done, len(cameras))
-                self._pass(part, others, passing)
+                found += self._find_drawn(part)
+                done += len(part.numbers)
+                if progress is not None:
+                    progress(done, len(cameras))
+            others: list[_Drawn] = []
+            # The widest first: they take most while they are made, and most again each time if they are not kept.
+            for view in sorted(found, key=lambda each: (-each.nbytes, each.number)):
+                if view.nbytes <= left and _MAKING * view.count <= left - view.nbytes + passing:
+                    self._keep(view.number, view.part.splats[view.drawn])
+                    left -= view.nbytes
+                else:
+                    others.append(view)
+            for part in parts:
+                self._pass([view for view in others if view.part is part], passing)
             self._owned = owned.pop_all()
         self.kept_views = len(self._views)
 
-    def _drawn(self, part: ViewPart) -> list[tuple[NDArray[np.bool_], int]]:
-        """Of each view of a part: which of the part's splats, (n,), it draws; and its intersections."""
+    def _find_drawn(self, part: ViewPart) -> list[_Drawn]:
+        """What the views of a part draw, each by itself."""
         drawn = [np.zeros(len(part.splats), bool) for _ in part.numbers]
         counts = [0] * len(drawn)
         device, scene = self._device, self._scene
@@ -160,7 +194,10 @@ class DrawnRemoval(Owner):
                             found = device.download(views.intersections, (count,), np.uint32)
                         drawn[place][first : first + _PIECE][found] = True
                         counts[place] += count
-        return list(zip(drawn, counts, strict=True))
+        return [
+            _Drawn(number, part, np.packbits(own), int(np.count_nonzero(own)), count, self._cameras[number])
+            for number, own, count in zip(part.numbers, drawn, counts, strict=True)
+        ]
 
     def _keep(self, number: int, splats: Indices) -> None:
         """Have a view stay prepared."""
@@ -184,22 +221,22 @@ class DrawnRemoval(Owner):
         view.rasterizer.rest()
         view.scene.rest()
 
-    def _pass(self, part: ViewPart, others: Sequence[tuple[int, NDArray[np.bool_]]], room: int) -> None:
-        """Have views of a part measured in passing, as many together as see few enough splats."""
+    def _pass(self, others: Sequence[_Drawn], room: int) -> None:
+        """Have views of one part measured in passing, as many together as see few enough splats."""
         together: list[int] = []
-        seen = np.zeros(len(part.splats), bool)
+        seen = np.zeros(0, bool)
 
         def take() -> None:
             drawn = np.zeros(self.splats, bool)
-            drawn[part.splats[seen]] = True
+            drawn[others[0].part.splats[seen]] = True
             self._passing.take(together, drawn)
 
-        for number, drawn in others:
-            both = seen | drawn
+        for view in sorted(others, key=lambda each: each.number):
+            both = seen | view.drawn if together else view.drawn
             if together and _PASSING_SPLAT * int(np.count_nonzero(both)) > room:
                 take()
-                together, both = [], drawn
-            together, seen = [*together, number], both
+                together, both = [], view.drawn
+            together, seen = [*together, view.number], both
         if together:
             take()
 
