@@ -18,13 +18,15 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
-from potr_cl.opencl.memory import Owner
+from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.culling import ViewPart
+from potr_cl.raster.macros import totals_limits
 from potr_cl.raster.preparing_memory import PreparingMemory
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
@@ -37,14 +39,48 @@ from potr_cl.stages.pruning.visible_parts import first_totals
 
 #: Splats that are projected at a time to find which of them views draw.
 _PIECE = 1 << 20
-#: Bytes of a view that stays prepared: of each splat (shape, colour, totals, states, number) and of each intersection
-#: (splat, sub-tiles, sums).
-_SPLAT, _INTERSECTION = 86, 16
+#: Bytes of a view that stays prepared: of each splat (shape, colour, totals, states, two numbers) and of each
+#: intersection (splat, sub-tiles, sums).
+_SPLAT, _INTERSECTION = 84, 16
 #: Bytes of each splat of views that pass, and of each intersection, while they are measured. What they are allowed is
 #: this part of the memory; a view that takes more is measured alone.
 _PASSING_SPLAT, _PASSING = 460, 1 / 4
+#: Work-items of a work-group that adds totals up.
+_GROUP = 64
+#: Bytes of each splat beside these while a view is made that stays prepared: of its scene, and of lists to be sorted.
+_MAKING = 320
 #: More than any view takes.
 _PLENTY = 1 << 60
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """What a view draws.
+
+    Attributes:
+        number: of the view.
+        part: that it belongs to.
+        bits: a bit for each of the part's splats, packed: those that it draws.
+        count: how many these are. intersections: with tiles.
+        camera: of the view.
+    """
+
+    number: int
+    part: ViewPart
+    bits: NDArray[np.uint8]
+    count: int
+    intersections: int
+    camera: Camera
+
+    @property
+    def drawn(self) -> NDArray[np.bool_]:
+        """(n,) which of the part's splats it draws."""
+        return np.unpackbits(self.bits, count=len(self.part.splats)).view(bool)
+
+    @property
+    def nbytes(self) -> int:
+        """What it takes while it stays prepared."""
+        return _SPLAT * self.count + _INTERSECTION * self.intersections + target_bytes(self.camera)
 
 
 @dataclass(frozen=True)
@@ -53,12 +89,14 @@ class _View:
 
     Attributes:
         splats: (n,) uint32, the numbers of those that it draws, ascending.
+        numbers: the same in the device's memory.
         scene: these on the device, while they are projected.
         rasterizer: of that scene.
         sweep: measures the view.
     """
 
     splats: NDArray[np.uint32]
+    numbers: cl.Buffer
     scene: SceneBuffers
     rasterizer: Rasterizer
     sweep: RemovalSweep
@@ -112,30 +150,33 @@ class DrawnRemoval(Owner):
         self._views: list[_View] = []
         memory = default_memory(device) if options.memory is None else options.memory
         passing = int(_PASSING * memory)
-        done, left = 0, memory - passing
+        left, done = memory - passing, 0
         with ExitStack() as owned:
             self._owned = owned
+            self._memory = owned.enter_context(Memory(device))
             self._passing = PassingParts(device, scene, self._fill, cameras, options, self._fixed_point, background)
             owned.enter_context(self._passing)
+            found: list[_Drawn] = []
             for part in parts:
-                others: list[tuple[int, NDArray[np.bool_]]] = []
-                for number, (drawn, count) in zip(part.numbers, self._drawn(part), strict=True):
-                    splats = part.splats[drawn]
-                    nbytes = _SPLAT * len(splats) + _INTERSECTION * count + target_bytes(cameras[number])
-                    if nbytes <= left:
-                        self._keep(number, splats)
-                        left -= nbytes
-                    else:
-                        others.append((number, drawn))
-                    done += 1
-                    if progress is not None:
-                        progress(done, len(cameras))
-                self._pass(part, others, passing)
+                found += self._find_drawn(part)
+                done += len(part.numbers)
+                if progress is not None:
+                    progress(done, len(cameras))
+            others: list[_Drawn] = []
+            # The widest first: they take most while they are made, and most again each time if they are not kept.
+            for view in sorted(found, key=lambda each: (-each.nbytes, each.number)):
+                if view.nbytes <= left and _MAKING * view.count <= left - view.nbytes + passing:
+                    self._keep(view.number, view.part.splats[view.drawn])
+                    left -= view.nbytes
+                else:
+                    others.append(view)
+            for part in parts:
+                self._pass([view for view in others if view.part is part], passing)
             self._owned = owned.pop_all()
         self.kept_views = len(self._views)
 
-    def _drawn(self, part: ViewPart) -> list[tuple[NDArray[np.bool_], int]]:
-        """Of each view of a part: which of the part's splats, (n,), it draws; and its intersections."""
+    def _find_drawn(self, part: ViewPart) -> list[_Drawn]:
+        """What the views of a part draw, each by itself."""
         drawn = [np.zeros(len(part.splats), bool) for _ in part.numbers]
         counts = [0] * len(drawn)
         device, scene = self._device, self._scene
@@ -153,7 +194,10 @@ class DrawnRemoval(Owner):
                             found = device.download(views.intersections, (count,), np.uint32)
                         drawn[place][first : first + _PIECE][found] = True
                         counts[place] += count
-        return list(zip(drawn, counts, strict=True))
+        return [
+            _Drawn(number, part, np.packbits(own), int(np.count_nonzero(own)), count, self._cameras[number])
+            for number, own, count in zip(part.numbers, drawn, counts, strict=True)
+        ]
 
     def _keep(self, number: int, splats: Indices) -> None:
         """Have a view stay prepared."""
@@ -166,7 +210,9 @@ class DrawnRemoval(Owner):
         rasterizer = self._owned.enter_context(Rasterizer(device, own, background=self._background))
         sweep = RemovalSweep(rasterizer, self._cameras, self._options, numbers=[number])
         self._owned.enter_context(sweep)
-        self._views.append(_View(splats.astype(np.uint32), own, rasterizer, sweep))
+        named = splats.astype(np.uint32)
+        numbers = self._memory.upload(named, "the numbers of a view's splats")
+        self._views.append(_View(named, numbers, own, rasterizer, sweep))
         self._lay_down(self._views[-1])
 
     def _lay_down(self, view: _View) -> None:
@@ -175,22 +221,22 @@ class DrawnRemoval(Owner):
         view.rasterizer.rest()
         view.scene.rest()
 
-    def _pass(self, part: ViewPart, others: Sequence[tuple[int, NDArray[np.bool_]]], room: int) -> None:
-        """Have views of a part measured in passing, as many together as see few enough splats."""
+    def _pass(self, others: Sequence[_Drawn], room: int) -> None:
+        """Have views of one part measured in passing, as many together as see few enough splats."""
         together: list[int] = []
-        seen = np.zeros(len(part.splats), bool)
+        seen = np.zeros(0, bool)
 
         def take() -> None:
             drawn = np.zeros(self.splats, bool)
-            drawn[part.splats[seen]] = True
+            drawn[others[0].part.splats[seen]] = True
             self._passing.take(together, drawn)
 
-        for number, drawn in others:
-            both = seen | drawn
+        for view in sorted(others, key=lambda each: each.number):
+            both = seen | view.drawn if together else view.drawn
             if together and _PASSING_SPLAT * int(np.count_nonzero(both)) > room:
                 take()
-                together, both = [], drawn
-            together, seen = [*together, number], both
+                together, both = [], view.drawn
+            together, seen = [*together, view.number], both
         if together:
             take()
 
@@ -212,10 +258,25 @@ class DrawnRemoval(Owner):
     def measure_totals(self) -> NDArray[np.int64]:
         """The same as (N, 2) int64 in units of the fixed point: the sums over the views that are measured here."""
         totals = first_totals(self.splats, self._spared)
-        for view in self._views:
-            totals[view.splats] += view.sweep.measure_totals()
+        self._add_kept(totals)
         self._passing.add_to(totals, self._alive)
         return totals
+
+    def _add_kept(self, totals: NDArray[np.int64]) -> None:
+        """Add what the views that stay prepared measure; the device adds it up."""
+        if not self._views:
+            return
+        device = self._device
+        add = device.shared_kernel("prune/parts.cl", "add_part", **totals_limits(device))
+        with Memory(device) as memory:
+            sums = memory.upload(totals, "the removal effects")
+            for view in self._views:
+                view.sweep.measure_on_device()
+                count = len(view.splats)
+                add.bind(totals=sums, part=view.sweep.totals, numbers=view.numbers, count=count)
+                add.launch((-(-count // _GROUP) * _GROUP,), (_GROUP,))
+            with device.errors("failed while computing"):
+                cl.enqueue_copy(device.queue, totals, sums, is_blocking=True)
 
     def remove(self, splats: Indices) -> None:
         """Take splats out for good."""
