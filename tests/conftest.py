@@ -17,6 +17,7 @@ from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model import agreement, virtual_cameras
 from potr_cl.model.placement.candidates import Candidates, Run
 from potr_cl.model.placement.matter import Frame, Matter
+from potr_cl.opencl.loader import register_runtimes
 
 DATA = Path(__file__).parent / "data"
 #: Where Chromium is, if it has another name than systems give it.
@@ -46,6 +47,16 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         on_gpu_kernels = parameters is not None and any(str(value) == "gpu" for value in parameters.params.values())
         if on_gpu_kernels and item.get_closest_marker("one_family") is not None:
             item.add_marker(pytest.mark.slow)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def runtimes_are_registered() -> None:
+    """As the first test that opens a device would do it, for all programs that tests start.
+
+    A program that does it itself leaves a folder where temporary files lie, for those after it; tests that look what is
+    left there would find that, if none has opened a device before them.
+    """
+    register_runtimes()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -223,7 +223,7 @@ def test_an_encode_that_is_told_to_end_leaves_nothing(encode, tmp_path, number, 
     temporary.mkdir()
     target = tmp_path / "a.potr"
     target.write_bytes(b"old")
-    long = [*map(str, encode), "--iterations", "2000", "--tolerance", "0", "--report", str(tmp_path / "page.html")]
+    long = [*map(str, encode), "--iterations", "9000", "--tolerance", "0", "--report", str(tmp_path / "page.html")]
     process = subprocess.Popen(
         [sys.executable, "-m", "potr_cl", *long], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         env=os.environ | {"TMPDIR": str(temporary)},
