@@ -44,7 +44,7 @@ def test_others_are_rendered_while_one_is_packed(rasterizer, tmp_path, monkeypat
 
     def noted(self, path):
         if path.name == "0.png":
-            assert second.wait(60), "nothing else is packed meanwhile"
+            assert second.wait(300), "nothing else is packed meanwhile"
         else:
             second.set()
         save(self, path)

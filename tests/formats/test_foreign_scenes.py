@@ -60,7 +60,9 @@ def test_what_is_written_looks_as_the_scene_does(device, tmp_path, plush_excerpt
 
 
 @pytest.mark.parametrize("name", FOREIGN)
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+)
 @given(draw=st.data())
 def test_damage_is_an_error_of_ours_or_does_not_matter(tmp_path, data, name, draw):
     content = bytearray((data / "foreign" / name).read_bytes())

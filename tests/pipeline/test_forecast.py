@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -22,9 +22,33 @@ def device():
     assert device.allocated == 0
 
 
+class Clock:
+    """Pictures take what a test says, whatever else keeps the machine busy; and which have been rendered."""
+
+    def __init__(self, monkeypatch) -> None:
+        self.now, self.calls = 0.0, 0
+        render = Rasterizer.render_device
+
+        def rendered(rasterizer, camera):
+            self.calls += 1
+            self.now += self.takes(self.calls)
+            return render(rasterizer, camera)
+
+        monkeypatch.setattr(Rasterizer, "render_device", rendered)
+        monkeypatch.setattr(forecasts, "time", SimpleNamespace(perf_counter=lambda: self.now))
+
+    def takes(self, call: int) -> float:
+        return 0.01
+
+
 @pytest.fixture
-def ahead(device, plush_excerpt, plush_excerpt_cameras):
-    """Forecasts in units of a picture's time, which differs from one call to the next."""
+def clock(monkeypatch):
+    return Clock(monkeypatch)
+
+
+@pytest.fixture
+def ahead(device, plush_excerpt, plush_excerpt_cameras, clock):
+    """Forecasts in units of a picture's time."""
 
     def of(options: EncodeOptions, views: int = 9, search: bool = False) -> float:
         found = forecast(plush_excerpt, train_views(plush_excerpt_cameras)[:views], options, device, search)
@@ -54,34 +78,20 @@ def test_a_fit_of_more_splats_takes_longer(ahead):
 
 @pytest.mark.parametrize("busy", [(3,), (2, 9, 17), (1, 2)], ids=str)
 def test_what_takes_the_device_away_for_a_moment_does_not_count(
-    device, plush_excerpt, plush_excerpt_cameras, monkeypatch, busy
+    device, plush_excerpt, plush_excerpt_cameras, clock, busy
 ):
     """Pictures of some milliseconds; before some of them the device is away for a quarter of a second."""
-    render, calls = Rasterizer.render_device, []
-
-    def delayed(self, camera):
-        calls.append(camera)
-        time.sleep(0.25 if len(calls) in busy else 0.002)
-        return render(self, camera)
-
-    monkeypatch.setattr(Rasterizer, "render_device", delayed)
+    clock.takes = lambda call: 0.25 if call in busy else 0.002
     ahead = forecast(plush_excerpt, train_views(plush_excerpt_cameras), EncodeOptions(), device)
-    assert ahead.sampled < 0.05
-    assert len(calls) > 9
+    assert ahead.sampled == pytest.approx(0.002)
+    assert clock.calls > 9
 
 
-def test_pictures_that_take_long_are_rendered_once(device, plush_excerpt, plush_excerpt_cameras, monkeypatch):
-    render, calls = Rasterizer.render_device, []
-
-    def slow(self, camera):
-        calls.append(camera)
-        time.sleep(0.05)
-        return render(self, camera)
-
-    monkeypatch.setattr(Rasterizer, "render_device", slow)
+def test_pictures_that_take_long_are_rendered_once(device, plush_excerpt, plush_excerpt_cameras, clock):
+    clock.takes = lambda call: 0.05
     ahead = forecast(plush_excerpt, train_views(plush_excerpt_cameras), EncodeOptions(), device)
-    assert ahead.sampled > 0.05
-    assert len(calls) == 5
+    assert ahead.sampled == pytest.approx(0.05)
+    assert clock.calls == 5
 
 
 def test_memory_is_that_of_views_and_stays_within_the_budget(device, plush_excerpt, plush_excerpt_cameras):
