@@ -89,7 +89,7 @@ def kept_elsewhere(error: PotrError, path: str | os.PathLike[str], write: Callab
     """
     places = list(_places())
     for place in places:
-        folder = place / f"potr-cl-{secrets.token_hex(6)}"
+        folder = place / f"potr-cl-kept-{secrets.token_hex(6)}"
         unfinished = folder.with_name(f".{folder.name}.tmp")
         with contextlib.suppress(OSError, PotrError), removed_at_end(unfinished):
             unfinished.mkdir(mode=0o700)
