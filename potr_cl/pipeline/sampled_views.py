@@ -26,8 +26,9 @@ F64 = NDArray[np.float64]
 #: Views that are rendered to see how long one takes; and how often each is at the most, where that takes no longer than
 #: so many seconds: other work comes and goes, and may take a device away for longer than a view does.
 _SAMPLE, _MOST_OFTEN, _ENOUGH = 4, 9, 0.1
-#: Bytes of a pixel, of the picture that a view is to have.
-PIXEL = 12
+#: Bytes of a pixel, of the picture that a view is to have; and of what is measured of an intersection, which is not
+#: counted on GPUs.
+PIXEL, _SUM = 12, 8
 #: Seconds that a clock may be coarse.
 _FINE = 1e-4
 #: Parts of a scene that differ by less tell nothing about why views take longer than others.
@@ -44,12 +45,14 @@ class SampledViews:
             GPUs, where it is not told apart.
         splats: that are projected for a view while splats are removed.
         nbytes: of what can be kept of a view.
+        most: splats that the view may draw which sees most, where views are looked at in parts of the scene; else 0.
     """
 
     picture: float
     splat: float
     splats: float
     nbytes: float
+    most: float = 0.0
 
     @property
     def seconds(self) -> float:
@@ -94,7 +97,8 @@ def sample_views(
     numbers = order[((np.arange(count) + 0.5) * len(cameras) / count).astype(int)].tolist()
     chosen, away = [cameras[number] for number in numbers], _away(scene, cameras[0])
     splats = np.full(count, float(len(scene)))
-    if len(scene) >= LEAST_SPLATS and parts.mean() <= LIKELY:
+    in_parts = len(scene) >= LEAST_SPLATS and bool(parts.mean() <= LIKELY)
+    if in_parts:
         wall, work, nothing, nbytes = np.empty((4, count))
         for place, rasterizer in enumerate(_of_what_each_sees(scene, chosen, device, background)):
             with rasterizer:
@@ -110,7 +114,8 @@ def sample_views(
     slow = float(wall.sum() / max(work.sum(), 1e-9))
     pictures = np.maximum(work - of_a_splat * splats, 0)
     picture, projected, held = (_mean(of, parts[numbers], parts) for of in (pictures, splats, nbytes))
-    return SampledViews(slow * picture, slow * of_a_splat, min(projected, len(scene)), held)
+    most = float(parts.max()) * len(scene) if in_parts else 0.0
+    return SampledViews(slow * picture, slow * of_a_splat, min(projected, len(scene)), held, most)
 
 
 @dataclass(frozen=True)
@@ -174,8 +179,10 @@ def _nbytes(rasterizer: Rasterizer, cameras: Sequence[Camera]) -> F64:
     nbytes = []
     for camera in cameras:
         before = rasterizer.device.allocated
-        with rasterizer.prepare_set([camera]):
-            nbytes.append(rasterizer.device.allocated - before + PIXEL * camera.width * camera.height)
+        with rasterizer.prepare_set([camera]) as views:
+            held = rasterizer.device.allocated - before
+            sums = _SUM * views.views[0].intersection_count if rasterizer.device.family == "cpu" else 0
+        nbytes.append(held + sums + PIXEL * camera.width * camera.height)
     return np.array(nbytes, float)
 
 
