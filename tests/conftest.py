@@ -21,6 +21,8 @@ from potr_cl.model.placement.matter import Frame, Matter
 DATA = Path(__file__).parent / "data"
 #: Where Chromium is, if it has another name than systems give it.
 CHROMIUM_VARIABLE = "POTR_CL_CHROMIUM"
+#: It is waited so long for what should come at once, however busy the machine is: Playwright has 30 s of its own.
+MOST_MILLISECONDS = 300_000
 SCENES = Path(__file__).parents[2] / "shared" / "scenes"
 
 
@@ -137,6 +139,14 @@ def browser() -> Iterator[Any]:
     if hasattr(os, "geteuid") and os.geteuid() == 0:
         arguments.append("--no-sandbox")
     with library.sync_playwright() as play:
-        chromium = play.chromium.launch(executable_path=path, args=arguments)
+        chromium = play.chromium.launch(executable_path=path, args=arguments, timeout=MOST_MILLISECONDS)
+        new_context = chromium.new_context
+
+        def patient(**choices: Any) -> Any:
+            context = new_context(**choices)
+            context.set_default_timeout(MOST_MILLISECONDS)
+            return context
+
+        chromium.new_context = patient
         yield chromium
         chromium.close()

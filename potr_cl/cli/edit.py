@@ -16,7 +16,7 @@ from potr_cl.cli.options import Commands, add_device_options, add_memory_option
 from potr_cl.cli.outputs import WrittenNumbers, scene_output
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
-from potr_cl.cli.scenes import add_antialiased_option, add_from_option, add_trust_option, read_scene, write_scene
+from potr_cl.cli.scenes import add_antialiased_option, add_from_option, add_trust_option, read_scene, write_result
 from potr_cl.cli.stage_flags import add_stage_flags, stage_choices
 from potr_cl.cli.terminal import note, say_done
 from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
@@ -50,7 +50,7 @@ def _prune(args: argparse.Namespace) -> None:
             scene, cameras, q=args.quality, memory=args.memory, background=args.background,
             device=device, progress=progress, cameras_anyway=args.cameras_anyway, **choices,
         )  # fmt: skip
-        write_scene(args.output, result.scene, args.to)
+        write_result(args.output, result.scene, args.to)
         if order is not None:
             np.save(order, result.pruned.order)
     say_done(f"{args.output}: {result.said} on {result.device.info}")
@@ -107,7 +107,7 @@ def _compact(args: argparse.Namespace) -> None:
             scene, cameras, q=args.quality, sf_sh=args.sf_sh, memory=args.memory, background=args.background,
             device=device, progress=progress, cameras_anyway=args.cameras_anyway, **choices,
         )  # fmt: skip
-    write_scene(args.output, result.scene, args.to)
+    write_result(args.output, result.scene, args.to)
     say_done(f"{args.output}: {result.said}")
 
 
@@ -151,7 +151,7 @@ def _refit(args: argparse.Namespace) -> None:
             drop=args.drop, memory=args.memory, background=background, device=device, progress=progress,
             cameras_anyway=args.cameras_anyway,
         )  # fmt: skip
-    write_scene(args.output, result.scene, args.to)
+    write_result(args.output, result.scene, args.to)
     say_done(f"{args.output}: {len(scene):,} splats re-fitted in {result.refitted.steps} steps on {result.device.info}")
     before, after = result.refitted.errors
     say_done(

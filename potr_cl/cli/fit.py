@@ -13,7 +13,7 @@ from potr_cl.cli.guard import read_file
 from potr_cl.cli.options import Commands, add_device_options, add_memory_option
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
-from potr_cl.cli.scenes import add_antialiased_option, add_trust_option, read_scene, write_scene
+from potr_cl.cli.scenes import add_antialiased_option, add_trust_option, read_scene, write_result
 from potr_cl.cli.terminal import say_done
 from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
 from potr_cl.formats.registry import suffixes_read
@@ -41,7 +41,7 @@ def _fit(args: argparse.Namespace) -> None:
             steps=args.steps, views_between=args.views_between, memory=args.memory, background=args.background,
             device=device, progress=progress, tell=progress.tell, cameras_anyway=args.cameras_anyway,
         )  # fmt: skip
-    write_scene(args.output, result.scene, args.to)
+    write_result(args.output, result.scene, args.to)
     between = f" and {result.added} between them" if result.added else ""
     say_done(f"{args.output}: {result.said} of {result.views} training views{between}, on {result.device.info}")
     if result.psnr is not None:

@@ -31,7 +31,7 @@ from potr_cl.stages.fit import Fit
 from potr_cl.stages.fitting.memory import fit_bytes
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.pruning.sweep_options import default_memory
-from potr_cl.stages.pruning.visible_parts import LEAST_SPLATS, SCENES
+from potr_cl.stages.pruning.visible_parts import LEAST_SPLATS
 from potr_cl.stages.refit import Refit
 from potr_cl.stages.refitting.placement import left_for_views, placed
 from potr_cl.stages.views_between import Between
@@ -44,9 +44,6 @@ _NONE_LEFT = 0.25
 #: Bytes of the process with its libraries; a splat, on the host and on the device; and what is kept of views and
 #: besides, as a multiple of what a view's own buffers take.
 _PROCESS, _HOST_SPLAT, _DEVICE_SPLAT, _VIEWS = 180e6, 1550, 154, 1.02
-#: Where views are looked at in parts of the scene: bytes for each splat of the largest part while one of its views is
-#: made; and of the memory, what all this takes at most.
-_IN_HAND, _PARTS = 120, 3 / 4
 #: The part of the splats that pruning leaves at q = 0.5, in the middle of what was measured, 0.31 to 0.56; and with
 #: which power of q it grows.
 _LEFT, _LEFT_GROWS = 0.45, 0.3
@@ -163,7 +160,7 @@ def _views(
     slow = device.info.kind == "cpu"  # nobody knows yet how many the scene needs
     each = needed_of_virtual(slow) if is_virtual(cameras) else most_needed(len(cameras), slow)
     if device.family == "cpu":  # only as many are added as there is room for
-        fit = _room_of_pruning(scene, options, device, sampled) / max(sampled.nbytes, 1)
+        fit = _room_of_pruning(scene, options, device) / max(sampled.nbytes, 1)
         each = min(each, max(fit / views - 1, 0))
     return views * (1 + each)
 
@@ -185,7 +182,7 @@ def _work(
     left = float(len(scene))
     if isinstance(prune := parts.get(Prune.name), Prune):
         pictures += views * (units.prune + units.iteration * prune.iterations)
-        room = _room_of_pruning(scene, options, device, sampled)
+        room = _room_of_pruning(scene, options, device)
         kept, whole = _kept(views, sampled.splats, sampled.lists, room)
         pictures += (views - kept) * units.again * prune.iterations
         of_iteration = (views - kept) * units.projections + (kept - whole) * units.geometry
@@ -239,15 +236,10 @@ def _kept(views: float, splats: float, lists: float, room: float) -> tuple[float
     return kept, min(kept, (free + geometry - kept * lists) / geometry)
 
 
-def _room_of_pruning(scene: Scene, options: EncodeOptions, device: Device, sampled: SampledViews) -> float:
+def _room_of_pruning(scene: Scene, options: EncodeOptions, device: Device) -> float:
     """Bytes that there are for views while splats are removed."""
-    given = for_views(device, options.memory, len(scene))
-    room = float(default_memory(device) if given is None else given)
-    if not sampled.most:
-        return room
-    # The largest part of the scene lies there too, or all parts do, and a view of it that is being made.
-    whole, of_a_splat = SCENES * room >= scene.nbytes, scene.nbytes / len(scene)
-    return room - min((len(scene) if whole else sampled.most) * of_a_splat + sampled.most * _IN_HAND, _PARTS * room)
+    room = for_views(device, options.memory, len(scene))
+    return float(default_memory(device) if room is None else room)
 
 
 def _room_of_refit(left: float, scene: Scene, options: EncodeOptions, device: Device) -> int | None:

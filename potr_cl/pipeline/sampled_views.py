@@ -45,14 +45,12 @@ class SampledViews:
             GPUs, where it is not told apart.
         splats: that are projected for a view while splats are removed.
         nbytes: of what can be kept of a view.
-        most: splats that the view may draw which sees most, where views are looked at in parts of the scene; else 0.
     """
 
     picture: float
     splat: float
     splats: float
     nbytes: float
-    most: float = 0.0
 
     @property
     def seconds(self) -> float:
@@ -97,8 +95,7 @@ def sample_views(
     numbers = order[((np.arange(count) + 0.5) * len(cameras) / count).astype(int)].tolist()
     chosen, away = [cameras[number] for number in numbers], _away(scene, cameras[0])
     splats = np.full(count, float(len(scene)))
-    in_parts = len(scene) >= LEAST_SPLATS and bool(parts.mean() <= LIKELY)
-    if in_parts:
+    if len(scene) >= LEAST_SPLATS and parts.mean() <= LIKELY:
         wall, work, nothing, nbytes = np.empty((4, count))
         for place, rasterizer in enumerate(_of_what_each_sees(scene, chosen, device, background)):
             with rasterizer:
@@ -114,8 +111,7 @@ def sample_views(
     slow = float(wall.sum() / max(work.sum(), 1e-9))
     pictures = np.maximum(work - of_a_splat * splats, 0)
     picture, projected, held = (_mean(of, parts[numbers], parts) for of in (pictures, splats, nbytes))
-    most = float(parts.max()) * len(scene) if in_parts else 0.0
-    return SampledViews(slow * picture, slow * of_a_splat, min(projected, len(scene)), held, most)
+    return SampledViews(slow * picture, slow * of_a_splat, min(projected, len(scene)), held)
 
 
 @dataclass(frozen=True)

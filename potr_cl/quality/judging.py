@@ -43,7 +43,7 @@ class Looks:
     Attributes:
         background: behind all scenes.
         rules: of the rasterizer.
-        ground_truth, lpips: as of :func:`potr_cl.quality.compare.compare`.
+        ground_truth, lpips: as of :class:`potr_cl.quality.figures.Against`.
         remember: whether the uncompressed scene's pictures are kept for the next candidate.
     """
 
@@ -97,7 +97,7 @@ class Judging(Owner):
         """The figures of some views, in their order.
 
         Raises:
-            As :func:`potr_cl.quality.compare.compare`.
+            As :meth:`potr_cl.quality.figures.Against.figures`.
         """
         yield from self._against.figures(self._references, partial(rendered, self._taken), cameras)
 

@@ -188,7 +188,6 @@ def parts_seen(scene: Scene, cameras: Sequence[Camera], near: float) -> NDArray[
 
 def _seen_of_few(scene: Scene, cameras: Sequence[Camera], near: float) -> tuple[NDArray[np.int64], int]:
     """(views,) how many of few splats each view may draw, and how many these are."""
-    black = replace(scene, sh=np.broadcast_to(np.float32(0), (len(scene), 1, 3)))  # colours are not looked at
-    few = black.subset(np.arange(0, len(scene), _SAMPLED))
+    few = scene.uncoloured().subset(np.arange(0, len(scene), _SAMPLED))
     groups = SplatGroups.of(few, max(splat_groups.LARGEST // _SAMPLED, 1))
     return groups.visible_by(cameras, near) @ groups.counts, len(few)

@@ -200,7 +200,7 @@ class Prune(Stage):
                 self.name, Pruned(splats, np.full(splats, -1, np.int32), 0, lambda: Course(everything))
             )
         if sights is not None:
-            sights = sights_worth_it(state.scene.subset(seen), state.views, options)
+            sights = sights_worth_it(state.scene.uncoloured().subset(seen), state.views, options)
         return self._pruned(told, bench, sights, seen, hidden)
 
     def _pruned(

@@ -185,7 +185,7 @@ def on_a_terminal(*arguments: object, **variables: str) -> str:
     except OSError:  # Linux's way of saying that the other end is closed
         pass
     os.close(ours)
-    process.wait(60)
+    process.wait(300)
     return written.decode()
 
 
@@ -242,7 +242,7 @@ def test_an_encode_that_is_told_to_end_leaves_nothing(encode, tmp_path, number, 
     while "prune …" not in (line := process.stderr.readline()):
         assert line
     process.send_signal(number)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=300)
     assert process.returncode == code
     assert err.count("\n") == 1
     assert "no file is left half written" in err

@@ -24,7 +24,7 @@ def test_a_picture_does_not_wait_for_others(plush_excerpt, plush_excerpt_cameras
     def patient(self: Any, *args: Any, **options: Any) -> None:
         made(self, *args, **options)
         assert self.window_duration_sec < 1
-        self.window_duration_sec = 10.0
+        self.window_duration_sec = 100.0
 
     monkeypatch.setattr(buffer, "__init__", patient)
     arrived: list[float] = []
@@ -49,9 +49,9 @@ def test_a_picture_does_not_wait_for_others(plush_excerpt, plush_excerpt_cameras
             for step in range(5):
                 socket.send(msgspec.msgpack.encode({**camera, "position": [0.1 * step, 0.0, -3.0]}))
                 known = len(arrived)
-                while len(arrived) == known and time.monotonic() < began + 25:
+                while len(arrived) == known and time.monotonic() < began + 99:
                     time.sleep(0.01)
             took = time.monotonic() - began
-        thread.join(5)
+        thread.join(60)
     assert len(arrived) >= 5
-    assert took < 25, "5 pictures wait for 10 s each"
+    assert took < 99, "they wait for 100 s"

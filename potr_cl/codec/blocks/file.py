@@ -51,7 +51,7 @@ class BlockedFile(Generic[B]):
 
     Attributes:
         table: verified.
-        read: gives so many bytes of the file from an offset on, or fewer where the file has got shorter.
+        read: gives so many bytes of the file from an offset on, or fewer where it ends.
         open_body: opens a block that was read; its header is verified again.
         trust: as of :func:`potr_cl.codec.blocks.table.read_table`.
     """

@@ -161,6 +161,11 @@ class RemovalSweep(Owner):
                 self._memory.adopt(former)
         elif former is not None:
             self._device.free(former)
+        self.project_again()
+
+    def project_again(self) -> None:
+        """Continue with the colours that the rasterizer's scene has by now; so with others, if it has got others."""
+        self._cached.settle()
         for views in self._prepared.cached:
             if views.views.shapes is not None:
                 self._rasterizer.project(views.views)

@@ -206,7 +206,7 @@ class PartedRemoval(Owner):
         if isinstance(self._whole, SceneBuffers):
             part.gather(self._whole, splats)
         else:
-            part.write(self._scene.subset(splats))
+            part.write_some(self._scene, splats)
 
     def _lay_down(self, part: _Part) -> None:
         if self._rest:
