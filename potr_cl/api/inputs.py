@@ -331,12 +331,14 @@ def chosen_views(
         split: "train", "test" or "all".
 
     Raises:
-        UsageError: there is no such view.
+        UsageError: there is no such view, or none is asked for.
     """
     if views is not None and split is not None:
         raise UsageError("give either views or a split")
     if views is not None:
         views = [views] if isinstance(views, (str, int)) else views
+        if not len(views):
+            raise UsageError("the list of views is empty: name at least one, or leave it out")
         by_name = {camera.name: camera for camera in cameras}
         by_name = {str(index): camera for index, camera in enumerate(cameras)} | by_name
         for name in map(str, views):

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from potr_cl.api.inputs import drawable_to_judge
 from potr_cl.cli.guard import StandardInput, StandardOutput
 from potr_cl.cli.outputs import not_streamed
+from potr_cl.cli.terminal import note
 from potr_cl.errors import UsageError, WriteError
 from potr_cl.formats import load_scene, scene_writer
 from potr_cl.formats.scene_size import bytes_of_scene
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
     from potr_cl.opencl.device import Device
     from potr_cl.outputs.coded_scene import CodedScene
     from potr_cl.raster.scene_buffers import Drawable
+
+#: Files of so many bytes are read for seconds.
+_LONG_TO_READ = 1 << 28
 
 FROM_HELP = 'the format that "-", standard input, brings: .ply, .spz …; default: what its content says'
 TO_HELP = "the format to write where no name says it, .ply, .spz …"
@@ -81,6 +85,8 @@ def read_scene(args: argparse.Namespace, path: Path) -> Scene:
         As :func:`potr_cl.formats.load_scene`.
     """
     with as_file(path) as file:
+        if (nbytes := bytes_of_scene(file) or 0) >= _LONG_TO_READ:
+            note(f"reading {path}, {nbytes / 1e9:.1f} GB …")
         return load_scene(file, **trust(args), antialiased=ANTIALIASED[args.antialiased])
 
 
