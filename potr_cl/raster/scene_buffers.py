@@ -23,6 +23,8 @@ SPLAT_GROUP = 256
 
 #: Splats whose parameters are uploaded at a time.
 _UPLOADED = 1 << 18
+#: Splats that are copied out of a scene at a time: so few that no array of theirs is ever mapped to a file.
+_TAKEN = 1 << 16
 #: Splats whose parameters are activated at a time.
 _ACTIVATED = 1 << 17
 
@@ -300,6 +302,39 @@ class SceneBuffers(Owner):
             for start, found in made:
                 for (parameter, what), rows in zip(parameters, found, strict=True):
                     self.write_rows(parameter, rows, what, start=start, room=room)
+
+    def write_some(self, scene: Scene, splats: NDArray[np.int64]) -> None:
+        """Set all parameters to those of some splats of a scene of the host, which are copied a few at a time.
+
+        Args:
+            scene: of the same SH degree.
+            splats: (N,) the numbers there of these splats.
+
+        Raises:
+            DeviceError: there is no room for some of them beside the scene.
+        """
+
+        def taken(start: int) -> list[tuple[cl.Buffer, FloatArray, str]]:
+            some = scene.subset(splats[start : start + _TAKEN])
+            return [
+                (self.means, some.means, "the centres"),
+                (self.scales, activated_scales(some.log_scales).astype(np.float32), "the scales"),
+                (self.quaternions, unit_quaternions(some.quaternions).astype(np.float32), "the rotations"),
+                (self.log2_opacities, log2_opacities(some.opacity_logits)[:, None].astype(np.float32), "the opacities"),
+                (self.sh, some.sh.reshape(len(some), -1), "the SH coefficients"),
+            ]
+
+        with Memory(self.device) as memory, Ahead(taken, range(0, self.splats, _TAKEN)) as made:
+            room = memory.allocate(12 * self.sh_count * min(self.splats, _TAKEN) + 16, "a scene's parameters")
+            for start, found in made:
+                for parameter, rows, what in found:
+                    self.write_rows(parameter, rows, what, start=start, room=room)
+
+    def write_sh_of(self, sh: FloatArray, splats: NDArray[np.int64]) -> None:
+        """Set the SH coefficients to those of some splats, (n, M, 3) float32 of any strides; ``splats``: (N,)."""
+        for start in range(0, len(splats), _TAKEN):
+            rows = sh[splats[start : start + _TAKEN]].reshape(-1, 3 * self.sh_count)
+            self.write_rows(self.sh, rows, "the SH coefficients", start=start)
 
     def write_sh(self, parameter: cl.Buffer, sh: FloatArray) -> None:
         """Set SH coefficients, (N, M, 3) float32 of any strides.

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from potr_cl import cli
-from potr_cl.cli import command_parser
+from potr_cl.cli import command_parser, scenes
 from potr_cl.cli.progress import Progress
 from potr_cl.cli.terminal import note, speak
 from potr_cl.errors import UsageError
@@ -123,7 +123,17 @@ def test_a_long_run_says_what_it_will_take(data, tmp_path, capsys, monkeypatch):
     cameras = data / "plush_excerpt_cameras.json"
     encode = ["encode", tmp_path / "a.ply", "--cameras", cameras, "-o", tmp_path / "a.potr"]
     _, _, err = called(capsys, *encode, "--iterations", "1", "--refit", "off", "--no-quality", "--cameras-anyway")
-    assert re.search(r"kernels for [CG]PUs; about [\d.]+ (s|min|h) and [\d.]+ [MG]B of memory", err.splitlines()[0])
+    first, second = err.splitlines()[:2]
+    assert re.search(r"kernels for [CG]PUs: 250,000 splats, 9 views", first)
+    assert re.fullmatch(r"about [\d.]+ (s|min|h) and [\d.]+ [MG]B of memory( of the device)?", second)
+
+
+def test_what_takes_long_to_read_is_named(encode, capsys, monkeypatch):
+    _, _, err = called(capsys, *encode)
+    assert "reading" not in err
+    monkeypatch.setattr(scenes, "_LONG_TO_READ", 100_000)
+    _, _, err = called(capsys, *encode)
+    assert re.fullmatch(r"reading .*plush_excerpt\.ply, 0\.0 GB …", err.splitlines()[0])
 
 
 # Progress

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from potr_cl.errors import PotrError, UsageError
 from potr_cl.formats import load_scene, scene_writer
 from potr_cl.opencl.device import Device
-from potr_cl.quality.compare import compare, mean_view
-from potr_cl.raster.rasterizer import Rasterizer
+from tests.cases.judging import psnr
 
 pytest.importorskip("gsply", reason="the extra convert is not installed")
 
@@ -42,12 +41,6 @@ WRITTEN = {
 @pytest.fixture(scope="module")
 def device():
     return Device()
-
-
-def psnr(device, a, b, cameras):
-    with Rasterizer(device, a) as first, Rasterizer(device, b) as second:
-        figures = mean_view(compare(first, second, cameras).views).figures["b_against_a"]
-    return figures.psnr
 
 
 @pytest.mark.parametrize("name", FOREIGN)

@@ -15,8 +15,8 @@ from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rules import INRIA
 from potr_cl.stages.between.room import room_for
 from potr_cl.stages.pruning import visible_parts
+from potr_cl.stages.pruning.drawn_removal import DrawnRemoval
 from potr_cl.stages.pruning.sweep_options import SweepOptions
-from potr_cl.stages.pruning.visible_parts import PartedRemoval
 from potr_cl.stages.stage import State, Workbench
 from tests.cases.streets import street
 from tests.devices import open_device
@@ -83,5 +83,5 @@ def test_what_is_added_is_kept():
     some = int(np.flatnonzero((np.array(found) > 0) & (np.array(found) < len(more)))[0])
     views = [*own, *more[: found[some]]]
     parts, options = parts_of_views(scene, views, INRIA.near), SweepOptions(memory=memories[some])
-    with PartedRemoval(device, scene, scene, views, parts, options) as removal:
+    with DrawnRemoval(device, scene, scene, views, parts, options) as removal:
         assert removal.kept_views == len(views)

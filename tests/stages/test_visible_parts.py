@@ -16,6 +16,7 @@ from potr_cl.raster.rules import INRIA
 from potr_cl.raster.scene_buffers import gathered, uploaded
 from potr_cl.stages import prune
 from potr_cl.stages.pruning import measured, visible_parts
+from potr_cl.stages.pruning.drawn_removal import DrawnRemoval
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions
@@ -38,10 +39,14 @@ def _small_groups(monkeypatch):
     monkeypatch.setattr(splat_groups, "LARGEST", 32)
 
 
-def parted(device, scene, cameras, options, whole=None) -> PartedRemoval:
-    parts = parts_of_views(scene, cameras, INRIA.near)
-    assert 3 <= len(parts) < len(cameras)
-    return PartedRemoval(device, scene, whole or scene, cameras, parts, options)
+@pytest.fixture(params=[PartedRemoval, DrawnRemoval])
+def parted(request):
+    def made(device, scene, cameras, options, whole=None):
+        parts = parts_of_views(scene, cameras, INRIA.near)
+        assert 3 <= len(parts) < len(cameras)
+        return request.param(device, scene, whole or scene, cameras, parts, options)
+
+    return made
 
 
 @pytest.mark.parametrize(
@@ -49,7 +54,7 @@ def parted(device, scene, cameras, options, whole=None) -> PartedRemoval:
     [(None, 0.0), (None, 0.05), (300_000, 0.0), (0, 0.0)],
     ids=["all fits", "all fits, tolerance", "some fits", "nothing fits"],
 )
-def test_the_same_bits(device, memory, tolerance):
+def test_the_same_bits(device, parted, memory, tolerance):
     """While splats go and colours change. Which views are kept is another matter: so none may be skipped there."""
     scene, cameras = street()
     options = SweepOptions(tolerance, memory=memory)
@@ -62,7 +67,7 @@ def test_the_same_bits(device, memory, tolerance):
         assert_same_bits(wanted, got, scene, rng)
 
 
-def test_the_same_choice(device):
+def test_the_same_choice(device, parted):
     """By the host, or by the device's own controller where there is one."""
     scene, cameras = street()
     options, schedule = SweepOptions(0.01), PruningOptions(1e-5, 12)
@@ -71,7 +76,8 @@ def test_the_same_choice(device):
         RemovalSweep(rasterizer, cameras, options) as wanted,
         parted(device, scene, cameras, options) as got,
     ):
-        assert (got.steering is None) == (wanted.steering is None)
+        if isinstance(got, PartedRemoval):
+            assert (got.steering is None) == (wanted.steering is None)
         a, b = (prune_scene(removal, schedule) for removal in (wanted, got))
     assert np.array_equal(a.order, b.order)
     assert a.kept == b.kept < len(scene)
@@ -91,7 +97,7 @@ def test_gathered_on_the_device(device):
             assert np.array_equal(one.render(camera)[0], other.render(camera)[0])
 
 
-def test_from_a_scene_on_the_device(device):
+def test_from_a_scene_on_the_device(device, parted):
     scene, cameras = street()
     with uploaded(device, scene) as whole, parted(device, scene, cameras, SweepOptions(0.0), whole) as got:
         found = got.measure()
@@ -157,10 +163,11 @@ def test_a_whole_encode_has_the_same_bytes(device, monkeypatch):
 
     def noting(*given):
         made.append(given[4])
-        return PartedRemoval(*given)
+        return (DrawnRemoval if device.family == "cpu" else PartedRemoval)(*given)
 
     monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1)
-    monkeypatch.setattr(measured, "PartedRemoval", noting)
+    for name in ("PartedRemoval", "DrawnRemoval"):
+        monkeypatch.setattr(measured, name, noting)
     # What a GPU does is another module's matter (test_view_by_view.py).
     monkeypatch.setattr(SweepOptions, "only_by_tolerance", property(lambda options: False))
     in_parts = encode(scene, cameras, options, device=device)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import os
 import signal
 import subprocess
@@ -28,6 +29,7 @@ from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.stages.pruning import visible_parts
 from potr_cl.workers import pace
 from potr_cl.workers.cluster import ClusterPool
+from potr_cl.workers.pool import WorkerLost
 from tests.cases.streets import street
 
 distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
@@ -188,6 +190,22 @@ def test_scenes_are_compared_by_a_cluster(scene, cameras, device, judged, tmp_pa
             assert [view.figures["b_against_a"].psnr for view in found.figures.views] == [
                 view.figures["b_against_a"].psnr for view in alone.figures.views
             ]
+
+
+def test_a_file_that_workers_get_is_read_once(scene, cameras, device, judged, tmp_path, monkeypatch):
+    """All judge the same bytes then, whoever writes to the file meanwhile."""
+    path, opened, plainly = tmp_path / "b.potr", [], Path.open
+    path.write_bytes(judged[0].data)
+
+    def noted(self, *args, **keywords):
+        if self == path:
+            opened.append(self)
+        return plainly(self, *args, **keywords)
+
+    monkeypatch.setattr(Path, "open", noted)
+    with local_cluster(1) as cluster:
+        potr_cl.compare(scene, path, cameras, device=device, cluster=cluster.scheduler_address)
+    assert len(opened) == 2  # for its first bytes, which tell what it is, and whole
 
 
 def looks(dask_worker):
@@ -410,7 +428,7 @@ def taken():
     ],
 )
 def test_no_cluster_there(address, said, device, monkeypatch):
-    monkeypatch.setattr("potr_cl.workers.cluster._CONNECT", 0.5)
+    monkeypatch.setattr("potr_cl.workers.client._CONNECT", 0.5)
     with pytest.raises(UsageError, match=said) as error:
         ClusterPool(address, device)
     assert "\n" not in str(error.value)
@@ -435,6 +453,25 @@ def test_workers_may_come_later(scene, cameras, device, expected, monkeypatch, c
             assert "has come: it gets views" in caplog.text
             assert encode(scene, cameras, OPTIONS, device=device, pool=pool).data == expected
             assert all(worker.rate for worker in pool.workers())
+
+
+def test_a_newcomer_that_is_lost_as_it_is_met_is_asked_ever_more_seldom(device, monkeypatch, caplog):
+    monkeypatch.setattr("potr_cl.workers.cluster._NEW", 0.05)
+    asked = []
+
+    def lost(worker):
+        asked.append(time.monotonic())
+        raise WorkerLost(f"{worker.name} has gone")
+
+    with local_cluster(1) as cluster, ClusterPool(cluster.scheduler_address, device) as pool:
+        monkeypatch.setattr("potr_cl.workers.cluster._ClusterWorker.meet", lost)
+        cluster.scale(2)
+        eventually(lambda: len(asked) >= 5)
+        assert len(pool.workers()) == 1
+    pauses = [later - sooner for sooner, later in itertools.pairwise(asked)]
+    # However slow this computer is, none is shorter.
+    assert all(pause >= 0.05 * 2**number for number, pause in enumerate(pauses))
+    assert caplog.text.count("it is asked again later") == 1
 
 
 @pytest.mark.slow

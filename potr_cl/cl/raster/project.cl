@@ -16,17 +16,14 @@
        LOW_PASS, LOW_PASS_SQUARED  square pixels added to a splat's variances on screen, and their square;
        PICKED         1: only the splats that `numbers` names are projected, `picked` of them, of a scene that is
                       `whole_stride` long; what is found lies in their order. Each view's numbers begin `apart` behind
-                      those of the view before it; NO_SPLAT among them is drawn nowhere. LANES must be 1. 0, the
-                      default: all. */
+                      those of the view before it; NO_SPLAT among them is drawn nowhere. 0, the default: all. */
 
 #include "include/lanes.clh"
 #include "include/splat.clh"
+#include "include/places.clh"
 #include "include/view_set.clh"
 #include "include/sh.clh"
 
-#ifndef PICKED
-#define PICKED 0
-#endif
 #ifndef ANTIALIASED
 #define ANTIALIASED 0
 #endif
@@ -79,7 +76,19 @@ kernel void project(
     colours += (size_t)stride * get_global_id(1);
     bounds += (size_t)stride * get_global_id(1);
     const size_t place = get_global_id(0); /* of the results */
-#if PICKED
+#if PICKED && LANES > 1
+    const size_t column = whole_stride;
+    numbers += (size_t)apart * get_global_id(1);
+    uint index[LANES];
+    float opacities[LANES];
+    for (int lane = 0; lane < LANES; ++lane) {
+        const size_t one = place * LANES + lane;
+        const uint number = numbers[min(one, (size_t)picked - 1)];
+        index[lane] = number == NO_SPLAT ? 0 : number;
+        opacities[lane] = one < picked && number != NO_SPLAT ? log2_opacities[index[lane]] : -INFINITY;
+    }
+    vfloat lo = VLOAD(0, opacities);
+#elif PICKED
     const size_t column = whole_stride; /* a parameter's columns lie so far apart */
     const uint number = numbers[(size_t)apart * get_global_id(1) + min(place, (size_t)picked - 1)];
     const size_t index = number == NO_SPLAT ? 0 : number;
@@ -91,9 +100,9 @@ kernel void project(
 #endif
     /* The camera centre is subtracted first: both are large where a scene is far from the origin, their difference is
        not. */
-    vfloat dx = (VLOAD(index, means) - view->camera_centre_high[0]) - view->camera_centre_low[0];
-    vfloat dy = (VLOAD(index, means + column) - view->camera_centre_high[1]) - view->camera_centre_low[1];
-    vfloat dz = (VLOAD(index, means + 2 * column) - view->camera_centre_high[2]) - view->camera_centre_low[2];
+    vfloat dx = (LOAD_AT(index, means) - view->camera_centre_high[0]) - view->camera_centre_low[0];
+    vfloat dy = (LOAD_AT(index, means + column) - view->camera_centre_high[1]) - view->camera_centre_low[1];
+    vfloat dz = (LOAD_AT(index, means + 2 * column) - view->camera_centre_high[2]) - view->camera_centre_low[2];
     global const float *w = view->rotation;
     vfloat tx = w[0] * dx + w[1] * dy + w[2] * dz;
     vfloat ty = w[3] * dx + w[4] * dy + w[5] * dz;
@@ -110,10 +119,10 @@ kernel void project(
 
     /* The ellipse's axes on screen: the rotation's columns times the scales, through the view's rotation and the
        Jacobian. */
-    vfloat qw = VLOAD(index, quaternions);
-    vfloat qx = VLOAD(index, quaternions + column);
-    vfloat qy = VLOAD(index, quaternions + 2 * column);
-    vfloat qz = VLOAD(index, quaternions + 3 * column);
+    vfloat qw = LOAD_AT(index, quaternions);
+    vfloat qx = LOAD_AT(index, quaternions + column);
+    vfloat qy = LOAD_AT(index, quaternions + 2 * column);
+    vfloat qz = LOAD_AT(index, quaternions + 3 * column);
     vfloat axes[9] = {
         1.0f - 2.0f * (qy * qy + qz * qz), 2.0f * (qx * qy + qw * qz), 2.0f * (qx * qz - qw * qy),
         2.0f * (qx * qy - qw * qz), 1.0f - 2.0f * (qx * qx + qz * qz), 2.0f * (qy * qz + qw * qx),
@@ -124,7 +133,7 @@ kernel void project(
         vfloat ux = w[0] * axis[0] + w[1] * axis[1] + w[2] * axis[2];
         vfloat uy = w[3] * axis[0] + w[4] * axis[1] + w[5] * axis[2];
         vfloat uz = w[6] * axis[0] + w[7] * axis[1] + w[8] * axis[2];
-        vfloat scale = VLOAD(index, scales + k * column) * inverse_z;
+        vfloat scale = LOAD_AT(index, scales + k * column) * inverse_z;
         mx[k] = view->fx * scale * (ux - ratio_x * uz);
         my[k] = view->fy * scale * (uy - ratio_y * uz);
         vfloat shrink = fmin(AXIS_LIMIT / fmax(fmax(fabs(mx[k]), fabs(my[k])), 1.0f), 1.0f);

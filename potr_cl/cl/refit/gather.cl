@@ -7,7 +7,7 @@
    Macros: LANES (splats a work-item), SH_COUNT, WEIGHTS (1: the totals hold the sums of w^2 too, for the blocks),
    SOME_BLOCKS (1: only the blocks of some splats are added up), PICKED (1: each view has some splats only, in an order
    of its own, which `numbers` names. Then views are done one after another, because two of them may have the same
-   splat; LANES must be 1. 0: all views have all). */
+   splat. 0: all views have all). */
 
 #include "refit/refit.clh"
 #include "refit/view_colours.clh"
@@ -60,6 +60,30 @@ inline vlong to_fixed_lanes(vfloat value)
     return (CONVERT_VLONG(high) << 31) + CONVERT_VLONG(low);
 }
 
+#if PICKED && LANES > 1
+inline vlong load_sums(Place place, global const long *column)
+{
+    long values[LANES];
+    for (int lane = 0; lane < LANES; ++lane)
+        values[lane] = column[place[lane]];
+    return VLOAD(0, values);
+}
+
+inline void store_sums(vlong sums, Place place, const int there[LANES], global long *column)
+{
+    long values[LANES];
+    VSTORE(sums, 0, values);
+    for (int lane = 0; lane < LANES; ++lane)
+        if (there[lane])
+            column[place[lane]] = values[lane];
+}
+#define LOAD_SUMS(place, column) load_sums(place, column)
+#define STORE_SUMS(sums, place, column) store_sums(sums, place, there, column)
+#else
+#define LOAD_SUMS(place, column) VLOAD(place, column)
+#define STORE_SUMS(sums, place, column) VSTORE(sums, place, column)
+#endif
+
 /* The totals of some of a set's views, times the view's scale, onto the coefficients: result += basis x (Y, Co, Cg) of
    the free channels' sums, view by view. What views have lies `apart`. With WEIGHTS also blocks += the sum of
    w^2 x basis x basis, for `block_stride` splats from number `first_block` on. Both are columns of integers; the scales
@@ -82,7 +106,12 @@ kernel void gather(
     global long *blocks)
 {
     const size_t index = get_global_id(0);
-#if PICKED
+#if PICKED && LANES > 1
+    uint splat[LANES];
+    int there[LANES];
+    if (!read_place(numbers + first_view * apart + LANES * index, splat, there))
+        return;
+#elif PICKED
     const uint splat = numbers[first_view * apart + index];
     if (splat == NO_SPLAT)
         return;
@@ -99,7 +128,7 @@ kernel void gather(
             continue;
         if (!any_view)
             for (int i = 0; i < 3 * SH_COUNT; ++i)
-                results[i] = VLOAD(splat, result + i * stride);
+                results[i] = LOAD_SUMS(splat, result + i * stride);
         any_view = 1;
         VREAL basis[SH_COUNT];
         basis_towards(means, stride, splat, &views[number].view, basis);
@@ -111,7 +140,20 @@ kernel void gather(
         for (int m = 0; m < SH_COUNT; ++m)
             for (int c = 0; c < 3; ++c)
                 results[3 * m + c] += to_fixed_lanes(basis[m] * channels[c]);
-#if WEIGHTS
+#if WEIGHTS && PICKED && LANES > 1
+        const vfloat weight = sums[3];
+        for (int i = 0; i < SH_COUNT; ++i)
+            for (int j = i; j < SH_COUNT; ++j) {
+                global long *column = blocks + AT(i, j) * block_stride;
+                long more[LANES];
+                VSTORE(to_fixed_lanes(weight * basis[i] * basis[j]), 0, more);
+                for (int lane = 0; lane < LANES; ++lane) {
+                    const size_t block = splat[lane] - first_block; /* of splats before the first one it is far beyond */
+                    if (there[lane] && block < block_stride)
+                        column[block] += more[lane];
+                }
+            }
+#elif WEIGHTS
         const vfloat weight = sums[3];
         const size_t block = index - first_block / LANES;
 #if SOME_BLOCKS
@@ -127,7 +169,7 @@ kernel void gather(
     }
     if (any_view)
         for (int i = 0; i < 3 * SH_COUNT; ++i)
-            VSTORE(results[i], splat, result + i * stride);
+            STORE_SUMS(results[i], splat, result + i * stride);
 }
 
 #if LANES == 1

@@ -1,7 +1,7 @@
 /* From coefficients to the splats' colours in each view: the first half of the map from coefficients to pictures.
 
    Macros: LANES (splats a work-item), SH_COUNT; PICKED (1: each view has some splats only, in an order of its own, which
-   `numbers` names; LANES must be 1. 0: all views have all). */
+   `numbers` names. 0: all views have all). */
 
 #include "refit/view_colours.clh"
 
@@ -32,11 +32,18 @@ kernel void view_colours(
 #endif
     for (uint number = get_global_id(1); number < view_count; number += get_global_size(1)) {
 #if PICKED
+#if LANES > 1
+        uint splat[LANES];
+        int there[LANES];
+        if (!read_place(numbers + number * apart + LANES * index, splat, there))
+            continue;
+#else
         const uint splat = numbers[number * apart + index];
         if (splat == NO_SPLAT)
             continue;
+#endif
         for (int i = 0; i < 3 * SH_COUNT; ++i)
-            values[i] = VLOAD(splat, coefficients + i * stride);
+            values[i] = LOAD_AT(splat, coefficients + i * stride);
 #endif
         VREAL basis[SH_COUNT];
         basis_towards(means, stride, splat, &views[number].view, basis);
@@ -48,7 +55,12 @@ kernel void view_colours(
         vfloat channels = (vfloat)(0.0f);
         const size_t place = number * apart / LANES + index;
         if (direction) {
-#if PICKED
+#if PICKED && LANES > 1
+            int flags[LANES];
+            for (int lane = 0; lane < LANES; ++lane)
+                flags[lane] = free_picks[LANES * place + lane];
+            const vint kept = VLOAD(0, flags);
+#elif PICKED
             const vint kept = free_picks[place];
 #else
             const vint kept = free_channels(free, place);
@@ -64,7 +76,12 @@ kernel void view_colours(
             channels = (red > 0.0f ? (vfloat)(1.0f) : (vfloat)(0.0f)) +
                 (green > 0.0f ? (vfloat)(2.0f) : (vfloat)(0.0f)) +
                 (blue > 0.0f ? (vfloat)(4.0f) : (vfloat)(0.0f));
-#if PICKED
+#if PICKED && LANES > 1
+            float flags[LANES];
+            VSTORE(channels, 0, flags);
+            for (int lane = 0; lane < LANES; ++lane)
+                free_picks[LANES * place + lane] = (uchar)flags[lane];
+#elif PICKED
             free_picks[place] = (uchar)channels;
 #endif
             red = fmax(red, (vfloat)(0.0f));

@@ -13,6 +13,7 @@ from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import lying_on, whole_on_device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.view_shares import ViewShares
+from potr_cl.stages.pruning.drawn_removal import DrawnRemoval
 from potr_cl.stages.pruning.part import RemovalPart
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.shared_removal import SharedRemoval
@@ -24,7 +25,7 @@ from potr_cl.workers.dealing import Shares, shares
 from potr_cl.workers.parts import Parts
 
 #: What measures: one device, perhaps part by part or view by view, or several together.
-Removal: TypeAlias = RemovalSweep | SharedRemoval | PartedRemoval | ViewByView
+Removal: TypeAlias = RemovalSweep | SharedRemoval | PartedRemoval | DrawnRemoval | ViewByView
 
 
 @contextmanager
@@ -66,9 +67,12 @@ def measurement(
                 if can_go_by_view(whole, device, options):
                     first = None if spared is None else first_totals(splats, spared)
                     yield stack.enter_context(ViewByView(device, whole, views, sights, *others_given, first))
+                elif device.family == "cpu":
+                    in_parts = (device, scene, whole, views, sights.parts(), *others_given, spared)
+                    yield stack.enter_context(DrawnRemoval(*in_parts))
                 else:
-                    parts = sights.parts()
-                    yield stack.enter_context(PartedRemoval(device, scene, whole, views, parts, *others_given, spared))
+                    in_parts = (device, scene, whole, views, sights.parts(), *others_given, spared)
+                    yield stack.enter_context(PartedRemoval(*in_parts))
                 return
             drawable = stack.enter_context(lying_on(device, bench.placed(state, seen)))
             rasterizer = stack.enter_context(Rasterizer(device, drawable, background=bench.background))

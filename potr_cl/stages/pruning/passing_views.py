@@ -28,7 +28,7 @@ _GROUP = 64
 _LOST_CHUNK = 4096
 #: They may lose so many times as much as a tile, on the average. With ten million splats and 300 views, none of them
 #: kept, 2 and 0.5 cost 1.4 and 0.2 dB against views that are kept; 0.5 took 2.7 times as long as 2.
-_PATIENCE = 0.5
+PATIENCE = 0.5
 
 
 class PassingViews(Owner):
@@ -125,7 +125,7 @@ class PassingViews(Owner):
         lost.launch((-(-splats // _LOST_CHUNK) * _GROUP,), (_GROUP,))
         importance = int(device.download(words, (1,), np.int64)[0])
         part = sum(len(batch.numbers) for batch in self._batches) / len(self._cameras)
-        return importance * self._scene.fixed_point.units[1] / part > _PATIENCE * tolerance
+        return importance * self._scene.fixed_point.units[1] / part > PATIENCE * tolerance
 
     @contextmanager
     def swept(self, batch: Batch, totals: cl.Buffer | None) -> Iterator[Ready | None]:

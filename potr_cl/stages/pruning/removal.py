@@ -135,10 +135,19 @@ class RemovalSweep(Owner):
         """
         return self.fixed_point.values(self.measure_totals())
 
+    @property
+    def totals(self) -> cl.Buffer:
+        """The totals of the views that stay prepared, (N, 2) int64 in the device's memory."""
+        return self._totals
+
+    def measure_on_device(self) -> None:
+        """Bring :attr:`totals` up to date."""
+        self._cached.measure()
+
     def measure_totals(self) -> NDArray[np.int64]:
         """The same as (N, 2) int64 in units of the fixed point: the sums over the views that are measured here."""
         first_time = self._cached.measurements == 0
-        self._cached.measure()
+        self.measure_on_device()
         totals = self._device.download(self._totals, (self.splats, 2), np.int64)
         if self._prepared.uncached:
             totals += self._uncached.measure(self.splats, first_time, self._original_sh)
@@ -161,6 +170,11 @@ class RemovalSweep(Owner):
                 self._memory.adopt(former)
         elif former is not None:
             self._device.free(former)
+        self.project_again()
+
+    def project_again(self) -> None:
+        """Continue with the colours that the rasterizer's scene has by now; so with others, if it has got others."""
+        self._cached.settle()
         for views in self._prepared.cached:
             if views.views.shapes is not None:
                 self._rasterizer.project(views.views)

@@ -1,4 +1,4 @@
-"""Removal effects of scenes of which no view sees much: :class:`PartedRemoval`.
+"""Removal effects of scenes of which no view sees much, on GPUs that have no room for them: :class:`PartedRemoval`.
 
 Views are dealt out to parts that see much of the same (:mod:`potr_cl.raster.culling`). Each part has a scene of the
 splats that its views may draw, and a :class:`~potr_cl.stages.pruning.removal.RemovalSweep` of its own, which projects
@@ -206,7 +206,7 @@ class PartedRemoval(Owner):
         if isinstance(self._whole, SceneBuffers):
             part.gather(self._whole, splats)
         else:
-            part.write(self._scene.subset(splats))
+            part.write_some(self._scene, splats)
 
     def _lay_down(self, part: _Part) -> None:
         if self._rest:

@@ -146,7 +146,7 @@ class ColourMap(Owner):
             self._owned.append(self._views)
             launches = self._views.launches
             most = max((len(numbers) for numbers in launches), default=0)
-            together = min(self._launcher.gathered, max(len(launches), 1)) if most == 1 else 1
+            together = min(self._launcher.gathered, max(len(launches), 1)) if most == 1 and reach is None else 1
             self._groups: list[list[list[range]]] = [
                 [some[first : first + together] for first in range(0, len(some), together)]
                 for some in (

@@ -30,6 +30,7 @@ from potr_cl.stages.refitting.launcher import launcher_for
 from potr_cl.stages.refitting.packing import Packing
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.stages.refitting.reached import reached_splats
+from potr_cl.stages.refitting.sparse_vector import SentVector, SparseVectors
 from potr_cl.stages.refitting.targets import RenderedTargets, Targets
 from potr_cl.stages.refitting.vector_space import Layout
 from potr_cl.stages.refitting.visible_targets import VisibleTargets
@@ -96,6 +97,8 @@ class ColourPart(Part):
             self._coefficients = owned.enter_context(Coefficients(device, layout))
             self._packing = owned.enter_context(Packing(self._coefficients))
             self._x, self._direction = self._coefficients.vector(), self._coefficients.vector()
+            self._coefficients.zero(self._x)
+            self._vectors: SparseVectors | None = None
             ahead, kept = (source, source.source) if isinstance(source, PicturesAhead) else (None, source)
             pictured = owned.enter_context(lying_on(device, kept))
             if sights is not None:
@@ -126,13 +129,12 @@ class ColourPart(Part):
         return [(*before, cameras, own, sights) for own in in_pieces(numbers, pieces, parts_of(len(cameras)))]
 
     def gradient(
-        self, x: FloatArray | Lent, flags: NDArray[np.uint32] | Lent, blocks: bool, constant: bool
+        self, x: SentVector | Lent, flags: NDArray[np.uint32] | Lent, blocks: bool, constant: bool
     ) -> Gradient:
         """What these views add to :meth:`~potr_cl.stages.refitting.colour_map.ColourMap.gradient`.
 
         Args:
-            x: (3 M, N or more) float32, the columns of the coefficients. If they are lent, the sums are lent too, and
-                the blocks with them.
+            x: the coefficients. If they are lent, the sums are lent too, and the blocks with them.
             flags: (2, N) uint32, which of them are active.
             blocks: whether the splats' own blocks are wanted; see :meth:`block_rows`.
             constant: whether only the constant coefficients are active.
@@ -143,7 +145,9 @@ class ColourPart(Part):
         if isinstance(x, Lent):
             self._packing.fetch(self._x, x)
         else:
-            self._coefficients.write_columns(self._x, x)
+            if self._vectors is None:
+                self._vectors = self._owned.enter_context(SparseVectors(self._coefficients))
+            self._vectors.give(self._x, x)
         if blocks:
             triangle = layout.sh_count * (layout.sh_count + 1) // 2
             self._block_sums = self._blocks.allocate(8 * triangle * layout.stride, "the splats' normal equations")

@@ -1,4 +1,4 @@
-"""Which splats each view reaches, on a GPU: :func:`reached_splats`.
+"""Which splats each view reaches: :func:`reached_splats`.
 
 A view reaches a splat if a sweep fetches it, for any of its tiles. Most others lie beside the view; or behind what ends
 all pixels of their tiles, as most of a city does. What a sweep computes is the same to the last bit if the others are
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -19,6 +20,7 @@ from potr_cl.model.camera import Camera
 from potr_cl.opencl.memory import Memory, Reused
 from potr_cl.raster.picked_splats import Picker
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.view_set import camera_struct
 
 #: Fewer splats are looked at together as fast.
 LEAST_SPLATS = 1 << 19
@@ -69,12 +71,12 @@ def reached_splats(
         memory: bytes of the device's memory that the user would have taken; None: as much as there is.
 
     Returns:
-        None where views had better share all splats: there are few, or views reach many of them, or it is no GPU.
+        None where views had better share all splats: there are few, or views reach many of them,.
 
     Raises:
         DeviceError: a view with all splats does not fit the device.
     """
-    if rasterizer.device.family != "gpu" or rasterizer.splats < LEAST_SPLATS or not numbers:
+    if rasterizer.splats < LEAST_SPLATS or not numbers:
         return None
     found: dict[int, NDArray[np.uint32]] = {}
     device, room = rasterizer.device, _Room()
@@ -85,6 +87,8 @@ def reached_splats(
             some = numbers[:: -(-len(numbers) // _SAMPLED)]
             free = min((device.info.memory if memory is None else memory), device.info.memory - device.allocated)
             most = int(min(max(free * _ROOM / (_VIEW * rasterizer.stride), 1), _TOGETHER))
+            if device.family == "cpu":  # a launch does one view
+                most = 1
             for views in (some, sorted(set(numbers) - set(some))):
                 left = list(views)
                 while left:
@@ -136,31 +140,33 @@ def _reached(
     rasterizer: Rasterizer, cameras: Sequence[Camera], picker: Picker, marks: cl.Buffer, passing: Reused
 ) -> list[NDArray[np.uint32]]:
     device, rules = rasterizer.device, rasterizer.rules
-    mark = device.shared_kernel(
-        "refit/reached.cl",
-        "mark_reached",
-        ALPHA_CAP=float(rules.alpha_cap),
-        TRANSMITTANCE_THRESHOLD=rules.transmittance_threshold,
-        NATIVE_EXP2=int(device.native_exp2),
-    )
+    ends = {"ALPHA_CAP": float(rules.alpha_cap), "TRANSMITTANCE_THRESHOLD": rules.transmittance_threshold}
+    of_cpu = device.family == "cpu"
+    if of_cpu:
+        lanes = max(device.vector_width, 8)
+        mark = device.shared_kernel("refit/reached_cpu.cl", "mark_reached", LANES=lanes, **ends)
+    else:
+        native = int(device.native_exp2)
+        mark = device.shared_kernel("refit/reached.cl", "mark_reached", NATIVE_EXP2=native, **ends)
     found: list[NDArray[np.uint32]] = []
     try:
         # Together: the longest tile list of one keeps few work-groups busy.
         views = rasterizer.prepare_set(cameras, passing)
         for number, view in enumerate(views.views):
             device.fill(marks, np.uint8(0))
-            mark.bind(
-                views=views.table,
-                number=number,
-                stride=views.stride,
-                shapes=views.shapes,
-                colours=views.colours,
-                offsets=views.offsets,
-                intersections=views.intersections,
-                subtiles=views.subtiles,
-                marks=marks,
-            )
-            mark.launch((view.tiles * _GROUP,), (_GROUP,))
+            lists: dict[str, Any] = {
+                "shapes": views.shapes,
+                "colours": views.colours,
+                "offsets": views.offsets,
+                "intersections": views.intersections,
+                "subtiles": views.subtiles,
+                "marks": marks,
+            }
+            if of_cpu:
+                mark.bind(view=camera_struct(view.camera), **lists).launch((view.tiles,), (1,))
+            else:
+                mark.bind(views=views.table, number=number, stride=views.stride, **lists)
+                mark.launch((view.tiles * _GROUP,), (_GROUP,))
             with Memory(device) as memory:
                 numbers, count = picker.pick(memory, np.ones(1, bool), marks, 1)
                 found.append(device.download(numbers, (count,), np.uint32))

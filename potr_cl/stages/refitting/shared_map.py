@@ -10,8 +10,8 @@ import numpy as np
 import pyopencl as cl
 
 from potr_cl.model.camera import Camera
-from potr_cl.model.scene import FloatArray, Scene
-from potr_cl.opencl.memory import Owner, Staging
+from potr_cl.model.scene import Scene
+from potr_cl.opencl.memory import Owner
 from potr_cl.opencl.relay import Lent
 from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import KeptScene
@@ -23,6 +23,7 @@ from potr_cl.stages.refitting.coming_scene import AnyScene, arrived
 from potr_cl.stages.refitting.packing import Packing
 from potr_cl.stages.refitting.part import ColourPart, Gradient
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
+from potr_cl.stages.refitting.sparse_vector import SentVector, SparseVectors
 from potr_cl.workers.dealing import Shares, shares
 from potr_cl.workers.parts import Parts, Pending
 from potr_cl.workers.pool import Pool, Shared
@@ -50,7 +51,7 @@ class SharedViews(Owner):
         self._coefficients, self._others, self._in_process = coefficients, others, in_process
         self._x: Lent | None = None
         self._packing = Packing(coefficients)
-        self._columns = Staging(coefficients.device)
+        self._vectors = None if in_process else SparseVectors(coefficients)
         self._pending: Pending | None = None
 
     def begin_gradient(self, x: cl.Buffer, blocks: bool, constant: bool) -> None:
@@ -59,13 +60,12 @@ class SharedViews(Owner):
         self._pending = self._others.begin("gradient", self._sent(x), flags, blocks, constant, anew=True)
         self._packing.take_flags()
 
-    def _sent(self, x: cl.Buffer) -> Lent | FloatArray:
+    def _sent(self, x: cl.Buffer) -> Lent | SentVector:
+        if self._vectors is not None:
+            return self._vectors.take(x)
         layout = self._coefficients.layout
-        if self._in_process:
-            self._x = Lent(self._coefficients.device, x, 4 * layout.columns * layout.stride)
-            return self._x
-        columns: FloatArray = self._columns.download(x, (layout.columns, layout.stride), np.float32)
-        return columns[:, : layout.splats]
+        self._x = Lent(self._coefficients.device, x, 4 * layout.columns * layout.stride)
+        return self._x
 
     def begin_normal(self, direction: cl.Buffer, at: cl.Buffer, unit: float, constant: bool, part: int | None) -> None:
         """Have them begin with a product of the normal matrix."""
@@ -112,7 +112,8 @@ class SharedViews(Owner):
     def close(self) -> None:
         """Give the master's device memory back; the parts are the caller's."""
         self._packing.close()
-        self._columns.close()
+        if self._vectors is not None:
+            self._vectors.close()
 
 
 def colour_shares(pool: Pool, views: int) -> Shares:
