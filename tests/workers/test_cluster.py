@@ -44,7 +44,7 @@ OPTIONS = EncodeOptions.for_preset(
 @pytest.fixture(autouse=True)
 def patient(monkeypatch):
     """A scheduler that a busy machine has just begun may take long to answer."""
-    monkeypatch.setattr("potr_cl.workers.cluster._CONNECT", 120.0)
+    monkeypatch.setattr("potr_cl.workers.client._CONNECT", 120.0)
 
 
 @contextlib.contextmanager
