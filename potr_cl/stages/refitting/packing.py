@@ -70,11 +70,18 @@ class Packing(Owner):
             self._coefficients.restore_flags(words)
         self.take_flags()
 
-    def floats(self, x: cl.Buffer) -> FloatArray:
-        """(count,) float32, a vector's active coefficients; valid until something else is packed."""
-        self._packed.reserve(4 * self.count)
-        self._row.pack_floats(x, self._packed.buffer)
-        packed: FloatArray = self._staging.download(self._packed.buffer, (self.count,), np.float32)
+    def floats(self, x: cl.Buffer, row: PackedRow | None = None, staging: Staging | None = None) -> FloatArray:
+        """(count,) float32, a vector's active coefficients; valid until something else is packed.
+
+        Args:
+            x: the vector.
+            row: another row than that of all active coefficients.
+            staging: where they are put, and valid as long as nothing else is put there; None: a place of this.
+        """
+        row = row or self._row
+        self._packed.reserve(max(4 * row.count, 1))
+        row.pack_floats(x, self._packed.buffer)
+        packed: FloatArray = (staging or self._staging).download(self._packed.buffer, (row.count,), np.float32)
         return packed
 
     def lend_floats(self, x: cl.Buffer) -> Lent:
@@ -85,7 +92,7 @@ class Packing(Owner):
 
     def set_floats(self, x: cl.Buffer, packed: FloatArray | Lent) -> None:
         """Set a vector; coefficients that are not active become 0."""
-        self._take(packed, 4)
+        self._take(packed, 4, self.count)
         self._row.unpack_floats(x, self._arrived.buffer)
         self._looked_at(packed)
 
@@ -109,10 +116,11 @@ class Packing(Owner):
         self._row.pack_sums(columns, self._packed.buffer)
         return Lent(self._coefficients.device, self._packed.buffer, 8 * self.count)
 
-    def add_sums(self, columns: cl.Buffer, packed: Narrowed | Lent) -> None:
-        """Add to sums over views."""
-        self._take(packed, 8)
-        self._row.add_sums(columns, self._arrived.buffer)
+    def add_sums(self, columns: cl.Buffer, packed: Narrowed | Lent, row: PackedRow | None = None) -> None:
+        """Add to sums over views; those of another row than that of all active coefficients."""
+        row = row or self._row
+        self._take(packed, 8, row.count)
+        row.add_sums(columns, self._arrived.buffer)
         self._looked_at(packed)
 
     def add_rows(self, sums: cl.Buffer, row: int, more: Narrowed) -> None:
@@ -148,11 +156,11 @@ class Packing(Owner):
         """Take a whole vector from another device, which lays it out in the same way."""
         self._relay.fetch(x, lent)
 
-    def _take(self, packed: NDArray[np.generic] | Narrowed | Lent, nbytes: int) -> None:
-        """Have packed coefficients of so many bytes each on the device."""
+    def _take(self, packed: NDArray[np.generic] | Narrowed | Lent, nbytes: int, expected: int) -> None:
+        """Have so many packed coefficients, of so many bytes each, on the device."""
         count = packed.count if isinstance(packed, Narrowed) else packed.nbytes // nbytes
-        if count != self.count:
-            raise ValueError(f"{count} packed coefficients, where {self.count} are active")
+        if count != expected:
+            raise ValueError(f"{count} packed coefficients, where {expected} are active")
         self._make_room(nbytes * count)
         if isinstance(packed, Narrowed):
             self._narrowing.upload(self._arrived.buffer, packed)
