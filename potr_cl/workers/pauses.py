@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 #: The first pause, in looks at who has come; each that follows is twice as long, up to the last number of seconds.
-_FIRST, _LONGEST = 1.0, 600.0
+_FIRST, _LONGEST = 1.0, 60.0
 
 
 class Pauses:
