@@ -34,7 +34,15 @@ if TYPE_CHECKING:
     from potr_cl.api.ladder import encode_ladder
     from potr_cl.api.pictures import Rendering, Renderings, preview, render
     from potr_cl.api.viewing import view
-    from potr_cl.errors import DataError, DeviceError, DeviceMemoryError, PotrError, UnreachableError, UsageError
+    from potr_cl.errors import (
+        DataError,
+        DeviceError,
+        DeviceMemoryError,
+        PotrError,
+        UnreachableError,
+        UsageError,
+        WriteError,
+    )
     from potr_cl.formats import load_cameras, load_scene, read_cameras, read_scene
     from potr_cl.model.camera import Camera
     from potr_cl.model.scene import Scene
@@ -67,6 +75,7 @@ __all__ = [
     "Target",
     "UnreachableError",
     "UsageError",
+    "WriteError",
     "__version__",
     "compact",
     "compare",
@@ -114,6 +123,7 @@ _HOMES = {
     "Target": "pipeline.target",
     "UnreachableError": "errors",
     "UsageError": "errors",
+    "WriteError": "errors",
     "compact": "api.editing",
     "compare": "api.comparing",
     "convert": "api.files",

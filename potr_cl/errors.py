@@ -29,6 +29,22 @@ class UsageError(PotrError):
     exit_code = 2
 
 
+class WriteError(PotrError):
+    """The system does not write a file: the disk is full, a quota, a folder that is gone.
+
+    Attributes:
+        path: of the file, as it was given.
+    """
+
+    def __init__(self, message: object = "", path: str = "") -> None:
+        super().__init__(message)
+        self.path = path
+
+
+class UnwritableError(WriteError, UsageError):
+    """No file can be made at a path."""
+
+
 class DeviceError(PotrError):
     """An OpenCL device is missing, failed to build a program, or ran out of memory."""
 

@@ -17,10 +17,13 @@ from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model import agreement, virtual_cameras
 from potr_cl.model.placement.candidates import Candidates, Run
 from potr_cl.model.placement.matter import Frame, Matter
+from potr_cl.opencl.loader import register_runtimes
 
 DATA = Path(__file__).parent / "data"
 #: Where Chromium is, if it has another name than systems give it.
 CHROMIUM_VARIABLE = "POTR_CL_CHROMIUM"
+#: It is waited so long for what should come at once, however busy the machine is: Playwright has 30 s of its own.
+MOST_MILLISECONDS = 300_000
 SCENES = Path(__file__).parents[2] / "shared" / "scenes"
 
 
@@ -44,6 +47,16 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         on_gpu_kernels = parameters is not None and any(str(value) == "gpu" for value in parameters.params.values())
         if on_gpu_kernels and item.get_closest_marker("one_family") is not None:
             item.add_marker(pytest.mark.slow)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def runtimes_are_registered() -> None:
+    """As the first test that opens a device would do it, for all programs that tests start.
+
+    A program that does it itself leaves a folder where temporary files lie, for those after it; tests that look what is
+    left there would find that, if none has opened a device before them.
+    """
+    register_runtimes()
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -137,6 +150,14 @@ def browser() -> Iterator[Any]:
     if hasattr(os, "geteuid") and os.geteuid() == 0:
         arguments.append("--no-sandbox")
     with library.sync_playwright() as play:
-        chromium = play.chromium.launch(executable_path=path, args=arguments)
+        chromium = play.chromium.launch(executable_path=path, args=arguments, timeout=MOST_MILLISECONDS)
+        new_context = chromium.new_context
+
+        def patient(**choices: Any) -> Any:
+            context = new_context(**choices)
+            context.set_default_timeout(MOST_MILLISECONDS)
+            return context
+
+        chromium.new_context = patient
         yield chromium
         chromium.close()

@@ -122,7 +122,7 @@ def test_commands_are_understood(page: Path) -> None:
 def test_flags_exist(page: Path) -> None:
     known = set(re.findall(r"`(--[\w-]+)", (ROOT / "docs" / "cli.md").read_text("utf-8")))
     # Of a recipe, of tools, of Docker and of Dask.
-    elsewhere = {"--haze", "--check", "--split", "--replay", "--user", "--memory-limit"}
+    elsewhere = {"--haze", "--check", "--split", "--replay", "--user", "--memory-limit", "--as-large"}
     for quoted in re.findall(r"`([^`\n]+)`", without_code(page.read_text("utf-8"))):
         if not quoted.startswith(("python -m pytest", "python -m tools", "ruff", "pip", "git")):
             for flag in re.findall(r"(?<![\w-])--[a-z][\w-]+", quoted):

@@ -94,14 +94,14 @@ def test_a_notebooks_code_runs(notebook, clone, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=[path.name for path in NOTEBOOKS])
-def test_a_notebook_runs_in_jupyter(notebook, clone):
+def test_a_notebook_runs_in_jupyter(notebook, clone, monkeypatch):
     nbformat = pytest.importorskip("nbformat")
     nbclient = pytest.importorskip("nbclient")
     pytest.importorskip("ipykernel")
     document = nbformat.read(notebook, as_version=4)
     client = nbclient.NotebookClient(document, timeout=300, resources={"metadata": {"path": str(clone / "examples")}})
     # The kernel is another process, which is to find this clone's package.
-    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")])))
     client.execute()
     kinds = {kind for cell in document.cells for output in cell.get("outputs", []) for kind in output.get("data", {})}
     assert {"image/png", "text/plain"} <= kinds

@@ -31,6 +31,7 @@ bench.busy             how busy is the device during an encode, stage by stage?
 bench.kernels          processor time of each kernel, on machines that do other work too
 bench.paired           are whole encodes faster or slower than those of another checkout?
 bench.memory           host memory of one encode, stage by stage
+bench.traffic          what travels to and from the workers of a cluster, and what is it for?
 bench.scaling          time and memory against splats, views and workers: with which exponents?
 bench.memory_growth    peak memory against splats and views, and whether --memory is obeyed
 =====================  =================================================================================================

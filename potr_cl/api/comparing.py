@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -52,6 +53,7 @@ from potr_cl.report.labels import U8, comparison_picture, shrunk
 from potr_cl.workers.opening import ClusterSource, DevicesSource, Workers, open_workers
 
 if TYPE_CHECKING:
+    from potr_cl.outputs.coded_scene import CodedScene
     from potr_cl.viewer.server import Viewer
 
 #: Pixels that a notebook's picture is wide at most: it is kept in the notebook.
@@ -212,11 +214,13 @@ def compare(
     source_a = a if given is not None else scene_of(a, trust, antialiased)
     there = given or points.placed(scene_of(source_a))
     chosen = chosen_views(there, views, split)
-    with (
-        open_workers(device, cluster) as workers,
-        drawable_of(source_a, workers.device, trust, antialiased) as scene_a,
-        drawable_of(b, workers.device, trust, antialiased) as scene_b,
-    ):
+    with contextlib.ExitStack() as stack:
+        workers = stack.enter_context(open_workers(device, cluster))
+        coded = [coded_for(workers, each, trust) if antialiased is None else None for each in (source_a, b)]
+        scene_a, scene_b = (
+            stack.enter_context(drawable_of(each, workers.device, trust, antialiased, read))
+            for each, read in zip((source_a, b), coded, strict=True)
+        )
         comparison = compare_scenes(
             (named(a, scene_a), scene_a),
             (named(b, scene_b), scene_b),
@@ -227,8 +231,7 @@ def compare(
             truth=None if truth is None else Path(truth),
             progress=progress,
             notes=[] if given else [f"no cameras: {told(there)}"],
-            files=None if antialiased is not None else (source_a, b),
-            trust=trust,
+            coded=coded,
         )
     if output is not None:
         comparison.save(output)
@@ -242,6 +245,18 @@ def named(source: SceneSource, scene: Drawable) -> SceneFile:
     return SceneFile(name_of(source), nbytes, len(scene), scene.sh_degree, scene.antialiased)
 
 
+def coded_for(workers: Workers, source: SceneSource, trust: bool = False) -> CodedScene | None:
+    """The .potr file that a source stands for, where other computers need it, who decode it for themselves.
+
+    None for anything else.
+
+    Raises:
+        UsageError: it cannot be read.
+    """
+    far = workers.pool is not None and not workers.pool.in_process
+    return coded_scene(source, trust) if far else None
+
+
 def compare_scenes(
     a: tuple[SceneFile, Drawable],
     b: tuple[SceneFile, Drawable],
@@ -253,14 +268,13 @@ def compare_scenes(
     truth: Path | None = None,
     progress: Callable[[str, float], None] | None = None,
     notes: Sequence[str] = (),
-    files: Sequence[SceneSource | None] | None = None,
-    trust: bool = False,
+    coded: Sequence[CodedScene | None] = (None, None),
 ) -> SceneComparison:
     """The same for scenes that have been read and views that have been chosen.
 
     Args:
         workers: that do it.
-        files: what both scenes have been read from as they are, for other computers; None: they are sent themselves.
+        coded: the files of both scenes, see :func:`coded_for`; None: they are sent themselves.
 
     Raises:
         As :func:`compare`.
@@ -283,8 +297,6 @@ def compare_scenes(
         told_of.append(str(missing))
     opened, tell, stage = workers.device, progress or (lambda _stage, _done: None), comparing(len(views))
     looks = Looks(background, rules, ground_truth, lpips)
-    far = workers.pool is not None and not workers.pool.in_process
-    coded = [coded_scene(each, trust) if far and each is not None else None for each in files or (None, None)]
     tell(stage, 0.0)
     with SharedJudging(opened, a[1], views, looks, workers.pool, anyway=True, coded=coded[0]) as judging:
         found = judging.figures(b[1], views, coded[1], lambda done: tell(stage, done / len(views)))

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from potr_cl.api.encoding import encode_options, views_or_placed
+from potr_cl.api.files import result_writer
 from potr_cl.api.inputs import (
     CamerasSource,
     ColourSource,
@@ -27,7 +28,6 @@ from potr_cl.api.inputs import (
 )
 from potr_cl.codec.quantize import ac_sparsity
 from potr_cl.errors import UsageError
-from potr_cl.formats import scene_writer
 from potr_cl.formats.images import Colour
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.camera import Camera, test_views, train_views, within_photographs
@@ -189,7 +189,7 @@ def prune(
         DeviceError: no device does the work.
     """
     options = stage_options(Prune, q, background, memory, choices).changed(cameras_anyway=cameras_anyway)
-    write = scene_writer(output) if output is not None else None
+    write = result_writer(output)
     views, what = cameras_of(cameras, virtual_views), scene_of(scene, trust, antialiased)
     with contextlib.ExitStack() as stack:
         ranks = stack.enter_context(replacing(order)) if order is not None else None
@@ -232,7 +232,7 @@ def compact(
         As :func:`prune`.
     """
     options = stage_options(Compact, q, background, memory, choices, sf_sh).changed(cameras_anyway=cameras_anyway)
-    write = scene_writer(output) if output is not None else None
+    write = result_writer(output)
     views, what = cameras_of(cameras, virtual_views), scene_of(scene, trust, antialiased)
     state, used = _run(what, views, virtual_views, options, Compact, device, progress)
     if write is not None:
@@ -325,7 +325,7 @@ def refit(
     budget = as_bytes(memory)
     if photos is not None and cameras is None:
         raise UsageError("--photos needs --cameras, the views that the photographs show")
-    write = scene_writer(output) if output is not None else None
+    write = result_writer(output)
     given = cameras_of(cameras, virtual_views)
     if photos is not None and given is not None:
         given = within_photographs(given)

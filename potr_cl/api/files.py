@@ -6,7 +6,7 @@ To decode takes less time than to import what other functions need, so little is
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,7 +23,8 @@ from potr_cl.codec.blocks.file import BlockedFile
 from potr_cl.codec.decoder import decode as decode_file
 from potr_cl.codec.decoder import open_file
 from potr_cl.errors import DataError, UsageError
-from potr_cl.host.atomic_write import replacing
+from potr_cl.host.atomic_write import check_place, replacing
+from potr_cl.host.rescue import written_or_kept
 from potr_cl.model.box import Box
 from potr_cl.model.scene import Scene
 
@@ -54,6 +55,27 @@ def save(scene: SceneSource, path: str | os.PathLike[str]) -> None:
         return
     write = scene_writer(path)  # a wrong name is told before anything is read
     write(scene_of(scene))
+
+
+def result_writer(output: str | os.PathLike[str] | None) -> Callable[[Scene], None] | None:
+    """What writes a scene that takes long to make: where the system fails to write it, it is kept elsewhere.
+
+    Args:
+        output: the file; None: nothing is to be written.
+
+    Returns:
+        Takes the scene, and raises as :func:`potr_cl.host.rescue.written_or_kept`; None if there is nothing to write.
+
+    Raises:
+        UsageError: no scene can be written to a file of this name, or no file there.
+    """
+    if output is None:
+        return None
+    from potr_cl.formats import scene_writer
+
+    _ = scene_writer(output)  # a wrong name is told before anything is made
+    check_place(output)
+    return lambda scene: written_or_kept(output, lambda path: scene_writer(path)(scene))
 
 
 def convert(

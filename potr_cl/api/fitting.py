@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from potr_cl.api.editing import Edited, check_rendered_alike
 from potr_cl.api.encoding import views_or_placed
+from potr_cl.api.files import result_writer
 from potr_cl.api.inputs import (
     CamerasSource,
     ColourSource,
@@ -21,7 +22,6 @@ from potr_cl.api.inputs import (
     scene_of,
 )
 from potr_cl.errors import UsageError
-from potr_cl.formats import scene_writer
 from potr_cl.host.signals import first_interrupt_asks
 from potr_cl.model.camera import test_views, train_views
 from potr_cl.model.views_between import views_between as place_between
@@ -101,7 +101,7 @@ def fit(
     """
     colour = colour_of(background)
     options, budget = check_fit(steps, views_between), as_bytes(memory)
-    write = scene_writer(output) if output is not None else None
+    write = result_writer(output)
     given = cameras_of(cameras, virtual_views)
     reduced, original = scene_of(scene, trust, antialiased), scene_of(reference, trust, antialiased)
     check_rendered_alike((str(name_of(scene)), reduced), (str(name_of(reference)), original))

@@ -77,32 +77,47 @@ def _usable(scene: Scene) -> Scene:
 
 @contextmanager
 def drawable_of(
-    source: SceneSource, device: Device, trust: bool = False, antialiased: bool | None = None
+    source: SceneSource,
+    device: Device,
+    trust: bool = False,
+    antialiased: bool | None = None,
+    coded: CodedScene | None = None,
 ) -> Iterator[Drawable]:
     """The scene that a source stands for, to be rendered on a device as long as the context lasts.
 
     A .potr file is decoded into the device's memory, with no scene on the host.
 
+    Args:
+        source: see :data:`SceneSource`.
+        device: to render on.
+        trust, antialiased: as of :func:`scene_of`.
+        coded: the source as :func:`coded_scene` has read it, so that it is not read again.
+
     Raises:
         As :func:`scene_of`.
         DeviceError: the scene does not fit the device.
     """
-    if not _is_potr(source):
+    if coded is None and not _is_potr(source):
         yield scene_of(source, trust, antialiased)
         return
-    with on_device(source, device, trust, antialiased=antialiased) as buffers:  # type: ignore[arg-type]
+    read = None if coded is None else coded.data
+    with on_device(source, device, trust, antialiased=antialiased, read=read) as buffers:  # type: ignore[arg-type]
         yield buffers
 
 
 @contextmanager
 def drawable_to_judge(
-    source: SceneSource, device: Device, trust: bool = False, antialiased: bool | None = None
+    source: SceneSource,
+    device: Device,
+    trust: bool = False,
+    antialiased: bool | None = None,
+    coded: CodedScene | None = None,
 ) -> Iterator[tuple[Drawable, Scene]]:
     """As :func:`drawable_of`, and a scene on the host by which cameras are judged as by the whole one.
 
     See :func:`potr_cl.model.agreement.judge_cameras`.
     """
-    if not _is_potr(source):
+    if coded is None and not _is_potr(source):
         scene = scene_of(source, trust, antialiased)
         yield scene, scene
         return
@@ -121,7 +136,11 @@ def drawable_to_judge(
 
         return take
 
-    with on_device(source, device, trust, antialiased=antialiased, beside=sampled) as buffers:  # type: ignore[arg-type]
+    read = None if coded is None else coded.data
+    with on_device(
+        source,  # type: ignore[arg-type]
+        device, trust, antialiased=antialiased, beside=sampled, read=read,
+    ) as buffers:  # fmt: skip
         yield buffers, joined([each.scene for each in samples])
 
 
@@ -160,11 +179,13 @@ def on_device(
     antialiased: bool | None = None,
     threads: int = 0,
     beside: Callable[[AnyFile], Beside] | None = None,
+    read: bytes | None = None,
 ) -> SceneBuffers:
     """The .potr file that a path, bytes or the result of an encode stand for, decoded into a device's memory.
 
     Args:
         beside: makes of the opened file what makes what takes the same splats.
+        read: the content of the path, where it has been read already.
         source, device, trust, sh_degree, antialiased, threads: as of :func:`potr_cl.decode_to_device`.
 
     Raises:
@@ -183,7 +204,7 @@ def on_device(
         raise UsageError(f"a .potr file is wanted, its bytes or an encode to one, not {type(source).__name__}")
     path = os.fspath(source)
     try:
-        return decoded(open_file(path, trust))
+        return decoded(open_file(path if read is None else read, trust))
     except DataError as error:
         raise error if path in str(error) else DataError(f"'{path}': {error}") from None
 
@@ -310,12 +331,14 @@ def chosen_views(
         split: "train", "test" or "all".
 
     Raises:
-        UsageError: there is no such view.
+        UsageError: there is no such view, or none is asked for.
     """
     if views is not None and split is not None:
         raise UsageError("give either views or a split")
     if views is not None:
         views = [views] if isinstance(views, (str, int)) else views
+        if not len(views):
+            raise UsageError("the list of views is empty: name at least one, or leave it out")
         by_name = {camera.name: camera for camera in cameras}
         by_name = {str(index): camera for index, camera in enumerate(cameras)} | by_name
         for name in map(str, views):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from potr_cl.formats.ladder import DESCRIPTION, Ladder, Rung, qualities
 from potr_cl.formats.registry import stem_of_scene
 from potr_cl.host.atomic_write import replacing
 from potr_cl.host.mapped import bounded
+from potr_cl.host.rescue import replacing_or_keeping, written_or_kept
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
@@ -146,6 +148,9 @@ def make_ladder(
         As :func:`encode_ladder`.
     """
     files = ladder_files(folder, name, steps, options.output.suffix)
+    for file in files:
+        if file.is_dir():
+            raise UsageError(f"cannot write '{file}': it is a directory; write the ladder elsewhere")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -153,15 +158,17 @@ def make_ladder(
     views = EvaluationViews.of(list(cameras)) if cameras is not None and device is not None and judged else None
     rungs = []
     # The uncompressed scene stays on the device from one quality to the next, where there is room.
-    with nullcontext() if device is None else KeptScene(device, scene, options.memory) as kept:
+    with (
+        replacing_or_keeping(files[-1]) as description,  # a folder that takes no file is told before the work
+        nullcontext() if device is None else KeptScene(device, scene, options.memory) as kept,
+    ):
         for q, file in zip(steps, files[:-1], strict=True):
             encoded = run_stages(scene, cameras, options.changed(q=q), progress, device, kept=kept, pool=pool)
             psnr = ssim = None
             judged_on = None if views is None else encoded.device or device
             with proved(encoded, trust, judged_on) as written:
                 nbytes, splats = len(written.data), len(written.scene)
-                with replacing(file) as opened:
-                    opened.write(written.data)
+                written_or_kept(file, partial(_write, written.data))
                 if views is not None and judged_on is not None:
                     judge = Judge(views, judged_on, options.background, kept=kept, pool=pool)
                     quality, _ = judge(scene, written, Stopwatch(progress))
@@ -170,6 +177,12 @@ def make_ladder(
             if tell is not None:
                 figure = "" if views is None else f", {decibels(psnr)}"
                 tell(f"{file}: q {q:g}, {nbytes:,} bytes, {splats:,} splats{figure}")
-    ladder = Ladder(files[-1], name.name, options.source_bytes, "" if views is None else str(views), tuple(rungs))
-    ladder.save()
+        judged_by = "" if views is None else str(views)
+        ladder = Ladder(files[-1], name.name, options.source_bytes, judged_by, tuple(rungs))
+        description.write(ladder.encoded())
     return ladder
+
+
+def _write(data: bytes, path: Path) -> None:
+    with replacing(path) as file:
+        file.write(data)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
@@ -259,10 +260,26 @@ def picture_files(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
     Raises:
         DataError: two views would have one file.
     """
-    names = [camera.name.replace("/", "_") + ".png" for camera in cameras]
+    names = [file_name(camera.name) + ".png" for camera in cameras]
     if len(set(names)) < len(names):
         raise DataError("two views of the cameras would be written to one file: choose among them with --views")
     return [folder / name for name in names]
+
+
+def file_name(view: str, windows: bool = os.name == "nt") -> str:
+    """A view's name as that of a file, without a suffix.
+
+    Args:
+        view: the name.
+        windows: whether the file is for Windows, where some characters stand for other things than themselves, and
+            some names for devices, whatever suffix they have.
+    """
+    name = view.replace("/", "_")
+    if windows:
+        name = re.sub(r'[\\<>:"|?*]', "_", name)
+        if re.fullmatch(r"(con|prn|aux|nul|(com|lpt)[0-9¹²³]) *(\..*)?", name, re.IGNORECASE):
+            name = f"_{name}"
+    return name
 
 
 def make_folder(folder: Path) -> None:

@@ -16,7 +16,7 @@ from potr_cl.cli.options import Commands, add_device_options, add_memory_option
 from potr_cl.cli.outputs import WrittenNumbers, scene_output
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
-from potr_cl.cli.scenes import add_antialiased_option, add_from_option, add_trust_option, read_scene, write_scene
+from potr_cl.cli.scenes import add_antialiased_option, add_from_option, add_trust_option, read_scene, write_result
 from potr_cl.cli.stage_flags import add_stage_flags, stage_choices
 from potr_cl.cli.terminal import note, say_done
 from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
@@ -50,7 +50,7 @@ def _prune(args: argparse.Namespace) -> None:
             scene, cameras, q=args.quality, memory=args.memory, background=args.background,
             device=device, progress=progress, cameras_anyway=args.cameras_anyway, **choices,
         )  # fmt: skip
-        write_scene(args.output, result.scene, args.to)
+        write_result(args.output, result.scene, args.to)
         if order is not None:
             np.save(order, result.pruned.order)
     say_done(f"{args.output}: {result.said} on {result.device.info}")
@@ -76,6 +76,21 @@ def add_output_options(p: argparse.ArgumentParser) -> None:
     add_from_option(p)
 
 
+def add_reduced_and_reference(p: argparse.ArgumentParser) -> None:
+    """The scenes and cameras of a command that brings one scene closer to another."""
+    p.add_argument("scene", type=read_file, metavar="PRUNED", help=f'{suffixes_read()}, or "-" for standard input')
+    p.add_argument("--reference", type=read_file, required=True, metavar="ORIGINAL", help="the uncompressed scene")
+    add_cameras_options(p)
+
+
+def add_usual_options(p: argparse.ArgumentParser) -> None:
+    """How scenes are read, and what computes with how much memory."""
+    add_trust_option(p)
+    add_antialiased_option(p)
+    add_memory_option(p)
+    add_device_options(p)
+
+
 def add_prune(commands: Commands) -> None:
     p = commands.add_parser("prune", help="remove the splats that no view misses; nothing else changes")
     p.add_argument("scene", type=read_file, metavar="SCENE", help=f'{suffixes_read()}, or "-" for standard input')
@@ -89,10 +104,7 @@ def add_prune(commands: Commands) -> None:
         help="also write the order of removal: the scene's splat numbers, first removed first, kept ones last",
     )
     add_stage_flags(p, [Prune], without=["on"])
-    add_trust_option(p)
-    add_antialiased_option(p)
-    add_memory_option(p)
-    add_device_options(p)
+    add_usual_options(p)
     p.set_defaults(run=_prune)
 
 
@@ -107,7 +119,7 @@ def _compact(args: argparse.Namespace) -> None:
             scene, cameras, q=args.quality, sf_sh=args.sf_sh, memory=args.memory, background=args.background,
             device=device, progress=progress, cameras_anyway=args.cameras_anyway, **choices,
         )  # fmt: skip
-    write_scene(args.output, result.scene, args.to)
+    write_result(args.output, result.scene, args.to)
     say_done(f"{args.output}: {result.said}")
 
 
@@ -119,10 +131,7 @@ def add_compact(commands: Commands) -> None:
     p.add_argument("-q", "--quality", type=float, default=0.5, metavar="Q", help="0 (sparsest) to 1; default 0.5")
     add_stage_flags(p, [Compact], without=["on", "at"])
     p.add_argument("--sf-sh", type=float, metavar="SF", help="steps a unit of the quantiser to expect")
-    add_trust_option(p)
-    add_antialiased_option(p)
-    add_memory_option(p)
-    add_device_options(p)
+    add_usual_options(p)
     p.set_defaults(run=_compact)
 
 
@@ -151,7 +160,7 @@ def _refit(args: argparse.Namespace) -> None:
             drop=args.drop, memory=args.memory, background=background, device=device, progress=progress,
             cameras_anyway=args.cameras_anyway,
         )  # fmt: skip
-    write_scene(args.output, result.scene, args.to)
+    write_result(args.output, result.scene, args.to)
     say_done(f"{args.output}: {len(scene):,} splats re-fitted in {result.refitted.steps} steps on {result.device.info}")
     before, after = result.refitted.errors
     say_done(
@@ -189,9 +198,7 @@ def add_refit(commands: Commands) -> None:
         description="Solve for the colours of all splats together, so that the training views look as those of the "
         "reference (or as the photographs) do; nothing else changes. Coefficients that are 0 stay 0.",
     )
-    p.add_argument("scene", type=read_file, metavar="PRUNED", help=f'{suffixes_read()}, or "-" for standard input')
-    p.add_argument("--reference", type=read_file, required=True, metavar="ORIGINAL", help="the uncompressed scene")
-    add_cameras_options(p)
+    add_reduced_and_reference(p)
     p.add_argument(
         "--photos", type=ReadPhotographs, metavar="DIR", help="photographs, named after the views, to fit instead"
     )
@@ -225,8 +232,5 @@ def add_refit(commands: Commands) -> None:
         metavar="X",
         help="give up an AC coefficient where the mean squared error grows by less; default: none",
     )
-    add_trust_option(p)
-    add_antialiased_option(p)
-    add_memory_option(p)
-    add_device_options(p)
+    add_usual_options(p)
     p.set_defaults(run=_refit)

@@ -7,16 +7,14 @@ import contextlib
 
 from potr_cl.api.editing import check_rendered_alike
 from potr_cl.api.fitting import check_fit, fit
-from potr_cl.cli.edit import add_output_options
+from potr_cl.cli.edit import add_output_options, add_reduced_and_reference, add_usual_options
 from potr_cl.cli.forecasts import tell_what_is_ahead
-from potr_cl.cli.guard import read_file
-from potr_cl.cli.options import Commands, add_device_options, add_memory_option
+from potr_cl.cli.options import Commands
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
-from potr_cl.cli.scenes import add_antialiased_option, add_trust_option, read_scene, write_scene
+from potr_cl.cli.scenes import read_scene, write_result
 from potr_cl.cli.terminal import say_done
-from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
-from potr_cl.formats.registry import suffixes_read
+from potr_cl.cli.views import given_cameras, virtual_cameras
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.amounts import as_bytes
 from potr_cl.pipeline.options import EncodeOptions
@@ -41,7 +39,7 @@ def _fit(args: argparse.Namespace) -> None:
             steps=args.steps, views_between=args.views_between, memory=args.memory, background=args.background,
             device=device, progress=progress, tell=progress.tell, cameras_anyway=args.cameras_anyway,
         )  # fmt: skip
-    write_scene(args.output, result.scene, args.to)
+    write_result(args.output, result.scene, args.to)
     between = f" and {result.added} between them" if result.added else ""
     say_done(f"{args.output}: {result.said} of {result.views} training views{between}, on {result.device.info}")
     if result.psnr is not None:
@@ -57,9 +55,7 @@ def add_fit(commands: Commands) -> None:
         "as those of the reference do. Some training views are held out; the scene that matches them best is kept, at "
         "worst the one that was given.",
     )
-    p.add_argument("scene", type=read_file, metavar="PRUNED", help=f'{suffixes_read()}, or "-" for standard input')
-    p.add_argument("--reference", type=read_file, required=True, metavar="ORIGINAL", help="the uncompressed scene")
-    add_cameras_options(p)
+    add_reduced_and_reference(p)
     add_output_options(p)
     p.add_argument(
         "--steps",
@@ -75,8 +71,5 @@ def add_fit(commands: Commands) -> None:
         metavar="N",
         help="views to look at besides, for each training view, between it and its neighbours; default 0",
     )
-    add_trust_option(p)
-    add_antialiased_option(p)
-    add_memory_option(p)
-    add_device_options(p)
+    add_usual_options(p)
     p.set_defaults(run=_fit)

@@ -25,7 +25,7 @@ def tell_what_is_ahead(
     search: bool = False,
     kept: KeptScene | None = None,
 ) -> None:
-    """A line with the device and its kernels; and where the work may take long, with roughly its time and memory.
+    """A line with the device and its kernels; and where the work may take long, one with roughly its time and memory.
 
     Args:
         cameras: of which the training views are looked at.
@@ -39,7 +39,9 @@ def tell_what_is_ahead(
         return
     views = train_views(cameras)
     note(f"driver: {device.info.platform}, {device.info.version}", "detail")
-    line = f"on {device.info}, kernels for {device.family.upper()}s"
+    width, height = max((view.width, view.height) for view in views)
+    work = f"{len(scene):,} splats, {len(views)} views of {width} x {height}"
+    note(f"on {device.info}, kernels for {device.family.upper()}s: {work}")  # at once: to measure takes seconds
     if len(scene) * len(views) >= _LONG:
         try:
             ahead = forecast(scene, views, options, device, search, kept)
@@ -48,9 +50,7 @@ def tell_what_is_ahead(
         else:
             note(f"one view takes {1000 * ahead.sampled:.1f} ms", "detail")
             where = "" if device.info.kind == "cpu" else " of the device"
-            line += f"; about {_duration(ahead.seconds)} and {_size(ahead.memory)} of memory{where}"
-    width, height = max((view.width, view.height) for view in views)
-    note(f"{line}: {len(scene):,} splats, {len(views)} views of {width} x {height}")
+            note(f"about {_duration(ahead.seconds)} and {_size(ahead.memory)} of memory{where}")
 
 
 def _duration(seconds: float) -> str:

@@ -85,20 +85,28 @@ _STREAMS = (StandardInput, StandardOutput)
 
 def read_file(text: str) -> Path:
     """A type of arguments: a file that the command reads, or standard input."""
-    return StandardInput(text) if text == "-" else ReadFile(text)
+    return StandardInput(text) if text == "-" else ReadFile(named(text))
+
+
+def named(text: str) -> str:
+    """A path as it was given; that of a file "-", "./-", so that nobody takes it for standard input or output."""
+    return os.path.abspath(text) if os.path.normpath(text) == "-" else text
 
 
 def check(args: argparse.Namespace) -> None:
     """Refuse arguments by which a file would be read and written, or written twice.
 
     Raises:
-        UsageError: they are of this kind.
+        UsageError: they are of this kind; or "-" is given where neither standard input nor output is taken.
         TypeError: a path of which nobody has said whether it is read or written: a mistake in the program.
     """
     for name, value in vars(args).items():
         for path in value if isinstance(value, (list, tuple)) else [value]:
             if isinstance(path, Path) and not isinstance(path, (*_READ, *_WRITTEN, *_STREAMS)):
                 raise TypeError(f"argument '{name}' is a path: give it one of the types of {__name__}")
+            if isinstance(path, (*_READ, *_WRITTEN)) and os.fspath(path) == "-":
+                stream = "output" if isinstance(path, _WRITTEN) else "input"
+                raise UsageError(f"'-' is standard {stream}, which this argument does not take: give it a name")
     _refuse(_given(args, (WrittenFile,)), _given(args, _READ))
 
 

@@ -10,14 +10,14 @@ import argparse
 import contextlib
 import os
 import sys
-from collections.abc import Iterator
-from io import BytesIO
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import Protocol
 
-from potr_cl.cli.guard import StandardOutput, WrittenFile, WrittenFolder
-from potr_cl.errors import UsageError
-from potr_cl.host.atomic_write import replacing
+from potr_cl.cli.guard import StandardOutput, WrittenFile, WrittenFolder, named
+from potr_cl.errors import UsageError, WriteError
+from potr_cl.host.atomic_write import check_place
+from potr_cl.host.rescue import kept_elsewhere, replacing_or_keeping
 from potr_cl.host.standard_files import standard_output_for_data
 
 
@@ -51,13 +51,14 @@ _SUFFIXES: dict[type[WrittenFile], tuple[tuple[str, ...], str]] = {
 
 def scene_output(text: str) -> Path:
     """A type of arguments: a scene that is written to a file, or to standard output."""
-    return StandardOutput(text) if text == "-" else WrittenScene(text)
+    return StandardOutput(text) if text == "-" else WrittenScene(named(text))
 
 
 def place(text: str) -> Path:
     """A type of arguments: where one scene or several go, a file, a folder or standard output."""
     if text == "-":
         return StandardOutput(text)
+    text = named(text)
     return WrittenFolder(text) if text.endswith((os.sep, "/")) or os.path.isdir(text) else WrittenFile(text)
 
 
@@ -87,11 +88,7 @@ def check_file(path: WrittenFile, option: str = "-o") -> None:
     Raises:
         UsageError: it cannot be written, or not under this name.
     """
-    if os.path.isdir(path):
-        raise UsageError(f"cannot write '{path}': it is a directory; give the name of a file")
-    folder = os.path.dirname(os.path.realpath(path))
-    if not os.path.isdir(folder):
-        raise UsageError(f"cannot write '{path}': the folder '{folder}' does not exist")
+    check_place(path)
     check_name(path, option)
 
 
@@ -142,22 +139,57 @@ def suffix_of(args: argparse.Namespace) -> str:
     return checked
 
 
+class Result(Protocol):
+    """What takes a command's result, whole."""
+
+    def write(self, content: bytes, /) -> object: ...
+
+
 @contextlib.contextmanager
-def writing(path: Path) -> Iterator[BinaryIO]:
-    """A file or standard output, which gets what is written in the block when the block has ended well.
+def writing(path: Path, suffix: str) -> Iterator[Result]:
+    """A file or standard output, for what takes long to make: if it cannot go there, it is kept elsewhere.
+
+    Args:
+        path: of the file, or standard output.
+        suffix: of the file that is kept where standard output does not take it.
 
     Raises:
-        As :func:`potr_cl.host.atomic_write.replacing`.
+        As :func:`potr_cl.host.rescue.replacing_or_keeping`.
     """
     if not isinstance(path, StandardOutput):
-        with replacing(path) as file:
+        with replacing_or_keeping(path) as file:
             yield file
         return
-    content = BytesIO()
-    yield content
-    stream = path.stream
-    stream.write(content.getbuffer())
-    stream.flush()
+    result = _Streamed()
+    yield result
+    try:
+        path.stream.write(result.content)
+        path.stream.flush()
+    except OSError as error:
+        raise not_streamed(error, suffix, lambda where: where.write_bytes(result.content)) from error
+
+
+def not_streamed(error: OSError | WriteError, suffix: str, write: Callable[[Path], object]) -> WriteError:
+    """What to raise where standard output does not take a result that took long to make, which is kept elsewhere.
+
+    Args:
+        error: what the system says; also that the reader has gone.
+        suffix: of the file that is kept.
+        write: as of :func:`potr_cl.host.rescue.written_or_kept`.
+    """
+    failure = error
+    if isinstance(failure, OSError):
+        failure = WriteError(f"cannot write to standard output: {failure.strerror or failure}")
+    return kept_elsewhere(failure, f"result{suffix}", write)
+
+
+class _Streamed:
+    """What goes to standard output once it is whole."""
+
+    content = b""
+
+    def write(self, content: bytes, /) -> None:
+        self.content = content
 
 
 @contextlib.contextmanager

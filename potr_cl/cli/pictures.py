@@ -6,7 +6,7 @@ import argparse
 import contextlib
 from pathlib import Path
 
-from potr_cl.api.comparing import compare_scenes, named
+from potr_cl.api.comparing import SceneComparison, coded_for, compare_scenes, named
 from potr_cl.api.inputs import chosen_views
 from potr_cl.api.pictures import make_folder, picture_files, written_pictures
 from potr_cl.api.views import Viewpoints, told
@@ -33,7 +33,7 @@ from potr_cl.cli.progress import Progress
 from potr_cl.cli.scenes import ANTIALIASED, add_antialiased_option, add_trust_option, read_scene, read_to_draw
 from potr_cl.cli.terminal import note, say, say_document, say_done
 from potr_cl.cli.views import read_cameras, warn_of_frame
-from potr_cl.errors import UsageError
+from potr_cl.errors import UsageError, WriteError
 from potr_cl.formats.images import parse_colour
 from potr_cl.formats.registry import suffixes_read
 from potr_cl.host.atomic_write import replacing
@@ -42,11 +42,12 @@ from potr_cl.model.scene import Scene
 from potr_cl.model.viewpoints import AXES, SIZE, VIEWS
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import list_devices
+from potr_cl.outputs.coded_scene import CodedScene
 from potr_cl.quality.compare import format_sizes, size_report
 from potr_cl.raster.rules import RULES
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.raster.seen_rasterizer import rasterizer_for
-from potr_cl.workers.opening import open_workers
+from potr_cl.workers.opening import Workers, open_workers
 
 
 def _add_viewpoints(p: argparse.ArgumentParser) -> None:
@@ -147,39 +148,49 @@ def _compare(args: argparse.Namespace) -> None:
         _tell(args, size_report(*files), format_sizes(*files))
         note("sizes only: there is no OpenCL device to compare pictures on")
         return
-    with contextlib.ExitStack() as stack:
-        drawables: list[Drawable] = []
-        if cameras is None:
-            scenes = [read_scene(args, path) for path in (args.a, args.b)]
-            cameras = _cameras(args, points, scenes[0], "; a scene encoded with cameras looks best from those")
-            drawables += scenes
-            views = chosen_views(cameras, args.views, args.split)
-            workers = stack.enter_context(open_workers(args.device, args.cluster))
-        else:
-            views = chosen_views(cameras, args.views, args.split)
-            workers = stack.enter_context(open_workers(args.device, args.cluster))
-            for path in (args.a, args.b):
-                drawable, judged = stack.enter_context(read_to_draw(args, path, workers.device))
-                warn_of_frame(path, judged, views)
-                drawables.append(drawable)
-        a, b = drawables
-        picture = stack.enter_context(replacing(args.output)) if args.output is not None else None
-        progress = stack.enter_context(contextlib.closing(Progress()))
-        comparison = compare_scenes(
-            (named(args.a, a), a), (named(args.b, b), b), views,
-            workers=workers, rules=RULES[args.rules], background=background, truth=args.truth, progress=progress,
-            files=_files(args), trust=args.trust,
-        )  # fmt: skip
-        if picture is not None:
-            comparison.write_picture(picture)
-            comparison.notes.append(f"{args.output}: {comparison.caption}")
+    comparison: SceneComparison | None = None
+    try:
+        with contextlib.ExitStack() as stack:
+            drawables: list[Drawable] = []
+            coded: list[CodedScene | None] = []
+            if cameras is None:
+                scenes = [read_scene(args, path) for path in (args.a, args.b)]
+                cameras = _cameras(args, points, scenes[0], "; a scene encoded with cameras looks best from those")
+                drawables += scenes
+                views = chosen_views(cameras, args.views, args.split)
+                workers = stack.enter_context(open_workers(args.device, args.cluster))
+                coded += [_coded(args, path, workers) for path in (args.a, args.b)]
+            else:
+                views = chosen_views(cameras, args.views, args.split)
+                workers = stack.enter_context(open_workers(args.device, args.cluster))
+                for path in (args.a, args.b):
+                    coded.append(_coded(args, path, workers))
+                    drawable, judged = stack.enter_context(read_to_draw(args, path, workers.device, coded[-1]))
+                    warn_of_frame(path, judged, views)
+                    drawables.append(drawable)
+            a, b = drawables
+            picture = stack.enter_context(replacing(args.output)) if args.output is not None else None
+            progress = stack.enter_context(contextlib.closing(Progress()))
+            comparison = compare_scenes(
+                (named(args.a, a), a), (named(args.b, b), b), views,
+                workers=workers, rules=RULES[args.rules], background=background, truth=args.truth, progress=progress,
+                coded=coded,
+            )  # fmt: skip
+            if picture is not None:
+                comparison.write_picture(picture)
+    except WriteError:
+        if comparison is not None:  # the figures are not lost with the picture
+            _tell(args, comparison.report(), str(comparison))
+        raise
+    if args.output is not None:
+        comparison.notes.append(f"{args.output}: {comparison.caption}")
     _tell(args, comparison.report(), str(comparison))
 
 
-def _files(args: argparse.Namespace) -> list[Path | None]:
-    """What may be sent to other computers as it is."""
-    as_they_say = ANTIALIASED[args.antialiased] is None
-    return [path if as_they_say and not isinstance(path, StandardInput) else None for path in (args.a, args.b)]
+def _coded(args: argparse.Namespace, path: Path, workers: Workers) -> CodedScene | None:
+    """The file for other computers, where it may be sent to them as it is."""
+    as_it_says = ANTIALIASED[args.antialiased] is None and not isinstance(path, StandardInput)
+    return coded_for(workers, path, args.trust) if as_it_says else None
 
 
 def _tell(args: argparse.Namespace, report: dict[str, object], text: str) -> None:

@@ -55,7 +55,8 @@ class Progress:
     def _begin(self, stage: str, done: float) -> None:
         if self._on_terminal and not is_quiet():
             form = "{desc}: {percentage:3.0f}% |{bar}| {elapsed} elapsed, {remaining} left"
-            self._bar = tqdm(total=1.0, initial=done, desc=stage, bar_format=form, leave=False)
+            # What is done is a part of the time: the mean tells more about what is left than the last moments do.
+            self._bar = tqdm(total=1.0, initial=done, desc=stage, bar_format=form, leave=False, smoothing=0)
         elif stage not in self._began and stage not in self._told:
             note(f"{stage} …")
         if stage not in self._told:

@@ -12,17 +12,24 @@ from typing import TYPE_CHECKING, Any
 
 from potr_cl.api.inputs import drawable_to_judge
 from potr_cl.cli.guard import StandardInput, StandardOutput
-from potr_cl.errors import UsageError
+from potr_cl.cli.outputs import not_streamed
+from potr_cl.cli.terminal import note
+from potr_cl.errors import UsageError, WriteError
 from potr_cl.formats import load_scene, scene_writer
 from potr_cl.formats.scene_size import bytes_of_scene
 from potr_cl.formats.scenes import spz
 from potr_cl.formats.streams import received, send
+from potr_cl.host.rescue import written_or_kept
 from potr_cl.model.scene import Scene
 
 # What computes on a device is imported where it is needed: other commands do without.
 if TYPE_CHECKING:
     from potr_cl.opencl.device import Device
+    from potr_cl.outputs.coded_scene import CodedScene
     from potr_cl.raster.scene_buffers import Drawable
+
+#: Files of so many bytes are read for seconds.
+_LONG_TO_READ = 1 << 28
 
 FROM_HELP = 'the format that "-", standard input, brings: .ply, .spz …; default: what its content says'
 TO_HELP = "the format to write where no name says it, .ply, .spz …"
@@ -78,19 +85,28 @@ def read_scene(args: argparse.Namespace, path: Path) -> Scene:
         As :func:`potr_cl.formats.load_scene`.
     """
     with as_file(path) as file:
+        if (nbytes := bytes_of_scene(file) or 0) >= _LONG_TO_READ:
+            note(f"reading {path}, {nbytes / 1e9:.1f} GB …")
         return load_scene(file, **trust(args), antialiased=ANTIALIASED[args.antialiased])
 
 
 @contextlib.contextmanager
-def read_to_draw(args: argparse.Namespace, path: Path, device: Device) -> Iterator[tuple[Drawable, Scene]]:
+def read_to_draw(
+    args: argparse.Namespace, path: Path, device: Device, coded: CodedScene | None = None
+) -> Iterator[tuple[Drawable, Scene]]:
     """The same to be rendered on a device, and a scene on the host by which cameras can be judged.
+
+    Args:
+        args, path: as of :func:`read_scene`.
+        device: to render on.
+        coded: what the file holds, where it has been read.
 
     Raises:
         As :func:`potr_cl.api.inputs.drawable_to_judge`.
     """
     with (
         as_file(path) as file,
-        drawable_to_judge(file, device, args.trust, ANTIALIASED[args.antialiased]) as found,
+        drawable_to_judge(file, device, args.trust, ANTIALIASED[args.antialiased], coded) as found,
     ):
         yield found
 
@@ -115,6 +131,21 @@ def write_scene(path: Path, scene: Scene, to: str | None = None, version: int | 
         return send(path.stream, suffix, lambda file: scene_writer(file, version)(scene))
     scene_writer(path, version)(scene)
     return bytes_of_scene(path) or os.stat(path).st_size
+
+
+def write_result(path: Path, scene: Scene, to: str | None = None) -> None:
+    """As :func:`write_scene`, for what takes long to make: if it cannot go there, it is kept elsewhere.
+
+    Raises:
+        As :func:`potr_cl.host.rescue.written_or_kept`.
+    """
+    if not isinstance(path, StandardOutput):
+        written_or_kept(path, lambda where: scene_writer(where)(scene))
+        return
+    try:
+        write_scene(path, scene, to)
+    except (OSError, WriteError) as error:
+        raise not_streamed(error, to or ".ply", lambda where: scene_writer(where)(scene)) from error
 
 
 def size_of_file(path: Path) -> int | None:

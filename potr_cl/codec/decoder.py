@@ -30,6 +30,7 @@ from potr_cl.codec.steps.rule import ColourSteps
 from potr_cl.codec.versions import VERSIONS, FormatVersion
 from potr_cl.errors import DataError, UsageError
 from potr_cl.host.threads import Run
+from potr_cl.host.unchanged import State, refuse_changed, state_of, unchanged
 from potr_cl.model.box import Box
 from potr_cl.model.scene import Scene, most_coefficients
 
@@ -282,16 +283,17 @@ def open_file(source: bytes | str | os.PathLike[str], trust: bool = False) -> An
             start = file.read(FIXED_BYTES)
             if stat.S_ISREG(status.st_mode) and is_of_blocks(start):
                 start += file.read(max(min(header_bytes_of(start), status.st_size) - len(start), 0))
-                return _opened(start, status.st_size, trust, partial(_read, path))
+                return _opened(start, status.st_size, trust, partial(_read, path, state_of(file.fileno())))
             if start.startswith(container.MAGIC):
-                start += file.read()
+                with unchanged(path, file):
+                    start += file.read()
         return _opened(
             start, max(len(start), status.st_size), trust, lambda offset, nbytes: start[offset : offset + nbytes]
         )
     except (OSError, ValueError) as error:
         raise UsageError(f"cannot read '{path}': {getattr(error, 'strerror', None) or error}") from None
     except DataError as error:
-        raise DataError(f"'{path}': {error}") from None
+        raise error if f"'{path}'" in str(error) else DataError(f"'{path}': {error}") from None
 
 
 def _opened(start: bytes, file_bytes: int, trust: bool, read: Callable[[int, int], bytes]) -> AnyFile:
@@ -300,12 +302,19 @@ def _opened(start: bytes, file_bytes: int, trust: bool, read: Callable[[int, int
     return BlockedFile(read_table(start, file_bytes, trust), read, partial(PotrFile.from_bytes, trust=trust), trust)
 
 
-def _read(path: Path, offset: int, nbytes: int) -> bytes:
-    """Some bytes of a file, fewer where it has got shorter."""
+def _read(path: Path, state: State, offset: int, nbytes: int) -> bytes:
+    """Some bytes of a file that has been opened before, and was in this state then.
+
+    Raises:
+        UsageError: it cannot be read any more.
+        DataError: it was changed since, or another file is in its place.
+    """
     try:
         with path.open("rb") as file:
             file.seek(offset)
-            return file.read(nbytes)
+            found = file.read(nbytes)
+            refuse_changed(path, state, state_of(file.fileno()))
+            return found
     except OSError as error:
         raise UsageError(f"cannot read '{path}': {error.strerror or error}") from None
 

@@ -21,6 +21,7 @@ from potr_cl.codec.container import Header
 from potr_cl.codec.dequantizer import Dequantizer
 from potr_cl.codec.native.values import PackedValues, ValueArrays, packing_rooms
 from potr_cl.codec.versions import FormatVersion
+from potr_cl.host import mapped
 from potr_cl.model.scene import Scene
 
 F32 = NDArray[np.float32]
@@ -136,7 +137,7 @@ class SceneArrays(Fillable):
         self._log_scales = np.empty((n, 3), np.float32)
         self._quaternions = np.empty((n, 4), np.float32)
         self._opacity_logits = np.empty(n, np.float32)
-        self._planar = np.empty((sh_count, 3, n), np.float32)
+        self._planar = mapped.array((sh_count, 3, n), np.float32, "SH coefficients")
 
     @property
     def values(self) -> ValueArrays:

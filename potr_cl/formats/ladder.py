@@ -91,6 +91,10 @@ class Ladder:
             "rungs": [asdict(rung) for rung in self.rungs],
         }
 
+    def encoded(self) -> bytes:
+        """The content of the description's file."""
+        return (json.dumps(self.document(), indent=1, ensure_ascii=False) + "\n").encode()
+
     def save(self) -> None:
         """Write the description; it appears only when it is whole.
 
@@ -98,7 +102,7 @@ class Ladder:
             UsageError: it cannot be written there.
         """
         with replacing(self.path) as file:
-            file.write((json.dumps(self.document(), indent=1, ensure_ascii=False) + "\n").encode())
+            file.write(self.encoded())
 
 
 def ladder_at(path: str | os.PathLike[str]) -> Path | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import secrets
 import stat
@@ -10,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from potr_cl.errors import PotrError, UsageError
+from potr_cl.errors import UnwritableError, UsageError, WriteError
 from potr_cl.host.leftovers import removed_at_end
 
 
@@ -31,7 +32,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     Raises:
         UsageError: ``path`` is a directory or another thing that is no regular file, its folder does not exist
             or cannot be written to.
-        PotrError: the system failed to write (disk full, quota, I/O error).
+        WriteError: the system failed to write (disk full, quota, I/O error), or has no such folder any more.
     """
     target = Path(os.path.realpath(path))
     mode = _mode_of_existing(target, path)
@@ -41,9 +42,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         try:
             descriptor = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o666)
         except OSError as error:
-            if not target.parent.is_dir():
-                raise UsageError(f"cannot write '{path}': the folder '{target.parent}' does not exist") from error
-            raise UsageError(f"cannot write '{path}': {error.strerror}") from error
+            why = error.strerror if target.parent.is_dir() else _no_folder(target.parent)
+            raise UnwritableError(f"cannot write '{path}': {why}", os.fspath(path)) from error
         try:
             # Closing flushes: a full disk may show only then, so it has to happen before the renaming.
             with os.fdopen(descriptor, "w+b") as file:
@@ -52,7 +52,37 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
                 temporary.chmod(mode)
             temporary.replace(target)
         except OSError as error:
-            raise PotrError(f"cannot write '{path}': {error.strerror or error}") from error
+            if error.filename not in (None, os.fspath(temporary)):
+                raise  # about another file, which the block has to do with
+            why = error.strerror or str(error)
+            if not target.parent.is_dir():
+                why = f"the folder '{target.parent}' is gone"
+            raise WriteError(f"cannot write '{path}': {why}", os.fspath(path)) from error
+
+
+def check_place(path: str | os.PathLike[str]) -> None:
+    """Refuse a path that no file can be written to, before work for hours begins; nothing is made for the trial.
+
+    Raises:
+        UsageError: ``path`` is a directory or another thing that is no regular file, or no file can be made in its
+            folder.
+    """
+    target = Path(os.path.realpath(path))
+    _mode_of_existing(target, path)
+    if not target.parent.is_dir():
+        raise UnwritableError(f"cannot write '{path}': {_no_folder(target.parent)}", os.fspath(path))
+    if not os.access(target.parent, os.W_OK | os.X_OK, effective_ids=os.access in os.supports_effective_ids):
+        read_only = hasattr(os, "statvfs") and os.statvfs(target.parent).f_flag & os.ST_RDONLY
+        why = os.strerror(errno.EROFS if read_only else errno.EACCES)
+        raise UnwritableError(f"cannot write '{path}': {why}", os.fspath(path))
+
+
+def _no_folder(folder: Path) -> str:
+    """Why no file can be in what is no folder."""
+    if os.path.lexists(folder):
+        return f"'{folder}' is no folder"
+    home = "; '~' is not expanded here: write the home folder out" if "~" in folder.parts else ""
+    return f"the folder '{folder}' does not exist{home}"
 
 
 def _mode_of_existing(target: Path, path: str | os.PathLike[str]) -> int | None:
@@ -62,7 +92,7 @@ def _mode_of_existing(target: Path, path: str | os.PathLike[str]) -> int | None:
     except (FileNotFoundError, NotADirectoryError):
         return None  # a new file; if its folder is missing, opening the temporary file tells
     except OSError as error:
-        raise UsageError(f"cannot write '{path}': {error.strerror}") from error
+        raise UnwritableError(f"cannot write '{path}': {error.strerror}", os.fspath(path)) from error
     if stat.S_ISDIR(mode):
         raise UsageError(f"cannot write '{path}': it is a directory; give the name of a file")
     if not stat.S_ISREG(mode):

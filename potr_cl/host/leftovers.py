@@ -33,22 +33,22 @@ def temporary_folder() -> Iterator[str]:
     """A new folder of this user alone in the system's folder for temporary files, gone when the block ends.
 
     Raises:
-        UsageError: there is no such folder that can be written to.
+        UnwritableError: there is no such folder that can be written to.
     """
     import secrets
 
-    from potr_cl.errors import UsageError
+    from potr_cl.errors import UnwritableError
 
     advice = "make room there, or name another by the environment variable TMPDIR"
     try:
         name = os.path.join(place_for_temporary_files(), f"potr-cl-{secrets.token_hex(8)}")
     except OSError as error:
-        raise UsageError(f"there is no folder for temporary files that can be written to: {advice}") from error
+        raise UnwritableError(f"there is no folder for temporary files that can be written to: {advice}") from error
     with removed_at_end(name):
         try:
             os.mkdir(name, 0o700)
         except OSError as error:
-            raise UsageError(f"cannot make the temporary folder '{name}': {error.strerror}: {advice}") from error
+            raise UnwritableError(f"cannot make the temporary folder '{name}': {error.strerror}: {advice}") from error
         yield name
 
 

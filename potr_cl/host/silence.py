@@ -9,8 +9,14 @@ from __future__ import annotations
 
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TypeVar
+
+T = TypeVar("T")
+
+#: How often something is tried that warnings have ended (:func:`whatever_warns`).
+_TRIES = 10
 
 _lock = threading.Lock()
 _silences: list[warnings.catch_warnings[None]] = []
@@ -35,3 +41,26 @@ def without_warnings() -> Iterator[None]:
             _blocks -= 1
             if _blocks == 0:
                 _silences.pop().__exit__(None, None, None)
+
+
+def whatever_warns(work: Callable[[], T]) -> T:
+    """Call a function that libraries warn in, with no warning shown, even where Python makes errors of warnings.
+
+    A block alone is not enough for a thread: while it is at work, others may put filters in front of the silent ones,
+    or put back those that they had found before, and where these turn warnings into errors (``python -W error``) the
+    next warning ends the work. It is done again then, from the beginning.
+
+    Args:
+        work: may be called several times.
+
+    Raises:
+        Whatever ``work`` raises; warnings only if they have ended it many times.
+    """
+    for _ in range(_TRIES - 1):
+        try:
+            with without_warnings():
+                return work()
+        except Warning:
+            continue
+    with without_warnings():
+        return work()

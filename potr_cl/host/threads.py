@@ -17,6 +17,9 @@ T = TypeVar("T")
 #: Threads that work ahead, unless more are asked for.
 _MOST_AHEAD = 4
 
+#: What the names of threads begin with whose work nobody may be waiting for.
+BACKGROUND = "potr_cl background"
+
 #: Calls a function with each of some arguments and gives the results in their order, as :func:`map` does. No call needs
 #: another one's result.
 Run = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
@@ -35,7 +38,7 @@ def thread_pool(threads: int = 0) -> Iterator[ThreadPoolExecutor]:
 
 def in_background(work: Callable[..., T], *args: Any) -> Future[T]:
     """Call a function in a thread of its own; what it returns or raises is the future's."""
-    pool = ThreadPoolExecutor(1)
+    pool = ThreadPoolExecutor(1, thread_name_prefix=BACKGROUND)
     future = pool.submit(work, *args)
     pool.shutdown(wait=False)
     return future

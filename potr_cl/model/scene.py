@@ -183,6 +183,10 @@ class Scene:
 
         return potr_cl.preview(self)
 
+    def uncoloured(self) -> Scene:
+        """The same splats, all black, for those who do not look at colours: black takes no memory."""
+        return dataclasses.replace(self, sh=np.broadcast_to(np.float32(0), (len(self), 1, 3)))
+
     def subset(self, index: NDArray[np.generic]) -> Scene:
         """The splats that ``index`` (integers or a boolean mask) selects, in its order."""
         numbers = np.asarray(index)

@@ -7,7 +7,7 @@ import re
 
 import pyopencl as cl
 
-from potr_cl.host.silence import without_warnings
+from potr_cl.host.silence import whatever_warns
 
 _EMPTY_PROGRAM = "kernel void nothing(void) {}"
 #: What pyopencl puts before and after the compiler's own words.
@@ -35,9 +35,10 @@ def fault(device: cl.Device) -> str | None:
     Costs a few hundredths of a second, once a device and process.
     """
     try:
-        with without_warnings():
-            # Without pyopencl's cache: what a compiler could do once, before a driver or a CPU changed, proves nothing.
-            cl.Program(cl.Context([device]), _EMPTY_PROGRAM).build(["-cl-std=CL1.2"], cache_dir=False)
+        # Without pyopencl's cache: what a compiler could do once, before a driver or a CPU changed, proves nothing.
+        whatever_warns(
+            lambda: cl.Program(cl.Context([device]), _EMPTY_PROGRAM).build(["-cl-std=CL1.2"], cache_dir=False)
+        )
     except cl.Error as error:
         return complaint(error)
     return None

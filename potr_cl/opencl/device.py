@@ -15,6 +15,7 @@ import numpy as np
 import pyopencl as cl
 
 from potr_cl.errors import DeviceError, DeviceMemoryError
+from potr_cl.host.silence import whatever_warns
 from potr_cl.host.threads import in_background, thread_pool
 from potr_cl.opencl import compiler, program_cache, quirks
 from potr_cl.opencl.ahead import context_of
@@ -160,7 +161,7 @@ class Device:
         self._foresight = Foresight(Path(folder), repr(about))
 
         def load(program: Wanted) -> None:
-            with suppress(DeviceError, OSError):
+            with suppress(DeviceError, OSError, Warning):
                 self._built(program)
 
         def load_all(wanted: Sequence[Wanted]) -> None:
@@ -175,9 +176,13 @@ class Device:
             with building(wanted, alone=self.info.kind == "cpu"):
                 if wanted not in self._programs:
                     options = ["-cl-std=CL1.2", *self._build_options, *(f"-D{name}={value}" for name, value in macros)]
-                    with self.errors(f"failed to build {source}"):
+
+                    def build() -> cl.Program:
                         program = cl.Program(self.context, kernel_source(source, self._variants))
-                        self._programs[wanted] = program.build(options, cache_dir=program_cache.folder(repr(wanted)))
+                        return program.build(options, cache_dir=program_cache.folder(repr(wanted)))
+
+                    with self.errors(f"failed to build {source}"):
+                        self._programs[wanted] = whatever_warns(build)
         return self._programs[wanted]
 
     def kernel(self, source: str, name: str, **defines: str | int | float) -> Kernel:

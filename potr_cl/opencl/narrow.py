@@ -1,6 +1,6 @@
-"""64-bit integers on their way to another computer, with the bytes that they need: :class:`Narrowing`.
+"""64-bit integers on their way to another computer, with the bits that they need: :class:`Narrowing`.
 
-Sums in fixed point have room for what is never there: most need half of their bytes. Nothing is lost.
+Sums in fixed point have room for what is never there: most need less than half of their bits. Nothing is lost.
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner, Scratch, Staging
 
 _SOURCE = "opencl/narrow.cl"
-#: Values of a run (RUN of the kernels), and work-items of a work-group.
-_RUN, _GROUP = 64, 64
+#: Values of a run, and runs between two whose beginning is known (RUN and RUNS of the kernels); work-items of a
+#: work-group.
+_RUN, _RUNS, _GROUP = 16, 4, 64
 _WHAT = "integers on their way"
 
 
@@ -26,13 +27,16 @@ class Narrowed:
 
     Attributes:
         shape: of the array of int64 that they are.
-        widths: (runs,) uint8, the bytes of each value of a run of 64, 0 to 8.
-        data: uint8, run by run, value by value, the lowest byte first, in two's complement.
+        widths: (runs,) uint8, the bits of each value of a run of 16, 0 to 64.
+        data: (sum of the widths,) uint16, run by run: 16 values of so many bits, in two's complement, the first one in
+            the lowest bits of the first word.
+        turned: whether the integers of a table, (rows, n), come column by column.
     """
 
     shape: tuple[int, ...]
     widths: NDArray[np.uint8]
-    data: NDArray[np.uint8]
+    data: NDArray[np.uint16]
+    turned: bool = False
 
     @property
     def count(self) -> int:
@@ -45,19 +49,15 @@ class Narrowed:
         return self.widths.nbytes + self.data.nbytes
 
     def starts(self) -> NDArray[np.uint64]:
-        """(runs,) uint64, where the bytes of each run begin.
+        """(runs / 4, rounded up) uint64, where the words of every fourth run begin.
 
         Raises:
             ValueError: the parts do not fit each other.
         """
-        runs = -(-self.count // _RUN)
-        lengths = _RUN * self.widths.astype(np.uint64)
-        if len(self.widths) == runs and runs:
-            lengths[-1] = np.uint64(int(self.widths[-1]) * (self.count - _RUN * (runs - 1)))
-        ends = np.cumsum(lengths, dtype=np.uint64)
-        if len(self.widths) != runs or (runs and (self.widths.max() > 8 or int(ends[-1]) != len(self.data))):
-            raise ValueError(f"{len(self.data)} bytes in {len(self.widths)} runs are not {self.count} integers")
-        starts: NDArray[np.uint64] = ends - lengths
+        starts, words = _starts(self.widths)
+        fits = len(self.widths) == -(-self.count // _RUN) and words == len(self.data)
+        if not fits or (words and self.widths.max() > 64) or (self.turned and len(self.shape) != 2):
+            raise ValueError(f"{len(self.data)} words in {len(self.widths)} runs are not {self.count} integers")
         return starts
 
     def widened(self) -> NDArray[np.int64]:
@@ -66,17 +66,31 @@ class Narrowed:
         Raises:
             ValueError: the parts do not fit each other.
         """
-        starts, count = self.starts(), self.count
-        padded = np.concatenate([self.data, np.zeros(8 * _RUN, np.uint8)])
+        self.starts()  # they fit
+        ends = np.cumsum(self.widths, dtype=np.int64)
         values = np.zeros((len(self.widths), _RUN), np.uint64)
-        for width in range(1, 9):
+        for width in np.unique(self.widths[self.widths > 0]).tolist():
             own = np.flatnonzero(self.widths == width)
-            places = starts[own, None].astype(np.int64) + width * np.arange(_RUN)
-            for k in range(width):
-                values[own] |= padded[np.minimum(places + k, len(padded) - 1)].astype(np.uint64) << np.uint64(8 * k)
-            above = np.uint64(64 - 8 * width)
-            values[own] = ((values[own] << above).view(np.int64) >> above.astype(np.int64)).view(np.uint64)
-        return values.view(np.int64).ravel()[:count].reshape(self.shape)
+            words = np.zeros((len(own), width + 4), np.uint64)  # what a value begins in, and four more
+            words[:, :width] = self.data[(ends[own] - width)[:, None] + np.arange(width)]
+            for k in range(_RUN):
+                word, bit = divmod(k * width, 16)
+                value = words[:, word] >> np.uint64(bit)
+                for more in range(1, -(-(bit + width) // 16)):
+                    value |= words[:, word + more] << np.uint64(16 * more - bit)
+                above = np.uint64(64 - width)
+                values[own, k] = ((value << above).view(np.int64) >> above.astype(np.int64)).view(np.uint64)
+        row = values.view(np.int64).ravel()[: self.count]
+        return np.ascontiguousarray(row.reshape(self.shape[::-1]).T) if self.turned else row.reshape(self.shape)
+
+
+def _starts(widths: NDArray[np.uint8]) -> tuple[NDArray[np.uint64], int]:
+    """Where the words of every fourth run begin, and how many words there are."""
+    padded = np.zeros(-(-len(widths) // _RUNS) * _RUNS, np.uint8)
+    padded[: len(widths)] = widths
+    lengths = padded.reshape(-1, _RUNS).sum(axis=1, dtype=np.uint64)
+    ends = np.cumsum(lengths, dtype=np.uint64)
+    return ends - lengths, int(ends[-1]) if len(ends) else 0
 
 
 class Narrowing(Owner):
@@ -93,32 +107,35 @@ class Narrowing(Owner):
         self._device = device
         self._kernels = {name: device.shared_kernel(_SOURCE, name) for name in ("widths_of", "narrow", "widen")}
         self._widths, self._starts = Scratch(device, _WHAT), Scratch(device, _WHAT)
-        self._bytes = Scratch(device, _WHAT)
+        self._words, self._values = Scratch(device, _WHAT), Scratch(device, _WHAT)
         self._staging = Staging(device)
 
-    def download(self, values: cl.Buffer, shape: tuple[int, ...], start: int = 0) -> Narrowed:
+    def download(self, values: cl.Buffer, shape: tuple[int, ...], start: int = 0, turned: bool = False) -> Narrowed:
         """Integers of a buffer, once all is done that has been enqueued before; valid until the next call.
 
         Args:
             values: int64.
             shape: of the array that they are.
             start: number of the first of them.
+            turned: whether those of a column, which are about as long, go beside each other; of a table alone.
         """
         count = int(np.prod(shape, dtype=np.int64))
         if not count:
-            return Narrowed(shape, np.zeros(0, np.uint8), np.zeros(0, np.uint8))
+            return Narrowed(shape, np.zeros(0, np.uint8), np.zeros(0, np.uint16), turned)
         runs = -(-count // _RUN)
         self._widths.reserve(runs)
-        given = {"values": values, "start": start, "count": count, "widths": self._widths.buffer}
+        given = {
+            "values": values, "start": start, "count": count, "widths": self._widths.buffer,
+            **_lying(shape, turned),
+        }  # fmt: skip
         self._launch("widths_of", runs, **given)
         widths = self._device.download(self._widths.buffer, (runs,), np.uint8)
-        lengths = _RUN * widths.astype(np.uint64)
-        lengths[-1] = np.uint64(int(widths[-1]) * (count - _RUN * (runs - 1)))
-        ends = np.cumsum(lengths, dtype=np.uint64)
-        self._copy(self._starts, ends - lengths)
-        self._bytes.reserve(max(int(ends[-1]), 1))
-        self._launch("narrow", count, **given, starts=self._starts.buffer, bytes=self._bytes.buffer)
-        return Narrowed(shape, widths, self._staging.download(self._bytes.buffer, (int(ends[-1]),), np.uint8))
+        starts, words = _starts(widths)
+        self._copy(self._starts, starts)
+        self._words.reserve(max(2 * words, 1))
+        self._launch("narrow", runs, **given, starts=self._starts.buffer, words=self._words.buffer)
+        data = self._staging.download(self._words.buffer, (words,), np.uint16)
+        return Narrowed(shape, widths, data, turned)
 
     def upload(self, values: cl.Buffer, narrowed: Narrowed) -> None:
         """Enqueue that a buffer begins with these integers.
@@ -131,7 +148,7 @@ class Narrowing(Owner):
         starts = narrowed.starts()
         self._copy(self._widths, narrowed.widths)
         self._copy(self._starts, starts)
-        self._copy(self._bytes, narrowed.data)
+        self._copy(self._words, narrowed.data)
         self._launch(
             "widen",
             narrowed.count,
@@ -139,8 +156,24 @@ class Narrowing(Owner):
             count=narrowed.count,
             widths=self._widths.buffer,
             starts=self._starts.buffer,
-            bytes=self._bytes.buffer,
+            words=self._words.buffer,
+            **_lying(narrowed.shape, narrowed.turned),
         )
+
+    def narrowed(self, values: NDArray[np.int64]) -> Narrowed:
+        """Integers of the host; valid until the next call."""
+        self._copy(self._values, values)
+        return self.download(self._values.buffer, values.shape)
+
+    def widened(self, narrowed: Narrowed) -> NDArray[np.int64]:
+        """Integers for the host, many times as fast as :meth:`Narrowed.widened`.
+
+        Raises:
+            ValueError: their parts do not fit each other.
+        """
+        self._values.reserve(max(8 * narrowed.count, 1))
+        self.upload(self._values.buffer, narrowed)
+        return self._device.download(self._values.buffer, narrowed.shape, np.int64)
 
     def _copy(self, scratch: Scratch, array: NDArray[np.generic]) -> None:
         scratch.reserve(max(array.nbytes, 1))
@@ -155,6 +188,11 @@ class Narrowing(Owner):
 
     def close(self) -> None:
         """Give the device's memory back."""
-        for scratch in (self._widths, self._starts, self._bytes):
+        for scratch in (self._widths, self._starts, self._words, self._values):
             scratch.close()
         self._staging.close()
+
+
+def _lying(shape: tuple[int, ...], turned: bool) -> dict[str, int]:
+    """How integers of a table lie, for the kernels."""
+    return {"rows": shape[0], "stride": shape[1]} if turned else {"rows": 1, "stride": 0}

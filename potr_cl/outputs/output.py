@@ -23,6 +23,7 @@ from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.encoder import Coded
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.formats.declaration import SceneFormat
+from potr_cl.host.mapped import bounded
 from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
@@ -223,13 +224,21 @@ class Output(ABC):
             return self.format.load(path, trust)
 
     @contextmanager
-    def seen(self, data: bytes, device: Device, trust: bool = False) -> Iterator[Drawable]:
+    def seen(self, data: bytes, device: Device, trust: bool = False, memory: int | None = None) -> Iterator[Drawable]:
         """The same, to be rendered on a device as long as the context lasts; it may lie there already.
+
+        Args:
+            data: the file.
+            device: to render on.
+            trust: as of :meth:`read`.
+            memory: bytes that the user would have taken; None: as much as there is.
 
         Raises:
             DataError: nobody can read it.
         """
-        yield self.read(data, trust)
+        with bounded(memory):
+            scene = self.read(data, trust)
+        yield scene
 
     def properties(self, data: bytes) -> dict[str, int]:
         """Bytes of the file by what they are for, as far as the format tells them apart."""

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
 from potr_cl.codec.blocks.encoder import code_blocks
 from potr_cl.codec.blocks.file import BlockedFile
 from potr_cl.codec.blocks.geometry import AnyGeometry, GeometryOfBlocks, in_blocks, quantise
-from potr_cl.codec.decoder import decode, open_file, scene_of_file
+from potr_cl.codec.decoder import AnyFile, decode, open_file, scene_of_file
 from potr_cl.codec.encoder import Coded, code_scene
 from potr_cl.codec.geometry import Geometry
 from potr_cl.codec.quantize import HyperParameters
@@ -19,12 +19,14 @@ from potr_cl.codec.versions import VERSIONS
 from potr_cl.errors import DeviceError
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes.potr import FORMAT
+from potr_cl.host.mapped import bounded
 from potr_cl.host.threads import thread_pool
-from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
 from potr_cl.ondevice.decode import decode_to_device
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.outputs.output import Output, Request, Rounded
+from potr_cl.raster.kept_scene import large_for
 from potr_cl.raster.scene_buffers import Drawable
 
 _NAMES = {
@@ -89,14 +91,22 @@ class Potr(Output):
         return decode(data, trust)
 
     @contextmanager
-    def seen(self, data: bytes, device: Device, trust: bool = False) -> Iterator[Drawable]:
-        """See :func:`potr_cl.ondevice.decode.decode_to_device`; an ordinary scene where it does not fit the device."""
+    def seen(self, data: bytes, device: Device, trust: bool = False, memory: int | None = None) -> Iterator[Drawable]:
+        """See :func:`potr_cl.ondevice.decode.decode_to_device`.
+
+        An ordinary scene where it does not fit the device; or where this is a CPU and has little memory: views are
+        drawn from what they show of it then.
+        """
         file = open_file(data, trust)
         with ExitStack() as stack:
-            try:
-                scene: Drawable = stack.enter_context(decode_to_device(file, device))
-            except DeviceError:
-                scene = scene_of_file(file)
+            scene: Drawable | None = None
+            of_host = device.info.kind == "cpu" or device.info.integrated
+            if memory is None or not (of_host and large_for(device, _decoded_bytes(file), memory)):
+                with suppress(DeviceError):
+                    scene = stack.enter_context(decode_to_device(file, device))
+            if scene is None:
+                with bounded(memory):
+                    scene = scene_of_file(file)
             yield scene
 
     def properties(self, data: bytes) -> dict[str, int]:
@@ -113,3 +123,9 @@ class Potr(Output):
             sums[name] += section.stored_bytes
         sums["other"] += len(data) - sum(sums.values())
         return {name: nbytes for name, nbytes in sums.items() if nbytes}
+
+
+def _decoded_bytes(file: AnyFile) -> int:
+    """Of the scene that a file holds."""
+    of = file.table if isinstance(file, BlockedFile) else file.header
+    return 4 * of.splats * (11 + 3 * SH_COEFFICIENTS[of.sh_degree])

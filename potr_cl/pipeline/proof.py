@@ -43,9 +43,11 @@ def proved(encoded: Encoded, trust: bool = False, device: Device | None = None) 
     data, output = encoded.data, encoded.options.output
     with ExitStack() as stack:
         try:
-            scene = (
-                output.read(data, trust) if device is None else stack.enter_context(output.seen(data, device, trust))
-            )
+            scene: Drawable
+            if device is None:
+                scene = output.read(data, trust)
+            else:
+                scene = stack.enter_context(output.seen(data, device, trust, encoded.options.memory))
         except DataError as error:
             raise PotrError(
                 f"the encoded file cannot be decoded ({error}): nothing was written. If the scene has splats that are "

@@ -1,14 +1,14 @@
-"""Judge a compressed scene: render it and the uncompressed one from the same views and compare the pictures.
+"""What is told of a comparison of two scenes (:class:`Comparison`), for programs and for people; and its photographs.
 
 A is the reference scene (uncompressed), B the candidate. With photographs, both are also judged against those.
+:mod:`potr_cl.quality.shared_judging` finds the figures.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +20,7 @@ from potr_cl.formats.cameras.view_files import IMAGE_SUFFIXES, stem
 from potr_cl.formats.images import image_size, to_8_bits
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
-from potr_cl.quality.figures import Against, Figures, ViewFigures
-from potr_cl.quality.metrics import Lpips
-from potr_cl.quality.pictures import Renderer, rendered
+from potr_cl.quality.figures import Figures, ViewFigures
 
 _TITLES = {
     "b_against_a": "B against A",
@@ -126,39 +124,6 @@ def _images_by_name(folder: Path) -> dict[str, list[Path]]:
         if file.suffix.lower() in IMAGE_SUFFIXES:
             images.setdefault(stem(file.name), []).append(file)
     return images
-
-
-def compare(
-    a: Renderer,
-    b: Renderer,
-    cameras: Sequence[Camera],
-    ground_truth: Mapping[str, Path] | None = None,
-    lpips: Lpips | None = None,
-    progress: Callable[[str, float], None] = lambda _stage, _done: None,
-) -> Comparison:
-    """Render every view of both scenes and compare.
-
-    Args:
-        a, b: the reference scene and the candidate, on one device, with the same rules and background.
-        cameras: at least one.
-        ground_truth: photographs by view name, see :func:`find_ground_truth`; cameras with a lens must then look within
-            them (:func:`potr_cl.model.camera.within_photographs`).
-        lpips: the metric, where it is installed.
-        progress: called with the stage and the part of it that is done.
-
-    Raises:
-        UsageError: no camera, or a photograph cannot be opened.
-        DataError: a photograph is damaged.
-        DeviceError: a view does not fit the device.
-    """
-    stage = comparing(len(cameras))
-    views: list[ViewFigures] = []
-    progress(stage, 0.0)
-    against = Against(a.device, a.background, ground_truth, lpips)
-    for view in against.figures(partial(rendered, a), partial(rendered, b), cameras):
-        views.append(view)
-        progress(stage, len(views) / len(cameras))
-    return comparison_of(views)
 
 
 def comparing(views: int) -> str:

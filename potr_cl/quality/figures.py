@@ -35,7 +35,9 @@ class Against:
     Args:
         device: that they lie on.
         background: behind photographs with alpha.
-        ground_truth, lpips: as of :func:`potr_cl.quality.compare.compare`.
+        ground_truth: photographs by view name, see :func:`potr_cl.quality.compare.find_ground_truth`; cameras with a
+            lens must then look within them (:func:`potr_cl.model.camera.within_photographs`).
+        lpips: the metric, where it is installed.
     """
 
     def __init__(
@@ -57,7 +59,9 @@ class Against:
             cameras: the views.
 
         Raises:
-            UsageError, DataError, DeviceError: as of :func:`potr_cl.quality.compare.compare`.
+            UsageError: a photograph cannot be opened.
+            DataError: a photograph is damaged.
+            DeviceError: a view does not fit the device.
         """
         truth = self._ground_truth
         photographs = [] if truth is None else [(truth[camera.name], camera) for camera in cameras]

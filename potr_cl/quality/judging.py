@@ -43,7 +43,7 @@ class Looks:
     Attributes:
         background: behind all scenes.
         rules: of the rasterizer.
-        ground_truth, lpips: as of :func:`potr_cl.quality.compare.compare`.
+        ground_truth, lpips: as of :class:`potr_cl.quality.figures.Against`.
         remember: whether the uncompressed scene's pictures are kept for the next candidate.
     """
 
@@ -71,19 +71,23 @@ class Judging(Owner):
         self._device, self._scene, self._looks, self._groups = device, reference, looks, groups
         self._against = Against(device, looks.background, looks.ground_truth, looks.lpips)
         self._reference: Rasterizer | SeenRasterizer | None = None
-        self._candidate: Rasterizer | None = None
+        self._candidate: Rasterizer | SeenRasterizer | None = None
         self._pictures: dict[_Seen, Picture] = {}
         self._kept = ExitStack()
         self._room = min(CACHED_PICTURES, device.info.memory // 16) if looks.remember else 0
 
-    def take(self, candidate: Drawable) -> None:
+    def take(self, candidate: Drawable, groups: SplatGroups | None = None) -> None:
         """Judge a candidate from now on, until :meth:`forget`.
+
+        Args:
+            candidate: to judge.
+            groups: of its splats, where it is better drawn by what views see of it.
 
         Raises:
             DeviceError: it does not fit the device.
         """
         self.forget()
-        self._candidate = Rasterizer(self._device, candidate, self._looks.rules, self._looks.background)
+        self._candidate = rasterizer_of(self._device, candidate, self._looks.rules, self._looks.background, groups)
 
     def forget(self) -> None:
         """Give the candidate's memory back, and the reference's where its pictures may be all that is needed of it."""
@@ -97,7 +101,7 @@ class Judging(Owner):
         """The figures of some views, in their order.
 
         Raises:
-            As :func:`potr_cl.quality.compare.compare`.
+            As :meth:`potr_cl.quality.figures.Against.figures`.
         """
         yield from self._against.figures(self._references, partial(rendered, self._taken), cameras)
 
@@ -118,7 +122,7 @@ class Judging(Owner):
         return self._original.render(camera)[0], self._taken.render(camera)[0]
 
     @property
-    def _taken(self) -> Rasterizer:
+    def _taken(self) -> Rasterizer | SeenRasterizer:
         assert self._candidate is not None, "there is no candidate"
         return self._candidate
 

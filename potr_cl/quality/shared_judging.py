@@ -118,8 +118,18 @@ class SharedJudging(Owner):
             return [self._own.pictures(camera) for camera in cameras]
 
     def _take(self, stack: ExitStack, candidate: Drawable) -> None:
-        self._own.take(candidate)
+        self._own.take(candidate, self._groups_of(candidate))
         stack.callback(self._own.forget)
+
+    def _groups_of(self, candidate: Drawable) -> SplatGroups | None:
+        """Those of a candidate that is too large for what a user allows, where views see little of it."""
+        reference = self._reference
+        if not isinstance(candidate, Scene) or not isinstance(reference, KeptScene) or self._groups is None:
+            return None
+        info = self._device.info
+        if not (info.kind == "cpu" or info.integrated) or not reference.is_large_for(self._device, candidate):
+            return None
+        return groups_worth_it(self._device, candidate, self._views, self._looks.rules.near, large=True)
 
     def _of_views(
         self,

@@ -164,17 +164,30 @@ def work(parts: Sequence[ViewPart]) -> int:
 
 
 def part_seen(scene: Scene, cameras: Sequence[Camera], near: float) -> float:
-    """Which part of a scene a view may draw on the average, told from few of both.
+    """Which part of a scene a view may draw on the average, told from few of both; 1 where there is no view.
 
     The boxes of few splats are smaller, so views seem to see a little less than they do.
 
     Args:
         scene: clean, at least one splat.
-        cameras: the views, at least one.
+        cameras: the views.
         near: as in the rasterizer's rules.
     """
-    black = replace(scene, sh=np.broadcast_to(np.float32(0), (len(scene), 1, 3)))  # colours are not looked at
-    few = black.subset(np.arange(0, len(scene), _SAMPLED))
-    groups = SplatGroups.of(few, max(splat_groups.LARGEST // _SAMPLED, 1))
+    if not cameras:
+        return 1.0
     some = [cameras[number] for number in range(0, len(cameras), -(-len(cameras) // _VIEWS))]
-    return float((groups.visible_by(some, near) @ groups.counts).mean() / len(few))
+    seen, splats = _seen_of_few(scene, some, near)
+    return float(seen.mean() / splats)
+
+
+def parts_seen(scene: Scene, cameras: Sequence[Camera], near: float) -> NDArray[np.float64]:
+    """(views,) which part of a scene each view may draw, told from few splats; arguments as of :func:`part_seen`."""
+    seen, splats = _seen_of_few(scene, cameras, near)
+    return seen / splats
+
+
+def _seen_of_few(scene: Scene, cameras: Sequence[Camera], near: float) -> tuple[NDArray[np.int64], int]:
+    """(views,) how many of few splats each view may draw, and how many these are."""
+    few = scene.uncoloured().subset(np.arange(0, len(scene), _SAMPLED))
+    groups = SplatGroups.of(few, max(splat_groups.LARGEST // _SAMPLED, 1))
+    return groups.visible_by(cameras, near) @ groups.counts, len(few)

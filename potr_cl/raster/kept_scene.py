@@ -55,21 +55,15 @@ class KeptScene(Owner):
             self.bring_to(other)
 
     def _placed(self, device: Device) -> SceneBuffers | None:
-        if _PART * self._scene.nbytes <= self._allowed(device):
+        if _PART * self._scene.nbytes <= _allowed(device, self._memory):
             with suppress(DeviceMemoryError):
                 # To make a scene ready on the host takes many times as long as to copy it from device to device.
                 return uploaded(device, self._scene) if self._buffers is None else copied(device, self._buffers)
         return None
 
-    def _allowed(self, device: Device) -> int:
-        """Bytes of a device's memory that there are, or that the user would have taken."""
-        if self._memory is not None and (device.info.kind == "cpu" or device.info.integrated):
-            return min(device.info.memory, self._memory)
-        return device.info.memory
-
-    def is_large_for(self, device: Device) -> bool:
-        """Whether the scene had better not lie whole on a device even for a while."""
-        return _AWHILE * self._scene.nbytes > self._allowed(device)
+    def is_large_for(self, device: Device, scene: Scene | None = None) -> bool:
+        """Whether the scene, or another one, had better not lie whole on a device even for a while."""
+        return large_for(device, (self._scene if scene is None else scene).nbytes, self._memory)
 
     @property
     def scene(self) -> Scene:
@@ -112,6 +106,24 @@ class KeptScene(Owner):
             if buffers is not None:
                 buffers.close()
         self._buffers, self._elsewhere = None, {}
+
+
+def large_for(device: Device, nbytes: int, memory: int | None) -> bool:
+    """Whether a scene had better not lie whole on a device even for a while.
+
+    Args:
+        device: to render on.
+        nbytes: of the scene.
+        memory: bytes that the user would have taken; None: as much as there is.
+    """
+    return _AWHILE * nbytes > _allowed(device, memory)
+
+
+def _allowed(device: Device, memory: int | None) -> int:
+    """Bytes of a device's memory that there are, or that the user would have taken where it is the host's."""
+    if memory is not None and (device.info.kind == "cpu" or device.info.integrated):
+        return min(device.info.memory, memory)
+    return device.info.memory
 
 
 @dataclass(frozen=True)

@@ -190,6 +190,8 @@ class SeenRasterizer(Owner):
                     start += 12 * camera.width * camera.height
             with self.device.errors("failed while rendering"):
                 self.device.queue.finish()
+        if self.device.info.kind == "cpu":
+            self._preparing.rest()  # another scene may be drawn next, where there is little memory
 
     def render(self, camera: Camera) -> tuple[FloatArray, FloatArray]:
         """See :meth:`potr_cl.raster.rasterizer.Rasterizer.render`."""

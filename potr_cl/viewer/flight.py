@@ -13,6 +13,8 @@ from potr_cl.viewer.pose import F64, Gaze
 #: Seconds of a flight, and of the photograph's coming, staying and going.
 FLIGHT, FADE, STAY = 0.6, 0.7, 1.2
 _STEP = 0.04
+#: Seconds that the browser has to say where its camera has landed, and of silence after which it rests.
+LANDING, _REST = 3.0, 0.25
 
 
 def fly(camera: Any, goal: Gaze, goes_on: Callable[[], bool]) -> None:
@@ -37,6 +39,36 @@ def fly(camera: Any, goal: Gaze, goes_on: Callable[[], bool]) -> None:
         if part == 1:
             return
         time.sleep(_STEP)
+
+
+def land(camera: Any, goal: Gaze, told: Callable[[], tuple[Gaze, float] | None], goes_on: Callable[[], bool]) -> bool:
+    """Wait after a flight until the browser's camera rests at the goal.
+
+    viser turns a rotation into a point to look at by where it thinks that the camera stands. What a browser tells of an
+    earlier step may reach it between two parts of the last one, and the camera would look past the goal for good: one
+    that rests in the right place and looks elsewhere is set once more.
+
+    Args:
+        camera: viser's handle of it.
+        goal: of the flight.
+        told: what the browser has told last, and when, by the monotonic clock; None before it has.
+        goes_on: asked all the time; whoever moves the camera meanwhile is left in peace.
+
+    Returns:
+        Whether it has arrived.
+    """
+    began = time.monotonic()
+    put_at = began
+    while goes_on() and (now := time.monotonic()) - began < LANDING:
+        last = told()
+        if last is not None and now - max(last[1], put_at) > _REST:
+            if last[0].is_near(goal):
+                return True
+            if last[0].stands_with(goal):
+                put(camera, goal.position, goal.rotation, goal.fov)
+                put_at = now
+        time.sleep(_STEP / 2)
+    return False
 
 
 def put(camera: Any, position: F64, rotation: F64, fov: float) -> None:

@@ -30,12 +30,16 @@ class Gaze:
 
     def is_near(self, other: Gaze) -> bool:
         """Whether both show the same, but for what is lost on the way through the browser, which counts in float32."""
-        far = float(np.linalg.norm(self.position)) + 1.0
         return (
-            float(np.abs(self.position - other.position).max()) < 1e-4 * far
+            self.stands_with(other)
             and float(np.abs(self.rotation - other.rotation).max()) < 2e-3
             and abs(self.fov - other.fov) < 2e-3
         )
+
+    def stands_with(self, other: Gaze) -> bool:
+        """Whether both stand in the same place, wherever they look."""
+        far = float(np.linalg.norm(self.position)) + 1.0
+        return float(np.abs(self.position - other.position).max()) < 1e-4 * far
 
 
 def camera_of(gaze: Gaze, width: int, height: int) -> Camera:

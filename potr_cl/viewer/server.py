@@ -164,6 +164,7 @@ class Viewer:
         tab = TabHandle(client, self, self._cameras)
         with self._lock:
             self._tabs[client.client_id] = tab
+        tab.show_key()  # now it can be found
         self.painter.enter(tab.visitor)
         if client.client_id not in self._server.get_clients():  # it left while its panel was being made
             self._leave(client)

@@ -13,7 +13,7 @@ import numpy as np
 
 from potr_cl.model.camera import Camera, camera_centres
 from potr_cl.viewer.comparison import FACTORS, MODES
-from potr_cl.viewer.flight import fade, fly, put
+from potr_cl.viewer.flight import fade, fly, land, put
 from potr_cl.viewer.frusta import add_frusta
 from potr_cl.viewer.losses import Losses
 from potr_cl.viewer.painter import Painter, decibels
@@ -65,6 +65,8 @@ class TabHandle:
         self._lock = threading.Lock()
         self._here = True
         self._goal: int | None = None
+        #: What the browser has said of its camera last, and when.
+        self._told: tuple[Gaze, float] | None = None
         self._said = ""
         self.visitor = Visitor(client.client_id, self._show, self._tell)
         self._add_panel()
@@ -78,11 +80,10 @@ class TabHandle:
             camera = client.camera
             gaze = gaze_on(house.losses.views[0], camera.image_width / max(camera.image_height, 1))
             put(camera, gaze.position, gaze.rotation, gaze.fov)
+            threading.Thread(target=self._land, args=(gaze, 0), name="potr_cl landing", daemon=True).start()
 
     def _add_panel(self) -> None:
         gui = self._client.gui
-        # The key is in the page alone: only a page that viser serves can find its tab.
-        gui.add_html(f'<div data-potr-key="{escape(self.key)}" hidden></div>', order=-2)
         gui.add_html(_box("error"), order=-1)
         self._mode = gui.add_dropdown(
             "show",
@@ -105,6 +106,13 @@ class TabHandle:
         )
         self._shows_frusta.on_update(lambda _: self._arrange())
         gui.add_html(_box("views"), order=8)
+
+    def show_key(self) -> None:
+        """Give the page the key by which it finds this tab; it asks for it at once, and once only.
+
+        The key is in the page alone: only a page that viser serves can find its tab.
+        """
+        self._client.gui.add_html(f'<div data-potr-key="{escape(self.key)}" hidden></div>', order=-2)
 
     # ------------------------------------------------------------------------------- what the user does
 
@@ -149,7 +157,7 @@ class TabHandle:
         with self._lock:
             self._flights += 1
             number = self._flights
-        self._goal = None
+            self._goal = None
         threading.Thread(target=self._fly, args=(view, number), name="potr_cl flight", daemon=True).start()
 
     def leave(self) -> None:
@@ -232,46 +240,63 @@ class TabHandle:
 
     def _look(self, camera: Any) -> None:
         gaze = Gaze(np.array(camera.position, np.float64), rotation_of(np.array(camera.wxyz)), float(camera.fov))
-        visitor = self.visitor
         size = int(camera.image_width), int(camera.image_height)
         if min(size) < 1 or not all(np.isfinite(part).all() for part in (gaze.position, gaze.rotation, gaze.fov)):
             return
-        if visitor.gaze is not None and size == (visitor.width, visitor.height) and gaze.is_near(visitor.gaze):
-            if not np.array_equal(gaze.position, visitor.gaze.position):
-                visitor.gaze = gaze
-            return
-        visitor.width, visitor.height = size
-        visitor.gaze, visitor.moved, visitor.is_still = gaze, time.monotonic(), False
-        if visitor.view is not None and not self._is_at(visitor.view):
-            visitor.view, visitor.fade = None, 0.0
-            self.restate(everything=False)
-        elif self._goal is not None and self._is_at(self._goal):
-            visitor.view, self._goal = self._goal, None
-            self.restate(everything=False)
-        self._house.painter.wake(visitor, look=True)
+        visitor, now = self.visitor, time.monotonic()
+        # By what is shown, and not by what was told last: else small steps would lead away unseen.
+        moves = visitor.gaze is None or size != (visitor.width, visitor.height) or not gaze.is_near(visitor.gaze)
+        if moves:
+            visitor.width, visitor.height = size
+            visitor.gaze, visitor.moved, visitor.is_still = gaze, now, False
+        self._told = gaze, now
+        self._notice()
+        if moves:
+            self._house.painter.wake(visitor, look=True)
 
-    def _is_at(self, view: int) -> bool:
-        visitor = self.visitor
-        if visitor.gaze is None:
-            return False
-        return visitor.gaze.is_near(gaze_on(self._house.losses.views[view], visitor.width / visitor.height))
+    def _notice(self) -> None:
+        """See whether the camera is at the view that it was to fly to.
+
+        The goal stays one after it is reached: in the last step of a flight viser for a moment takes its own word for
+        the browser's, which then tells of the step before.
+        """
+        with self._lock:
+            told, goal, visitor = self._told, self._goal, self.visitor
+            view = goal if told is not None and goal is not None and self._is_at(goal, told[0]) else None
+            if view == visitor.view:
+                return
+            visitor.view = view
+            if view is None:
+                visitor.fade = 0.0
+        self.restate(everything=False)
+
+    def _is_at(self, view: int, gaze: Gaze) -> bool:
+        return gaze.is_near(gaze_on(self._house.losses.views[view], self.visitor.width / self.visitor.height))
 
     def _fly(self, view: int, number: int) -> None:
-        def goes_on() -> bool:
-            return self._here and self._flights == number
-
         visitor = self.visitor
         if visitor.gaze is None:
             return
-        self._goal = view
-        fly(self._client.camera, gaze_on(self._house.losses.views[view], visitor.width / visitor.height), goes_on)
-        landed = time.monotonic()
-        while goes_on() and visitor.view != view and time.monotonic() - landed < 3:
-            time.sleep(0.02)
-        if visitor.view != view or not goes_on():
+        with self._lock:
+            if not self._goes_on(number):
+                return
+            self._goal = view
+        self._notice()  # it may be there already, and the browser has nothing to tell
+        goal = gaze_on(self._house.losses.views[view], visitor.width / visitor.height)
+        fly(self._client.camera, goal, lambda: self._goes_on(number))
+        if not self._land(goal, number) or visitor.view != view:
             return
         if self._house.losses.has_photograph(view):
-            fade(lambda part: self._fade_to(part, on_slider=True), lambda: goes_on() and visitor.view == view)
+            fade(
+                lambda part: self._fade_to(part, on_slider=True),
+                lambda: self._goes_on(number) and visitor.view == view,
+            )
+
+    def _land(self, goal: Gaze, number: int) -> bool:
+        return land(self._client.camera, goal, lambda: self._told, lambda: self._goes_on(number))
+
+    def _goes_on(self, number: int) -> bool:
+        return self._here and self._flights == number
 
     def _fade(self, event: Any) -> None:
         if event.client is not None:  # the user, and not the program, has moved the slider

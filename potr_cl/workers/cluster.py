@@ -17,16 +17,17 @@ from contextlib import ExitStack, contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 from potr_cl.errors import DeviceError, PotrError, UsageError
-from potr_cl.host.installation import install_command
 from potr_cl.opencl.device import Device
+from potr_cl.workers.client import client_of, first_line
+from potr_cl.workers.pauses import Pauses
 from potr_cl.workers.pool import Held, Part, Pool, Shared, Traffic, Worker, WorkerLost
 from potr_cl.workers.seat import Known, Seat
 
 if TYPE_CHECKING:
     from dask.distributed import Client
 
-#: Seconds to wait for a scheduler, for the first worker to come, and for a worker to say which device it has.
-_CONNECT, _COME, _HELLO = 5.0, 60.0, 120.0
+#: Seconds to wait for the first worker to come, and for a worker to say which device it has.
+_COME, _HELLO = 60.0, 120.0
 #: Seconds between two looks at whether a worker that has not answered yet is alive, and at whether to go on waiting.
 _ALIVE, _POLL = 3.0, 0.1
 #: The second of them grows by this factor from look to look, up to so much: each look wakes the client's event loop.
@@ -65,7 +66,7 @@ class ClusterPool(Pool):
         self._refused: set[str] = set()
         self._meeting = threading.Lock()
         self._owned = ExitStack()
-        self.client, is_own = _client_of(cluster)
+        self.client, is_own = client_of(cluster)
         if is_own:
             self._owned.callback(self._leave_cluster)
         try:
@@ -122,7 +123,7 @@ class ClusterPool(Pool):
             return set(self.client.nthreads())
         except Exception as error:
             raise WorkerLost(
-                f"the cluster's scheduler does not answer any more ({_first_line(error)}): start it and its workers, "
+                f"the cluster's scheduler does not answer any more ({first_line(error)}): start it and its workers, "
                 "and encode again"
             ) from None
 
@@ -157,8 +158,8 @@ class ClusterPool(Pool):
             raise DeviceError(f"worker {address} ran out of memory") from None
         except Exception as error:
             if self._closing.is_set() or address not in self._alive() or _is_of_transport(error):
-                raise WorkerLost(f"{address} is gone ({_first_line(error)})") from None
-            raise _Failed(address, _first_line(error)) from error
+                raise WorkerLost(f"{address} is gone ({first_line(error)})") from None
+            raise _Failed(address, first_line(error)) from error
 
     def _answered(self, answer: Any, seconds: float) -> bool:
         """Whether an answer is there, after waiting a little for it."""
@@ -213,21 +214,29 @@ class ClusterPool(Pool):
 
     def _meet_others(self) -> None:
         """Meet those that come, until the cluster is left."""
+        pauses = Pauses(_NEW)
         while not self._closing.wait(_NEW):
             with suppress(WorkerLost):  # whoever waits for an answer says so
-                known = {worker.name for worker in self._workers}
-                for worker in self._invited(self._alive() - known - self._refused):
+                known, now = {worker.name for worker in self._workers}, time.monotonic()
+                come = self._alive() - known - self._refused
+                lost: dict[str, WorkerLost] = {}
+                for worker in self._invited({each for each in come if pauses.may_ask(_host(each), now)}):
                     try:
                         worker.meet()
                     except UsageError as error:
                         self._refused.add(worker.name)
                         worker.leave()
                         _log.warning("%s; it does no views", error)
-                    except WorkerLost:
+                    except WorkerLost as gone:
                         worker.leave()
+                        lost.setdefault(worker.host, gone)
                     else:
+                        pauses.note_met(worker.host)
                         _log.warning("worker %s has come: it gets views from the next stage on", worker.name)
                         self._take_in([worker])
+                for host, said in lost.items():
+                    if pauses.note_lost(host, time.monotonic()) and not self._closing.is_set():
+                        _log.warning("%s; it is asked again later", said)
 
     def _invited(self, addresses: set[str]) -> list[_ClusterWorker]:
         """Workers that have begun to say which device they take: those of one computer take its devices in turn."""
@@ -347,7 +356,7 @@ class _ClusterWorker(Worker):
             # Two: the uncompressed scene, and what is worked on now.
             kept = self._known[-1:]
             self.ask("keep", number, thing, [each for each, _ in kept])
-            self._pool.traffic.add(sent=getattr(thing, "nbytes", 0))
+            self._pool.traffic.add(sent=getattr(thing, "nbytes", 0), what=type(thing).__name__)
         else:
             kept = [each for each in self._known if each[1] is not thing]
         self._known = [*kept, (number, thing)]
@@ -404,33 +413,6 @@ def _check(address: str, version: str, name: str, family: str, first: Device) ->
         )
 
 
-def _client_of(cluster: str | Client) -> tuple[Client, bool]:
-    """A client, and whether it was made here."""
-    try:
-        from dask.distributed import Client
-    except ImportError:
-        raise UsageError(f"a cluster needs Dask: {install_command('cluster')}") from None
-    if isinstance(cluster, Client):
-        return cluster, False
-    if not isinstance(cluster, str):
-        raise UsageError(
-            f"a cluster is the address of a Dask scheduler, or a dask.distributed.Client, not {type(cluster).__name__}"
-        )
-    if not cluster.strip():
-        raise UsageError("--cluster is empty: give the address of a Dask scheduler, such as tcp://10.0.0.1:8786")
-    # What it has to say is said here, in one line. Some of its modules' loggers have levels of their own.
-    for name in ["distributed", *(name for name in logging.root.manager.loggerDict if name.startswith("distributed."))]:
-        logging.getLogger(name).setLevel(logging.CRITICAL)
-    try:
-        return Client(cluster, timeout=_CONNECT, set_as_default=False, direct_to_workers=True), True
-    except Exception as error:
-        # Of another program's answer it takes the first bytes for a size.
-        said = "something else does" if isinstance(error, MemoryError) else _first_line(error)
-        raise UsageError(
-            f"no Dask scheduler answers at '{cluster}' ({said}): give its address, such as tcp://10.0.0.1:8786"
-        ) from None
-
-
 def _is_of_transport(error: Exception) -> bool:
     return isinstance(error, (OSError, EOFError)) or "lost" in str(error).lower() or "cancel" in repr(error).lower()
 
@@ -442,9 +424,4 @@ def _as_worker_lost(who: str) -> Iterator[None]:
     except PotrError:
         raise
     except Exception as error:
-        raise WorkerLost(f"{who} does not answer ({_first_line(error)})") from None
-
-
-def _first_line(error: BaseException) -> str:
-    said = str(error).strip().partition("\n")[0][:200]
-    return said or type(error).__name__
+        raise WorkerLost(f"{who} does not answer ({first_line(error)})") from None

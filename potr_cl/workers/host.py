@@ -5,6 +5,7 @@ Drivers leave the interpreter free while they compute, copy or build, so threads
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
@@ -80,7 +81,8 @@ class _Thread(Worker):
             # A failure may leave buffers behind that nobody owns any more.
             with self._device.all_or_nothing(), self._device.errors("failed while encoding"):
                 things = [each.of(each.handle) if isinstance(each, Shared) else each for each in given]
-                return _HeldHere(self._thread, self._device, kind(self._device, memory, *things))
+                part = kind(self._device, memory, *things)
+                return _HeldHere(self._thread, threading.get_ident(), self._device, part)
 
         return self._thread.submit(made)
 
@@ -91,8 +93,8 @@ class _Thread(Worker):
 class _HeldHere(Held):
     """A part in this process."""
 
-    def __init__(self, thread: ThreadPoolExecutor, device: Device, part: Part) -> None:
-        self._thread, self._device, self._part = thread, device, part
+    def __init__(self, thread: ThreadPoolExecutor, ident: int, device: Device, part: Part) -> None:
+        self._thread, self._ident, self._device, self._part = thread, ident, device, part
 
     def begin(self, command: str, args: Sequence[Any]) -> Future[Any]:
         def done() -> Any:
@@ -102,4 +104,7 @@ class _HeldHere(Held):
         return self._thread.submit(done)
 
     def close(self) -> None:
-        self._thread.submit(self._part.close).result()
+        if threading.get_ident() == self._ident:  # it has just been made there, and nobody wants it any more
+            self._part.close()
+        else:
+            self._thread.submit(self._part.close).result()

@@ -127,7 +127,7 @@ class Parts(Owner):
         found: list[Any] = [None]
 
         def take(_place: int, result: Any) -> None:
-            self._pool.traffic.add(received=nbytes(result))
+            self._pool.traffic.add(received=nbytes(result), what=command, answers=1)
             found[0] = result
 
         self._collect(Round({place: self._begin(place, command, args)}), take, (command, args))
@@ -164,9 +164,10 @@ class Parts(Owner):
         held, self._held = self._held, [None] * len(self._given)
         making, self._making = self._making, None
         for place, each in making.futures.items() if making is not None else ():  # an error came between
-            if _is_left(self._by[place]):
+            if abandoned or _is_left(self._by[place]):
+                # Nobody waits for it, and nobody wants it: its memory is given back as soon as it is made.
                 each.add_done_callback(_abandon_made)
-            elif not abandoned:
+            else:
                 with suppress(PotrError):
                     held[place] = each.result()
         for part, by in zip(held, self._by, strict=True):
@@ -191,7 +192,7 @@ class Parts(Owner):
 
     def _send(self, held: Held, origin: int, command: str, args: Sequence[Any]) -> Future[Any]:
         args = [each.args[origin] if isinstance(each, Each) else each for each in args]
-        self._pool.traffic.add(sent=nbytes(args))
+        self._pool.traffic.add(sent=nbytes(args), what=command)
         return held.begin(command, args)
 
     def _take_made(self, place: int, held: Held) -> None:
@@ -432,7 +433,7 @@ class Pending:
         parts, found, since = self._parts, dict[int, Any](), time.monotonic()
 
         def take(place: int, result: Any) -> None:
-            parts._pool.traffic.add(received=nbytes(result))
+            parts._pool.traffic.add(received=nbytes(result), what=self._command, answers=1)
             found[place] = result
 
         try:

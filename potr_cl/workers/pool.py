@@ -11,8 +11,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from concurrent.futures import Future
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 from potr_cl.errors import DeviceError
 from potr_cl.opencl.device import Device
@@ -115,18 +115,35 @@ class Shared:
 _counting = threading.Lock()
 
 
-@dataclass
-class Traffic:
-    """What went between the master and the workers, in bytes: arrays, without what their transport adds."""
+class Went(NamedTuple):
+    """What went for one purpose: how many answers came, and the bytes either way."""
 
+    answers: int = 0
     sent: int = 0
     received: int = 0
 
-    def add(self, sent: int = 0, received: int = 0) -> None:
+
+@dataclass
+class Traffic:
+    """What went between the master and the workers, in bytes: arrays, without what their transport adds.
+
+    Attributes:
+        sent, received: in all.
+        of: the same by what it was for: a command of the parts, or the kind of a thing that was shared.
+    """
+
+    sent: int = 0
+    received: int = 0
+    of: dict[str, Went] = field(default_factory=dict)
+
+    def add(self, sent: int = 0, received: int = 0, what: str | None = None, answers: int = 0) -> None:
         """Count what has gone, from any thread."""
         with _counting:
             self.sent += sent
             self.received += received
+            if what is not None:
+                before = self.of.get(what, Went())
+                self.of[what] = Went(before.answers + answers, before.sent + sent, before.received + received)
 
 
 class Pool(ABC):

@@ -9,6 +9,7 @@ import pytest
 
 import potr_cl
 from potr_cl import Camera, DataError, EncodeOptions, Scene, UsageError
+from potr_cl.raster import seen_rasterizer
 
 QUICK = {"preset": "fast", "iterations": 1, "refit": False, "compact": False}
 
@@ -143,3 +144,15 @@ def test_a_tensor_is_no_array(plush_excerpt):
         dataclasses.replace(plush_excerpt, means=torch.from_numpy(plush_excerpt.means))
     camera = Camera("a", 10, 10, 10.0, 10.0, 5.0, 5.0, torch.eye(3), torch.zeros(3))  # type: ignore[arg-type]
     assert (camera.rotation == np.eye(3)).all()
+
+
+@pytest.mark.parametrize("size", ["small", "large"])
+def test_no_view_at_all(size, plush_excerpt, plush_excerpt_cameras, monkeypatch):
+    """An empty list, as a filter of names leaves it; whatever a scene's size has decided by then."""
+    if size == "large":
+        monkeypatch.setattr(seen_rasterizer, "_LEAST_SPLATS", 1)
+        monkeypatch.setattr(seen_rasterizer, "_PART", 0.0)
+    for call in (potr_cl.render, lambda scene, *given, **views: potr_cl.compare(scene, scene, *given, **views)):
+        for none in ([], (), np.array([], str)):
+            with pytest.raises(UsageError, match="the list of views is empty: name at least one, or leave it out"):
+                call(plush_excerpt, plush_excerpt_cameras, views=none)

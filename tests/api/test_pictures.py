@@ -44,7 +44,7 @@ def test_others_are_rendered_while_one_is_packed(rasterizer, tmp_path, monkeypat
 
     def noted(self, path):
         if path.name == "0.png":
-            assert second.wait(60), "nothing else is packed meanwhile"
+            assert second.wait(300), "nothing else is packed meanwhile"
         else:
             second.set()
         save(self, path)
@@ -58,3 +58,22 @@ def test_others_are_rendered_while_one_is_packed(rasterizer, tmp_path, monkeypat
 def test_a_picture_that_cannot_be_written_is_told(rasterizer, tmp_path):
     with pytest.raises(UsageError, match="does not exist"):
         list(written_pictures(rasterizer, CAMERAS[:3], [tmp_path / "no" / f"{number}.png" for number in range(3)]))
+
+
+@pytest.mark.parametrize(
+    ("view", "elsewhere", "windows"),
+    [
+        ("left/0001", "left_0001", "left_0001"),
+        ("2026-01-01T12:00:00", "2026-01-01T12:00:00", "2026-01-01T12_00_00"),
+        ('a<b>"c|d?*', 'a<b>"c|d?*', "a_b__c_d__"),
+        ("C:\\x", "C:\\x", "C__x"),
+        ("con", "con", "_con"),
+        ("NUL.left", "NUL.left", "_NUL.left"),
+        ("com1 ", "com1 ", "_com1 "),
+        ("console", "console", "console"),
+        ("grüße", "grüße", "grüße"),
+    ],
+)
+def test_names_of_views_as_names_of_files(view, elsewhere, windows):
+    assert pictures.file_name(view, windows=False) == elsewhere
+    assert pictures.file_name(view, windows=True) == windows

@@ -131,7 +131,7 @@ def test_no_permission(scene_path):
             path.chmod(mode)
         # Root may do anything: give the right up, once everything is imported.
         script = (
-            "import locale, os, sys; from potr_cl.cli import encode, main; os.geteuid() or os.setuid(65534); "
+            "import locale, os, sys; from potr_cl.cli import edit, encode, main; os.geteuid() or os.setuid(65534); "
             "sys.exit(main(sys.argv[1:]))"
         )
         for source, target in ((scene, locked / "a.potr"), (secret, Path(folder) / "a.potr")):
@@ -141,6 +141,16 @@ def test_no_permission(scene_path):
             assert "Permission denied" in result.stderr
             assert "Traceback" not in result.stderr
             assert not target.exists()
+        # What takes long looks first.
+        few = ["--iterations", "1", "--virtual-views", "4"]
+        for words in (["prune", *few], ["compact", "--virtual-views", "4"], ["encode", "--ladder", "0.2", *KEEP]):
+            name = "" if "--ladder" in words else "a.ply"
+            command = [sys.executable, "-c", script, words[0], str(scene), "-o", f"{locked}/{name}", *words[1:]]
+            result = subprocess.run(command, capture_output=True, text=True, check=False)
+            assert result.returncode == 2, result.stderr
+            assert result.stderr.startswith("potr-cl: cannot write")
+            assert "Permission denied\n" in result.stderr
+            assert result.stderr.count("\n") == 1
 
 
 def test_interrupt(tmp_path, scene_path, capsys, monkeypatch):

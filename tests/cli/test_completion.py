@@ -36,7 +36,7 @@ def script(tmp_path, capsys):
 
 
 def output(*command: str, cwd: Path) -> str:
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=True, timeout=60).stdout
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=True, timeout=300).stdout
 
 
 BASH = """
@@ -87,7 +87,7 @@ def test_zsh(script, tmp_path):
 
     def typed(text: str, wanted: str) -> None:
         os.write(terminal, text.encode())
-        written, end = "", time.monotonic() + 30
+        written, end = "", time.monotonic() + 300
         while wanted not in written:
             ready = select.select([terminal], [], [], max(end - time.monotonic(), 0))[0]
             assert ready, written

@@ -131,7 +131,7 @@ def interrupted(words, times):
                 process.send_signal(signal.SIGINT)
             if "interrupted: what is done so far is kept" in line and times == 2:
                 process.send_signal(signal.SIGINT)
-        output, _ = process.communicate(timeout=100)
+        output, _ = process.communicate(timeout=300)
     return process.returncode, output, rounds
 
 

@@ -434,7 +434,7 @@ def run(shell: str, *arguments: object, **environment: str) -> subprocess.Comple
     command = [sys.executable, "-m", "potr_cl", *map(str, arguments)]
     return subprocess.run(
         ["sh", "-c", shell, "sh", *command],
-        cwd=ROOT, env=os.environ | environment, capture_output=True, text=True, timeout=60, check=False,
+        cwd=ROOT, env=os.environ | environment, capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from potr_cl import cli
-from potr_cl.cli import command_parser
+from potr_cl.cli import command_parser, scenes
 from potr_cl.cli.progress import Progress
 from potr_cl.cli.terminal import note, speak
 from potr_cl.errors import UsageError
@@ -123,7 +123,17 @@ def test_a_long_run_says_what_it_will_take(data, tmp_path, capsys, monkeypatch):
     cameras = data / "plush_excerpt_cameras.json"
     encode = ["encode", tmp_path / "a.ply", "--cameras", cameras, "-o", tmp_path / "a.potr"]
     _, _, err = called(capsys, *encode, "--iterations", "1", "--refit", "off", "--no-quality", "--cameras-anyway")
-    assert re.search(r"kernels for [CG]PUs; about [\d.]+ (s|min|h) and [\d.]+ [MG]B of memory", err.splitlines()[0])
+    first, second = err.splitlines()[:2]
+    assert re.search(r"kernels for [CG]PUs: 250,000 splats, 9 views", first)
+    assert re.fullmatch(r"about [\d.]+ (s|min|h) and [\d.]+ [MG]B of memory( of the device)?", second)
+
+
+def test_what_takes_long_to_read_is_named(encode, capsys, monkeypatch):
+    _, _, err = called(capsys, *encode)
+    assert "reading" not in err
+    monkeypatch.setattr(scenes, "_LONG_TO_READ", 100_000)
+    _, _, err = called(capsys, *encode)
+    assert re.fullmatch(r"reading .*plush_excerpt\.ply, 0\.0 GB …", err.splitlines()[0])
 
 
 # Progress
@@ -175,7 +185,7 @@ def on_a_terminal(*arguments: object, **variables: str) -> str:
     except OSError:  # Linux's way of saying that the other end is closed
         pass
     os.close(ours)
-    process.wait(60)
+    process.wait(300)
     return written.decode()
 
 
@@ -223,7 +233,7 @@ def test_an_encode_that_is_told_to_end_leaves_nothing(encode, tmp_path, number, 
     temporary.mkdir()
     target = tmp_path / "a.potr"
     target.write_bytes(b"old")
-    long = [*map(str, encode), "--iterations", "2000", "--tolerance", "0", "--report", str(tmp_path / "page.html")]
+    long = [*map(str, encode), "--iterations", "9000", "--tolerance", "0", "--report", str(tmp_path / "page.html")]
     process = subprocess.Popen(
         [sys.executable, "-m", "potr_cl", *long], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         env=os.environ | {"TMPDIR": str(temporary)},
@@ -232,7 +242,7 @@ def test_an_encode_that_is_told_to_end_leaves_nothing(encode, tmp_path, number, 
     while "prune …" not in (line := process.stderr.readline()):
         assert line
     process.send_signal(number)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=300)
     assert process.returncode == code
     assert err.count("\n") == 1
     assert "no file is left half written" in err

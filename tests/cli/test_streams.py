@@ -136,7 +136,7 @@ def test_an_endless_stream_that_is_no_scene_is_not_read_to_its_end(folder: Path)
             stdin=endless.stdout,
             capture_output=True,
             cwd=ROOT,
-            timeout=60,
+            timeout=300,
             check=False,
         )
         endless.kill()
@@ -146,13 +146,13 @@ def test_an_endless_stream_that_is_no_scene_is_not_read_to_its_end(folder: Path)
 
 def test_a_wrong_option_is_told_before_anything_is_read(folder: Path) -> None:
     """Nothing comes, and nothing ends, and yet the command does."""
-    with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(100)"], stdout=subprocess.PIPE) as silent:
+    with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(400)"], stdout=subprocess.PIPE) as silent:
         result = subprocess.run(
             [sys.executable, "-m", "potr_cl", "encode", "-", "-o", str(folder / "b.potr"), "-q", "7"],
             stdin=silent.stdout,
             capture_output=True,
             cwd=ROOT,
-            timeout=60,
+            timeout=300,
             check=False,
         )
         silent.kill()
@@ -179,7 +179,7 @@ def test_who_reads_the_result_may_go_early(folder: Path) -> None:
     script = f"{sys.executable} -m potr_cl decode a.potr -o - | head -c 10; echo; echo ${{PIPESTATUS[0]}}"
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     result = subprocess.run(
-        ["bash", "-c", script], capture_output=True, cwd=folder, env=environment, check=False, timeout=60
+        ["bash", "-c", script], capture_output=True, cwd=folder, env=environment, check=False, timeout=300
     )
     assert result.stdout == b"ply\nformat\n0\n"
     assert b"Traceback" not in result.stderr

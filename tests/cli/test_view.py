@@ -27,11 +27,11 @@ def test_it_serves_until_it_is_interrupted(data, number):
             line = process.stdout.readline()
             found = re.search(r"http://127\.0\.0\.1:(\d+) ", line)
             assert found, line
-            connection = http.client.HTTPConnection("127.0.0.1", int(found[1]), timeout=30)
+            connection = http.client.HTTPConnection("127.0.0.1", int(found[1]), timeout=300)
             connection.request("GET", "/")
             assert connection.getresponse().status == 200
             process.send_signal(number)
-            said, _ = process.communicate(timeout=30)
+            said, _ = process.communicate(timeout=300)
         finally:
             process.kill()
     assert process.returncode == 128 + number

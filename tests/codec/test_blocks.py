@@ -28,6 +28,7 @@ from potr_cl.codec.geometry import quantise_geometry
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.scenes import ply
+from potr_cl.host.mapped import bounded
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.morton import morton_order
 from potr_cl.model.scene import Scene
@@ -265,11 +266,48 @@ def test_a_file_that_gets_shorter_while_it_is_open(data, tmp_path):
     path.write_bytes(data)
     file = open_file(path)
     path.write_bytes(data[: len(data) // 2])
-    with pytest.raises(DataError, match="block"):
+    with pytest.raises(DataError, match="was changed while it was read"):
         file.scene()
     path.unlink()
     with pytest.raises(UsageError, match="cannot read"):
         file.scene()
+
+
+def test_where_memory_is_bounded_colours_are_decoded_to_the_disk():
+    """Those of all blocks together, and those of the blocks that threads decode meanwhile."""
+    scene = random_scene(20_000, 3, seed=1)
+    data = b"".join(in_blocks(scene, 5_000).pieces)
+
+    def decoded(memory: float | None) -> tuple[Scene, int]:
+        tracemalloc.start()
+        with bounded(memory):
+            found = decode(data)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return found, peak
+
+    expected, whole = decoded(None)
+    found, little = decoded(64 * 100_000)  # arrays above 100,000 bytes are large
+    for name in ARRAYS:
+        assert np.array_equal(getattr(found, name), getattr(expected, name))
+    assert little < whole - scene.sh.nbytes
+
+
+def test_where_memory_is_bounded_colours_of_one_block_are_decoded_to_the_disk():
+    scene = random_scene(20_000, 3, seed=1)
+    data = b"".join(code_scene(scene, BEST, ring_of_cameras(4)).pieces)
+
+    def decoded(memory: float | None) -> tuple[Scene, int]:
+        tracemalloc.start()
+        with bounded(memory):
+            found = decode(data)
+        left = tracemalloc.get_traced_memory()[0]
+        tracemalloc.stop()
+        return found, left
+
+    (expected, whole), (found, little) = decoded(None), decoded(64 * 100_000)
+    assert np.array_equal(found.sh, expected.sh)
+    assert little < whole - 0.9 * scene.sh.nbytes
 
 
 # Files that lie ------------------------------------------------------------------------------------------------------

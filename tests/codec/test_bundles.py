@@ -213,7 +213,9 @@ def small():
     return encoder.encode(values, classes_of(values, steps)), steps
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+)
 @given(data=st.data())
 def test_both_paths_say_the_same_of_damaged_sections(monkeypatch, small, data):
     monkeypatch.delenv(VARIABLE, raising=False)

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from potr_cl.errors import PotrError, UsageError
 from potr_cl.formats import load_scene, scene_writer
 from potr_cl.opencl.device import Device
-from potr_cl.quality.compare import compare, mean_view
-from potr_cl.raster.rasterizer import Rasterizer
+from tests.cases.judging import psnr
 
 pytest.importorskip("gsply", reason="the extra convert is not installed")
 
@@ -44,12 +43,6 @@ def device():
     return Device()
 
 
-def psnr(device, a, b, cameras):
-    with Rasterizer(device, a) as first, Rasterizer(device, b) as second:
-        figures = mean_view(compare(first, second, cameras).views).figures["b_against_a"]
-    return figures.psnr
-
-
 @pytest.mark.parametrize("name", FOREIGN)
 def test_files_of_another_tool_look_as_the_scene_does(device, data, plush_excerpt, plush_excerpt_cameras, name):
     scene = load_scene(data / "foreign" / name)
@@ -67,7 +60,9 @@ def test_what_is_written_looks_as_the_scene_does(device, tmp_path, plush_excerpt
 
 
 @pytest.mark.parametrize("name", FOREIGN)
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+)
 @given(draw=st.data())
 def test_damage_is_an_error_of_ours_or_does_not_matter(tmp_path, data, name, draw):
     content = bytearray((data / "foreign" / name).read_bytes())

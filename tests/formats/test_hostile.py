@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import struct
 import tracemalloc
-import warnings
 import zipfile
 import zlib
 from pathlib import Path
@@ -18,6 +17,7 @@ from potr_cl.errors import DataError
 from potr_cl.formats import load_cameras, load_scene, save_scene
 from potr_cl.formats.images import image_size, read_ground_truth
 from potr_cl.reference.scenes import random_scene
+from tests.cases.own_warnings import no_warnings
 
 #: Of double precision, by its bits: one that must not be computed with.
 SIGNALLING_NAN = struct.pack("<Q", 0x7FF0000000000001)
@@ -25,8 +25,7 @@ SIGNALLING_NAN = struct.pack("<Q", 0x7FF0000000000001)
 
 @pytest.fixture(autouse=True)
 def _warnings_are_errors():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with no_warnings():
         yield
 
 

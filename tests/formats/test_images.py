@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import os
 import tracemalloc
-import warnings
 
 import numpy as np
 import pytest
@@ -14,6 +13,7 @@ from PIL import Image
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.images import image_size, parse_colour, read_ground_truth, to_8_bits, write_png
 from tests.cases.images import png_of
+from tests.cases.own_warnings import no_warnings
 
 
 def random_pixels(channels, seed=0):
@@ -87,8 +87,7 @@ def test_too_many_pixels_are_refused_before_they_are_unpacked(tmp_path, width, h
     path = tmp_path / "a.png"
     path.write_bytes(png_of(width, height))
     tracemalloc.start()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with no_warnings():
         for read in (image_size, read_ground_truth):
             with pytest.raises(DataError, match="pixels"):
                 read(path)
@@ -98,8 +97,7 @@ def test_too_many_pixels_are_refused_before_they_are_unpacked(tmp_path, width, h
 
 def test_large_photographs_give_no_warning(tmp_path):
     (tmp_path / "a.png").write_bytes(png_of(10_000, 10_000))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with no_warnings():
         assert image_size(tmp_path / "a.png") == (10_000, 10_000)
 
 

@@ -89,7 +89,7 @@ def test_formats_import_no_heavy_library() -> None:
 @settings(
     max_examples=12,
     deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
     phases=[Phase.explicit, Phase.reuse, Phase.generate],  # a format that fails does so for nearly every scene
 )
 def test_every_format_reads_what_it_writes(

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from potr_cl.errors import PotrError, UsageError
-from potr_cl.host.atomic_write import replacing
+from potr_cl.host.atomic_write import check_place, replacing
 
 
 def _write_half_then_raise(target: Path, failure: BaseException) -> None:
@@ -97,12 +97,42 @@ def test_refuses_what_is_no_file(tmp_path: Path) -> None:
         (tmp_path / "fifo", "not a regular file"),
         (Path(os.devnull), "not a regular file"),
         (tmp_path / "missing" / "out.bin", "folder '.*missing' does not exist"),
-        (tmp_path / "file" / "out.bin", "folder '.*file' does not exist"),
+        (tmp_path / "file" / "out.bin", "'.*file' is no folder"),
         (tmp_path / ("x" * 300), "File name too long"),
     ]:
         with pytest.raises(UsageError, match=message), replacing(path) as file:
             file.write(b"x")
     assert sorted(os.listdir(tmp_path)) == ["fifo", "file"]
+
+
+def test_a_place_is_looked_at_before_the_work_without_a_trace(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    before = tmp_path.stat().st_mtime_ns
+    for path, message in [
+        (tmp_path, "is a directory"),
+        (Path(os.devnull), "not a regular file"),
+        (tmp_path / "missing" / "out.bin", "folder '.*missing' does not exist$"),
+        (tmp_path / "~" / "out.bin", "does not exist; '~' is not expanded here"),
+        (tmp_path / "file" / "out.bin", "'.*file' is no folder"),
+        (tmp_path / ("x" * 300), "File name too long"),
+    ]:
+        with pytest.raises(UsageError, match=message):
+            check_place(path)
+    check_place(tmp_path / "file")
+    check_place(tmp_path / "new")
+    assert tmp_path.stat().st_mtime_ns == before
+
+
+def test_two_that_write_one_file_at_once(tmp_path: Path) -> None:
+    """Both are whole; the last one wins; nothing else is left."""
+    target = tmp_path / "out.bin"
+    with replacing(target) as first:
+        first.write(b"first" * 1000)
+        with replacing(target) as second:
+            second.write(b"second")
+        assert target.read_bytes() == b"second"
+    assert target.read_bytes() == b"first" * 1000
+    assert os.listdir(tmp_path) == ["out.bin"]
 
 
 def test_a_name_as_long_as_the_file_system_allows(tmp_path: Path) -> None:

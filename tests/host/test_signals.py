@@ -19,7 +19,7 @@ SIGNALS = [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
 def run(program: str, *arguments: object, **options: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-c", program, *map(str, arguments)],
-        cwd=ROOT, capture_output=True, text=True, timeout=60, check=False, **options,
+        cwd=ROOT, capture_output=True, text=True, timeout=300, check=False, **options,
     )  # fmt: skip
 
 
@@ -185,7 +185,7 @@ def test_closed_standard_files_are_not_written_to_by_accident(tmp_path: Path, cl
     redirections = " ".join(f"{number}>&-" for number in closed)
     subprocess.run(
         ["sh", "-c", f'exec "$0" -c "$1" "$2" {redirections}', sys.executable, program, str(tmp_path / "file")],
-        cwd=ROOT, check=True, capture_output=True, timeout=60,
+        cwd=ROOT, check=True, capture_output=True, timeout=300,
     )  # fmt: skip
     assert (tmp_path / "file").read_bytes() == b"content"
 

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from potr_cl.formats.images import opened_image
-from potr_cl.host.silence import without_warnings
+from potr_cl.host.silence import whatever_warns, without_warnings
 from potr_cl.opencl.building import building
 
 
@@ -66,3 +66,41 @@ def test_filters_that_others_put_in_front_do_not_count():
         warnings.simplefilter("error")
         with without_warnings():
             warnings.warn("nobody hears it", stacklevel=1)
+
+
+@pytest.mark.parametrize("interrupted", [0, 1, 3])
+def test_work_that_warnings_end_is_done_again(interrupted):
+    """Others put filters in front while it is at work, from other threads or from the same one."""
+    tries = []
+
+    def work():
+        tries.append(1)
+        if len(tries) <= interrupted:
+            warnings.simplefilter("error")
+        warnings.warn("a compiler has said something", stacklevel=1)
+        return "built"
+
+    with warnings.catch_warnings():
+        assert whatever_warns(work) == "built"
+    assert len(tries) == interrupted + 1
+
+
+def test_work_that_warnings_always_end_ends():
+    def work():
+        warnings.simplefilter("error")
+        warnings.warn("a compiler has said something", RuntimeWarning, stacklevel=1)
+
+    with warnings.catch_warnings(), pytest.raises(RuntimeWarning):
+        whatever_warns(work)
+
+
+def test_other_errors_are_raised_at_once():
+    tries = []
+
+    def work():
+        tries.append(1)
+        raise ValueError("wrong")
+
+    with pytest.raises(ValueError, match="wrong"):
+        whatever_warns(work)
+    assert len(tries) == 1

@@ -41,13 +41,13 @@ def test_parts_of_a_task_come_first_and_keep_their_order(threads):
     with thread_pool(threads) as pool:
         for _ in range(threads):
             pool.submit(work.do)
-        assert whole.result(timeout=30) == [n * n for n in range(50)]
+        assert whole.result(timeout=300) == [n * n for n in range(50)]
 
 
 def test_parts_are_done_by_other_threads_too():
     work = SharedWork()
     seen = set()
-    both = threading.Barrier(2, timeout=30)
+    both = threading.Barrier(2, timeout=300)
 
     def part(n):
         both.wait()  # nobody passes alone
@@ -58,7 +58,7 @@ def test_parts_are_done_by_other_threads_too():
     with thread_pool(2) as pool:
         pool.submit(work.do)
         pool.submit(work.do)
-        whole.result(timeout=30)
+        whole.result(timeout=300)
     assert len(seen) == 2
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -128,3 +129,17 @@ def test_scenes_are_joined_in_an_order(monkeypatch, planar):
     for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
         both = np.concatenate([getattr(some, name), getattr(others, name)])
         assert np.array_equal(getattr(joined, name), both[order])
+
+
+def test_without_colours_a_part_of_a_scene_takes_no_memory_for_them():
+    scene = random_scene(100_000, 3)
+    some = np.arange(0, len(scene), 2)
+    tracemalloc.start()
+    part = scene.uncoloured().subset(some)
+    taken = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    for name in ("means", "log_scales", "quaternions", "opacity_logits"):
+        assert np.array_equal(getattr(part, name), getattr(scene, name)[some])
+    assert part.sh.shape == (len(some), 1, 3)
+    assert not part.sh.any()
+    assert taken < scene.nbytes / 6  # the half of all but the colours, and little else

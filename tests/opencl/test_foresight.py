@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from pathlib import Path
 
 import pyopencl as cl
@@ -39,6 +40,46 @@ def test_what_was_needed_once_is_there_the_next_time(monkeypatch):
     assert second.kernel("raster/columns.cl", "columns").name == "columns"
     with pytest.raises(DeviceError):
         other.program("raster/columns.cl")
+
+
+def test_warnings_that_become_errors_while_programs_are_loaded_stop_nobody(monkeypatch):
+    """As where the main thread runs in a block of its own: filters are the whole process's."""
+    first = Device()
+    first.prepare_for("a test").result()
+    first.program("raster/columns.cl")
+    second = Device()
+    build, warned = cl.Program.build, []
+
+    def chatting(program, *arguments, **choices):
+        if not warned:
+            warned.append(1)
+            warnings.simplefilter("error")
+        warnings.warn("a compiler's words", cl.CompilerWarning, stacklevel=1)
+        return build(program, *arguments, **choices)
+
+    monkeypatch.setattr(cl.Program, "build", chatting)
+    with warnings.catch_warnings():
+        second.prepare_for("a test").result()
+        assert warned
+        no_builds(monkeypatch)
+        assert second.kernel("raster/columns.cl", "columns").name == "columns"
+
+
+def test_a_device_that_is_always_interrupted_is_loaded_by_who_needs_it(monkeypatch):
+    """What is loaded ahead raises nothing."""
+    first = Device()
+    first.prepare_for("a test").result()
+    first.program("raster/columns.cl")
+    second = Device()
+
+    def chatting(program, *arguments, **choices):
+        warnings.simplefilter("error")
+        warnings.warn("a compiler's words", cl.CompilerWarning, stacklevel=1)
+
+    with warnings.catch_warnings(), monkeypatch.context() as patch:
+        patch.setattr(cl.Program, "build", chatting)
+        second.prepare_for("a test").result()
+    assert second.kernel("raster/columns.cl", "columns").name == "columns"
 
 
 def test_experiments_are_not_noted(cache):

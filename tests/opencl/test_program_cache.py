@@ -31,14 +31,15 @@ def cache(tmp_path, monkeypatch) -> Path:
     return Path(name)
 
 
-def test_an_old_lock_is_removed_at_once(cache):
+def test_an_old_lock_is_removed_at_once(cache, monkeypatch):
+    monkeypatch.setattr(program_cache, "PATIENCE", 600.0)
     lock = cache / "lock"
     lock.touch()
     os.utime(lock, (1e9, 1e9))
     began = time.monotonic()
     assert program_cache.folder() == str(cache)
     assert not lock.exists()
-    assert time.monotonic() - began < 1
+    assert time.monotonic() - began < 300
 
 
 def test_a_lock_that_stays_the_same_is_removed(cache, monkeypatch):
@@ -84,9 +85,8 @@ def test_a_device_opens_after_another_process_was_killed(tmp_path):
     lock = kept[0].parent / "lock"
     lock.touch()
     os.utime(lock, (1e9, 1e9))
-    began = time.monotonic()
+    # Were it left to pyopencl, the lock would still be there after a minute of waiting for it.
     assert opened(tmp_path).stdout == "built\n"
-    assert time.monotonic() - began < 30
     assert not lock.exists()
 
 

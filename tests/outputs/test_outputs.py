@@ -22,9 +22,9 @@ from potr_cl.outputs.registry import OUTPUTS, output_of, output_of_suffix
 from potr_cl.outputs.spz import Spz
 from potr_cl.pipeline.encoded import Encoded
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.quality.compare import compare, mean_view
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.reference.scenes import random_scene
+from tests.cases import judging
 from tests.cases.scenes import antialiased
 
 EVERY = [*(kind() for kind in OUTPUTS), Spz(version=3), Spz(version=4)]
@@ -47,8 +47,7 @@ def encoded_to(output: Output, scene: Scene, cameras, device: Device, **changes)
 
 
 def psnr(device: Device, scene: Scene, other: Scene, cameras) -> float:
-    with Rasterizer(device, scene) as a, Rasterizer(device, other) as b:
-        return mean_view(compare(a, b, held_out(cameras)).views).figures["b_against_a"].psnr
+    return judging.psnr(device, scene, other, held_out(cameras))
 
 
 def seen_in_file(encoded: Encoded, folder: Path) -> Scene:

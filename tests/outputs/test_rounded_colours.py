@@ -12,8 +12,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.outputs.potr import Potr
 from potr_cl.pipeline.encoded import Encoded
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.quality.compare import compare, mean_view
-from potr_cl.raster.rasterizer import Rasterizer
+from tests.cases import judging
 
 
 @pytest.fixture(scope="module")
@@ -41,8 +40,7 @@ def test_less_error_at_no_more_bytes_than_with_the_nearest_levels(
     encoded, plush_excerpt, plush_excerpt_cameras, device, monkeypatch
 ):
     def psnr(file: Encoded) -> float:
-        with Rasterizer(device, plush_excerpt) as a, Rasterizer(device, file.scene) as b:
-            return mean_view(compare(a, b, held_out(plush_excerpt_cameras)).views).figures["b_against_a"].psnr
+        return judging.psnr(device, plush_excerpt, file.scene, held_out(plush_excerpt_cameras))
 
     rounds = encoded()
 

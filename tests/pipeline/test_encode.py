@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -137,9 +138,40 @@ def test_progress_comes_to_an_end(device, plush_excerpt, views):
     assert [s for s, d in seen if d == 1] == ["prepare views", "compact", "prune", "octree", "quantise and code"]
 
 
+def progress_of(scene, views, options, device) -> dict[str, list[float]]:
+    told: dict[str, list[float]] = {}
+    encode(scene, views, options, lambda stage, done: told.setdefault(stage, []).append(done), device)
+    for parts in told.values():
+        assert parts == sorted(parts)
+        assert (parts[0], parts[-1]) == (0, 1)
+    return told
+
+
+def test_progress_of_pruning_is_of_its_time(device, plush_excerpt, views):
+    """The first measurement takes much of it, the last ones little; where views are made again all take as long."""
+    options = EncodeOptions.for_preset("best", between=False, prune={"iterations": 10}, refit=False)
+    early, late = np.array(progress_of(plush_excerpt, views, options, device)["prune"])[[1, 9]]
+    assert early > 0.15
+    assert late > 0.95
+    if device.family == "cpu":
+        made_again = progress_of(plush_excerpt, views, options.changed(memory=0), device)["prune"]
+        assert made_again[1:10] == pytest.approx(np.arange(1, 10) / 10)
+
+
+def test_progress_of_the_refit_is_of_its_time(device, plush_excerpt, views):
+    """Before its first step all views are prepared and looked at, after its last one colours are rounded."""
+    options = EncodeOptions.for_preset("best", between=False, prune={"iterations": 2})
+    told = progress_of(plush_excerpt, views, options, device)["refit"]
+    steps = np.diff(told)
+    assert steps[0] > 3 * np.median(steps), "to the first step"
+    assert steps[-1] >= 2 * np.median(steps), "from the last one"
+    assert told[-2] > 0.8, "told between the rounds too"
+
+
 def test_a_stage_within_another_counts_for_itself(monkeypatch):
     now = iter([0.0, 1.0, 2.0, 5.0, 9.0, 10.0, 20.0, 21.0])
-    monkeypatch.setattr("potr_cl.pipeline.stopwatch.time.perf_counter", lambda: next(now))
+    # Not the clock of the whole process: other threads look at that.
+    monkeypatch.setattr("potr_cl.pipeline.stopwatch.time", SimpleNamespace(perf_counter=lambda: next(now)))
     watch = Stopwatch()
     for stage, done in (("a", 0.0), ("a", 0.5), ("b", 0.0), ("b", 1.0), ("a", 0.7), ("a", 1.0), ("c", 1.0)):
         watch(stage, done)

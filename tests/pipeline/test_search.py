@@ -20,10 +20,10 @@ from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.search import encode_to_target
 from potr_cl.pipeline.target import KINDS, Target
-from potr_cl.quality.compare import compare, mean_view
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.reference.scenes import random_scene, ring_of_cameras
 from potr_cl.stages.stage import Stage
+from tests.cases import judging
 from tests.devices import skip_without_cpu
 
 FEW = EncodeOptions.for_preset("paper", prune={"iterations": 6})
@@ -42,9 +42,7 @@ def cameras(plush_excerpt_cameras):
 
 
 def psnr(device, scene, file, cameras):
-    with Rasterizer(device, scene) as a, Rasterizer(device, decode(file)) as b:
-        views = compare(a, b, [camera for camera in cameras if camera.split == "test"]).views
-    return mean_view(views).figures["b_against_a"].psnr
+    return judging.psnr(device, scene, decode(file), [camera for camera in cameras if camera.split == "test"])
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import potr_cl
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.images import to_8_bits
 from potr_cl.model.scene import Scene
@@ -20,7 +21,7 @@ from potr_cl.quality.compare import (
     Figures,
     SceneFile,
     ViewFigures,
-    compare,
+    comparison_of,
     comparison_report,
     find_ground_truth,
     format_comparison,
@@ -29,6 +30,7 @@ from potr_cl.quality.compare import (
     side_by_side,
     size_report,
 )
+from potr_cl.quality.judging import Judging, Looks
 from potr_cl.quality.metrics import psnr, ssim
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.reference.scenes import ring_of_cameras
@@ -37,17 +39,31 @@ BACKGROUND = (0.25, 0.5, 1.0)
 
 
 @pytest.fixture(scope="module")
-def rasterizers(plush_excerpt):
+def device():
+    return Device()
+
+
+@pytest.fixture(scope="module")
+def scenes(plush_excerpt):
     """The excerpt, and the excerpt with other colours."""
-    device = Device()
     s = plush_excerpt
-    other = Scene(s.means, s.log_scales, s.quaternions, s.opacity_logits, s.sh * np.float32(0.9))
-    return Rasterizer(device, s, background=BACKGROUND), Rasterizer(device, other, background=BACKGROUND)
+    return s, Scene(s.means, s.log_scales, s.quaternions, s.opacity_logits, s.sh * np.float32(0.9))
+
+
+@pytest.fixture(scope="module")
+def rasterizers(device, scenes):
+    return [Rasterizer(device, scene, background=BACKGROUND) for scene in scenes]
 
 
 @pytest.fixture(scope="module")
 def views(plush_excerpt_cameras):
     return [c for c in plush_excerpt_cameras if c.split == "test"]
+
+
+def compare(device, a, b, views, ground_truth=None, lpips=None):
+    with Judging(device, a, Looks(BACKGROUND, ground_truth=ground_truth, lpips=lpips)) as judging:
+        judging.take(b)
+        return comparison_of(list(judging.figures(views)))
 
 
 def comparison(*psnrs):
@@ -56,10 +72,9 @@ def comparison(*psnrs):
     return Comparison(views, worst)
 
 
-def test_figures_are_those_of_the_pictures(rasterizers, views):
+def test_figures_are_those_of_the_pictures(device, scenes, rasterizers, views):
     a, b = rasterizers
-    stages = []
-    result = compare(a, b, views, progress=lambda stage, done: stages.append((stage, done)))
+    result = compare(device, *scenes, views)
     assert [view.name for view in result.views] == [view.name for view in views]
     for camera, view in zip(views, result.views, strict=True):
         picture_a, picture_b = a.render(camera)[0], b.render(camera)[0]
@@ -69,21 +84,26 @@ def test_figures_are_those_of_the_pictures(rasterizers, views):
         assert figures.lpips is None
         assert view.figures == {}
     assert result.worst == np.argmin([psnr(b.render(camera)[0], a.render(camera)[0]) for camera in views])
+    assert compare(device, *scenes, views) == compare(device, *scenes, views)
+
+
+def test_progress(device, scenes, views):
+    stages = []
+    potr_cl.compare(*scenes, views, device=device, progress=lambda stage, done: stages.append((stage, done)))
     assert stages[0] == ("comparing 3 views", 0)
     assert [done for _, done in stages[1:]] == pytest.approx([1 / 3, 2 / 3, 1])
-    assert compare(a, b, views) == compare(a, b, views)
 
 
-def test_ground_truth(rasterizers, views, tmp_path):
+def test_ground_truth(device, scenes, rasterizers, views, tmp_path):
     """Photographs with alpha, made of A's own pictures: composited over the background they are A's pictures again."""
-    a, b = rasterizers
+    a, _ = rasterizers
     for camera in views:
         image, transmittance = a.render(camera)
         alpha = 1 - transmittance[..., None]
         own = image - np.float32(BACKGROUND) * transmittance[..., None]
         straight = own / np.where(alpha > 0, alpha, 1)
         Image.fromarray(to_8_bits(np.concatenate([straight, alpha], axis=-1))).save(tmp_path / f"{camera.name}.png")
-    result = compare(a, b, views, find_ground_truth(tmp_path, views))
+    result = compare(device, *scenes, views, find_ground_truth(tmp_path, views))
     for view in result.views:
         f = view.figures
         assert f["a_against_truth"].psnr > 45  # what 8 bits allow
@@ -98,9 +118,8 @@ def test_ground_truth(rasterizers, views, tmp_path):
     assert header.split("  ")[-1].strip() == "loss by photo"
 
 
-def test_a_scene_against_itself(rasterizers, views):
-    a, _ = rasterizers
-    result = compare(a, a, views)
+def test_a_scene_against_itself(device, scenes, views):
+    result = compare(device, scenes[0], scenes[0], views)
     report = json.loads(json.dumps(comparison_report(result), allow_nan=False))
     assert report["identical_views"] == 3
     assert report["mean"]["b_against_a"] == {"psnr": None, "ssim": 1}
@@ -111,11 +130,10 @@ def test_a_scene_against_itself(rasterizers, views):
     assert "nan" not in text
 
 
-def test_lpips_column(rasterizers, views):
+def test_lpips_column(device, scenes, views):
     """The metric itself needs weights; any function shows that its figures arrive."""
-    a, b = rasterizers
     distances = iter([0.5, None, 0.3])
-    result = compare(a, b, views, lpips=lambda _image, _reference: next(distances))
+    result = compare(device, *scenes, views, lpips=lambda _image, _reference: next(distances))
     assert mean_view(result.views).figures["b_against_a"].lpips == pytest.approx(0.4)
     report = comparison_report(result)
     assert report["views"][0]["b_against_a"]["lpips"] == 0.5
@@ -125,9 +143,9 @@ def test_lpips_column(rasterizers, views):
     assert [line.split()[-1] for line in lines[2:6]] == ["0.5000", "-", "0.3000", "0.4000"]
 
 
-def test_no_view(rasterizers):
+def test_no_view():
     with pytest.raises(UsageError, match="no view"):
-        compare(*rasterizers, [])
+        comparison_of([])
 
 
 def test_mean_psnr_is_the_mean_of_the_views():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -18,17 +17,9 @@ from potr_cl.reference import raster as reference
 from potr_cl.reference.scenes import plain_splats, random_splats, tilted_camera
 from potr_cl.reference.scenes import straight_camera as camera
 from tests.cases.scenes import antialiased
-from tests.devices import KERNELS, open_device
 
 #: A pixel whose every alpha and transmittance stays this far, relatively, from 1/255 and 1e-4 cannot flip.
 CLEAR = 1e-4
-
-
-@pytest.fixture(scope="module", params=KERNELS)
-def device(request: pytest.FixtureRequest) -> Iterator[Device]:
-    device = open_device(request.param)
-    yield device
-    assert device.allocated == 0, "a rasterizer did not give all its memory back"
 
 
 def check(device: Device, scene: Scene, view: Camera, rules: RasterRules) -> reference.Composite:

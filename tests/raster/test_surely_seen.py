@@ -13,14 +13,6 @@ from potr_cl.raster.surely_seen import Seen, surely_seen
 from potr_cl.reference.scenes import random_scene
 from potr_cl.stages.pruning.unseen import find_unseen
 from potr_cl.stages.stage import State
-from tests.devices import KERNELS, open_device
-
-
-@pytest.fixture(scope="module", params=KERNELS)
-def device(request):
-    device = open_device(request.param)
-    yield device
-    assert device.allocated == 0
 
 
 @pytest.fixture

@@ -10,7 +10,13 @@ import pytest
 
 from potr_cl.errors import DeviceMemoryError
 from potr_cl.opencl.memory import Memory
-from potr_cl.stages.pruning.changed_totals import AddedChanges, ChangedTotals, changes_on_host
+from potr_cl.stages.pruning.changed_totals import (
+    AddedChanges,
+    ChangedTotals,
+    changes_on_host,
+    numbers_of,
+    numbers_or_bits,
+)
 from potr_cl.stages.pruning.survivors import SplatState
 from tests.devices import KERNELS, open_device
 
@@ -86,3 +92,12 @@ def test_without_room_nothing_stays_on_the_device(monkeypatch):
         with pytest.raises(DeviceMemoryError):
             ChangedTotals(device, splats, states)
         assert device.allocated == before
+
+
+@pytest.mark.parametrize("count", [0, 1, 30, 32, 500, 999])
+def test_splats_are_told_in_few_bytes(count):
+    meant = np.zeros(999, bool)
+    meant[np.random.default_rng(count).permutation(999)[:count]] = True
+    told = numbers_or_bits(np.flatnonzero(meant), meant)
+    assert np.array_equal(numbers_of(told), np.flatnonzero(meant))
+    assert told.nbytes == min(4 * count, 125)

@@ -430,7 +430,7 @@ def test_a_scene_that_is_still_to_come(case):
     begun = threading.Event()
 
     def make() -> Scene:
-        begun.wait(60)
+        begun.wait(300)
         return case.scene
 
     threading.Timer(0.2, begun.set).start()

@@ -59,7 +59,7 @@ def port_of(viewer: Any) -> int:
 
 
 def asked(viewer: Any, path: str = "/", **headers: str) -> tuple[int, dict[str, str], bytes]:
-    connection = http.client.HTTPConnection("127.0.0.1", port_of(viewer), timeout=20)
+    connection = http.client.HTTPConnection("127.0.0.1", port_of(viewer), timeout=120)
     connection.request("GET", path, headers=headers)
     response = connection.getresponse()
     return response.status, {name.lower(): value for name, value in response.getheaders()}, response.read()
@@ -117,7 +117,7 @@ def test_an_unknown_tab_has_no_channel(viewer):
     client = pytest.importorskip("websockets.sync.client")
     address = f"ws://127.0.0.1:{port_of(viewer)}/potr_cl/channel?key=guessed"
     with client.connect(address) as connection, pytest.raises(Exception, match="no such tab"):
-        connection.recv(timeout=20)
+        connection.recv(timeout=120)
 
 
 def test_a_taken_port_is_told(viewer, data):

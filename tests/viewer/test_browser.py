@@ -201,10 +201,35 @@ def test_a_click_flies_to_a_view(viewer, page):
     assert visitor.view == 0
     page.locator("[data-view='5']").click()
     until(lambda: visitor.view == 5)
+    still(viewer, page)
+    assert visitor.view == 5
     camera = viewer.losses.views[5]
     assert visitor.gaze.position == pytest.approx(camera.centre, abs=1e-3)
     assert visitor.gaze.rotation == pytest.approx(camera.rotation.T, abs=1e-3)
     page.locator("[data-view='5'].at").wait_for()
+
+
+def test_a_press_outlasts_news_of_the_views(viewer, page):
+    """The list is made anew and put in order while figures of views become known, also under a finger."""
+    slide(page, 2)
+    until(lambda: viewer.losses.is_complete and viewer.session.exhibit("B").name.endswith("_q1.potr"))
+    visitor = still(viewer, page)
+    row = page.locator("[data-view='7']")
+    row.scroll_into_view_if_needed()
+    box = row.bounding_box()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.down()
+    before = row.inner_text()
+    viewer.climb(0)
+    until(lambda: viewer.losses.is_complete and viewer.session.exhibit("B").name.endswith("_q0.potr"))
+    still(viewer, page)
+    page.mouse.up()
+    until(lambda: visitor.view == 7)
+    until(lambda: row.inner_text() != before)
+    row.focus()
+    viewer.climb(2)
+    until(lambda: row.inner_text() == before)
+    assert page.evaluate("document.activeElement.dataset.view") == "7", "the keyboard stays where it was"
 
 
 def test_a_click_on_a_frustum_flies_there(viewer, page):

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,14 @@ from tests.devices import KERNELS, open_device
 WIDTH, HEIGHT = 120, 90
 
 
+def until(check: Callable[[], object], said: Callable[[], str] = str) -> None:
+    """Wait for what comes at once unless something hangs."""
+    end = time.monotonic() + 300
+    while not check():
+        assert time.monotonic() < end, f"it does not come to pass {said()}"
+        time.sleep(0.01)
+
+
 class Browser:
     """Keeps what a visitor is shown and told."""
 
@@ -39,10 +48,7 @@ class Browser:
         painter.wake(self.visitor, look=True)
 
     def still(self) -> Shown:
-        end = time.monotonic() + 60
-        while not (self.shown and self.shown[-1].still and self.visitor.is_still):
-            assert time.monotonic() < end, f"no whole picture; told {self.told}"
-            time.sleep(0.01)
+        until(lambda: self.shown and self.shown[-1].still and self.visitor.is_still, lambda: f"told {self.told}")
         return self.shown[-1]
 
 
@@ -68,7 +74,7 @@ def painter(device, scenes, plush_excerpt_cameras) -> Iterator[Painter]:
     painter.session, painter.losses = session, losses  # type: ignore[attr-defined]
     painter.start()
     yield painter
-    painter.stop()
+    painter.stop(patience=300)
     assert device.allocated == 0
 
 
@@ -90,22 +96,22 @@ def test_whole_pictures_are_those_of_render(painter, gazes, scenes, device):
     assert browser.shown[-1].look.psnr == pytest.approx(compared.psnr, abs=1e-4)
     browser.visitor.swapped = True
     painter.wake(browser.visitor)
-    end = time.monotonic() + 30
-    while not np.array_equal(browser.shown[-1].picture, to_8_bits(b)):
-        assert time.monotonic() < end
-        time.sleep(0.01)
+    until(lambda: np.array_equal(browser.shown[-1].picture, to_8_bits(b)))
 
 
 def test_while_the_camera_moves_there_are_fewer_pixels(painter, gazes):
     browser = Browser()
     browser.visitor.width, browser.visitor.height = 4 * WIDTH, 4 * HEIGHT
     painter.enter(browser.visitor)
-    for number in range(12):
-        browser.look(painter, gazes[number % len(gazes)])
-        time.sleep(0.05)
-    moving = [each for each in browser.shown if not each.still]
-    assert moving
-    assert moving[0].picture.shape < (4 * HEIGHT, 4 * WIDTH, 3)
+    steps = itertools.cycle(gazes)
+
+    def moving() -> list[Shown]:
+        browser.look(painter, next(steps))
+        time.sleep(0.04)
+        return [each for each in browser.shown if not each.still]
+
+    until(moving)
+    assert moving()[0].picture.shape < (4 * HEIGHT, 4 * WIDTH, 3)
     assert browser.still().picture.shape == (4 * HEIGHT, 4 * WIDTH, 3)
 
 
@@ -123,10 +129,7 @@ def test_losses_are_those_of_compare(painter, gazes, scenes, plush_excerpt_camer
     browser = Browser()
     painter.enter(browser.visitor)
     browser.look(painter, gazes[0])
-    end = time.monotonic() + 60
-    while not painter.losses.is_complete:
-        assert time.monotonic() < end
-        time.sleep(0.02)
+    until(lambda: painter.losses.is_complete)
     time.sleep(0.3)
     compared = potr_cl.compare(*(each.scene for each in scenes), plush_excerpt_cameras[:3], device=device, split="all")
     figures = [view.figures["b_against_a"] for view in compared.figures.views]
@@ -165,16 +168,13 @@ def test_an_error_is_told_and_the_next_picture_comes(painter, gazes, monkeypatch
     with monkeypatch.context() as patch:
         patch.setattr(Rasterizer, "render_into", failing)
         browser.look(painter, gazes[1])
-        end = time.monotonic() + 30
-        while "the device has failed" not in browser.told:
-            assert time.monotonic() < end
-            time.sleep(0.01)
+        until(lambda: "the device has failed" in browser.told)
         pictures = len(browser.shown)
         time.sleep(0.5)
         assert len(browser.shown) == pictures, "it does not try the same again and again"
     browser.look(painter, gazes[2])
     browser.still()
-    assert browser.told[-1] == ""
+    until(lambda: browser.told[-1] == "")  # it is told after the picture is shown
 
 
 def test_scenes_are_replaced_between_pictures(painter, gazes, scenes):
@@ -189,10 +189,7 @@ def test_scenes_are_replaced_between_pictures(painter, gazes, scenes):
         painter.all_anew()
 
     painter.do(job)
-    end = time.monotonic() + 30
-    while browser.shown[-1].look.psnr != float("inf"):
-        assert time.monotonic() < end
-        time.sleep(0.01)
+    until(lambda: browser.shown[-1].look.psnr == float("inf"))
     assert not np.array_equal(browser.shown[-1].picture, before.picture)
 
 
@@ -252,10 +249,11 @@ def test_the_thread_ends(device, scenes):
     session = Session(lambda: device, INRIA, (0.0, 0.0, 0.0))
     session.show("A", scenes[0])
     painter = Painter(session, Losses([], None), lambda: None)
+    others = set(threading.enumerate())
     painter.start()
-    before = threading.active_count()
-    painter.stop()
-    assert threading.active_count() == before - 1
+    (own,) = set(threading.enumerate()) - others
+    painter.stop(patience=300)
+    assert not own.is_alive()
     assert painter.ask(lambda: 1) is None
 
 
@@ -283,10 +281,7 @@ def test_the_photograph_of_a_view_fades_over_it(device, scenes, plush_excerpt_ca
             browser.visitor.fade = part
             painter.wake(browser.visitor)
             painter.ask(lambda: None)
-            end = time.monotonic() + 30
             expected = bare * (1 - part) + 200 * part
-            while abs(browser.shown[-1].picture - expected).max() > 1:
-                assert time.monotonic() < end
-                time.sleep(0.01)
+            until(lambda expected=expected: abs(browser.shown[-1].picture - expected).max() <= 1)
     finally:
-        painter.stop()
+        painter.stop(patience=300)

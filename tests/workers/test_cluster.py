@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import os
 import signal
 import subprocess
@@ -28,6 +29,7 @@ from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.stages.pruning import visible_parts
 from potr_cl.workers import pace
 from potr_cl.workers.cluster import ClusterPool
+from potr_cl.workers.pool import WorkerLost
 from tests.cases.streets import street
 
 distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
@@ -37,6 +39,12 @@ OPTIONS = EncodeOptions.for_preset(
     "best", q=0.3, prune={"keep": 0.4, "iterations": 6}, refit={"at": (0.4,), "steps": 3, "drop": 1e-7}, compact=True,
     between={"views": 0},
 )  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch):
+    """A scheduler that a busy machine has just begun may take long to answer."""
+    monkeypatch.setattr("potr_cl.workers.client._CONNECT", 120.0)
 
 
 @contextlib.contextmanager
@@ -99,7 +107,7 @@ def test_the_same_bytes(workers, scene, cameras, device, expected):
         with distributed.Client(cluster, set_as_default=False) as client:
             assert potr_cl.encode(scene, cameras, OPTIONS, device=device, cluster=client).data == expected
             # A caller's client stays the caller's.
-            assert client.submit(sum, [1, 2]).result(timeout=30) == 3
+            assert client.submit(sum, [1, 2]).result(timeout=300) == 3
 
 
 @pytest.mark.slow
@@ -165,7 +173,7 @@ def test_nobody_waits_for_a_judge_that_stands_still(scene, device, judged, caplo
                 began = time.monotonic()
                 judge = evaluator.judge(candidate, lambda what, done: done and os.kill(process, signal.SIGSTOP), coded)
                 assert judge == expected
-            assert time.monotonic() - began < 30
+            assert time.monotonic() - began < 300
         finally:
             os.kill(process, signal.SIGCONT)
     assert "nobody else can judge" in caplog.text
@@ -182,6 +190,22 @@ def test_scenes_are_compared_by_a_cluster(scene, cameras, device, judged, tmp_pa
             assert [view.figures["b_against_a"].psnr for view in found.figures.views] == [
                 view.figures["b_against_a"].psnr for view in alone.figures.views
             ]
+
+
+def test_a_file_that_workers_get_is_read_once(scene, cameras, device, judged, tmp_path, monkeypatch):
+    """All judge the same bytes then, whoever writes to the file meanwhile."""
+    path, opened, plainly = tmp_path / "b.potr", [], Path.open
+    path.write_bytes(judged[0].data)
+
+    def noted(self, *args, **keywords):
+        if self == path:
+            opened.append(self)
+        return plainly(self, *args, **keywords)
+
+    monkeypatch.setattr(Path, "open", noted)
+    with local_cluster(1) as cluster:
+        potr_cl.compare(scene, path, cameras, device=device, cluster=cluster.scheduler_address)
+    assert len(opened) == 2  # for its first bytes, which tell what it is, and whole
 
 
 def looks(dask_worker):
@@ -309,7 +333,7 @@ def test_what_is_printed_when_the_cluster_is_gone(lost, tmp_path, data):
             time.sleep(1)
             for each in [scheduler] if lost == "scheduler" else workers:
                 each.kill()
-            _, said = running.communicate(timeout=120)
+            _, said = running.communicate(timeout=300)
         finally:
             running.kill()
     assert running.returncode == 1
@@ -327,7 +351,7 @@ def test_what_is_printed_when_the_cluster_is_gone(lost, tmp_path, data):
 @pytest.mark.slow
 def test_a_worker_stands_still(scene, cameras, device, expected, caplog):
     """It is waited for once, not in each stage again."""
-    with local_cluster(2) as cluster, ClusterPool(cluster.scheduler_address, device, patience=2.0) as pool:
+    with local_cluster(2) as cluster, ClusterPool(cluster.scheduler_address, device, patience=8.0) as pool:
         worker = next(iter(cluster.workers.values()))
         process, address = process_of(worker), worker.worker_address
         stopped = []
@@ -351,7 +375,7 @@ def seats(dask_worker):
     return len(dask_worker.state.actors)
 
 
-def eventually(check, seconds=60):
+def eventually(check, seconds=300):
     end = time.monotonic() + seconds
     while not check():
         assert time.monotonic() < end, "it does not come to pass"
@@ -373,7 +397,7 @@ def test_ctrl_c_leaves_no_worker_busy(tmp_path, data, scene, cameras, device, ex
             eventually(lambda: sum(client.run(seats).values()) == 2)
             time.sleep(1)
             running.send_signal(signal.SIGINT)
-            _, said = running.communicate(timeout=60)
+            _, said = running.communicate(timeout=300)
         finally:
             running.kill()
         assert running.returncode == 130
@@ -404,7 +428,7 @@ def taken():
     ],
 )
 def test_no_cluster_there(address, said, device, monkeypatch):
-    monkeypatch.setattr("potr_cl.workers.cluster._CONNECT", 0.5)
+    monkeypatch.setattr("potr_cl.workers.client._CONNECT", 0.5)
     with pytest.raises(UsageError, match=said) as error:
         ClusterPool(address, device)
     assert "\n" not in str(error.value)
@@ -431,6 +455,25 @@ def test_workers_may_come_later(scene, cameras, device, expected, monkeypatch, c
             assert all(worker.rate for worker in pool.workers())
 
 
+def test_a_newcomer_that_is_lost_as_it_is_met_is_asked_ever_more_seldom(device, monkeypatch, caplog):
+    monkeypatch.setattr("potr_cl.workers.cluster._NEW", 0.05)
+    asked = []
+
+    def lost(worker):
+        asked.append(time.monotonic())
+        raise WorkerLost(f"{worker.name} has gone")
+
+    with local_cluster(1) as cluster, ClusterPool(cluster.scheduler_address, device) as pool:
+        monkeypatch.setattr("potr_cl.workers.cluster._ClusterWorker.meet", lost)
+        cluster.scale(2)
+        eventually(lambda: len(asked) >= 5)
+        assert len(pool.workers()) == 1
+    pauses = [later - sooner for sooner, later in itertools.pairwise(asked)]
+    # However slow this computer is, none is shorter.
+    assert all(pause >= 0.05 * 2**number for number, pause in enumerate(pauses))
+    assert caplog.text.count("it is asked again later") == 1
+
+
 @pytest.mark.slow
 def test_a_slow_worker_does_not_hold_up_the_others(scene, cameras, device, expected, monkeypatch, caplog):
     """Within a stage they wait for it once; the file is the same."""
@@ -448,8 +491,8 @@ def test_a_slow_worker_does_not_hold_up_the_others(scene, cameras, device, expec
         began = time.monotonic()
         assert encode(scene, cameras, options, device=device, pool=pool).data == same
         assert f"worker {pool.names[0]} is slow: its views go to" in caplog.text
-        # Every command of the slow worker takes a second; 80 are given in each round of pruning alone.
-        assert time.monotonic() - began < 40
+        # Every command of the slow worker takes three seconds, and 80 are given in pruning alone.
+        assert time.monotonic() - began < 180
 
 
 def slow_down():
@@ -459,7 +502,7 @@ def slow_down():
     run = Seat.run
 
     def slowly(self, *args):
-        time.sleep(1.0)
+        time.sleep(3.0)
         return run(self, *args)
 
     Seat.run = slowly

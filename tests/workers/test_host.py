@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import threading
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from potr_cl.errors import DeviceError, DeviceMemoryError, UsageError
 from potr_cl.model import splat_groups
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import choose_device, choose_devices
+from potr_cl.opencl.memory import Memory
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.stages.pruning import measured, part, shared_removal, visible_parts
@@ -23,6 +25,8 @@ from potr_cl.stages.refitting.part import ColourPart
 from potr_cl.stages.refitting.targets import RenderedTargets
 from potr_cl.workers.host import HostPool
 from potr_cl.workers.opening import open_workers
+from potr_cl.workers.parts import Parts
+from potr_cl.workers.pool import Part
 from tests.cases.streets import street
 from tests.devices import FAMILIES, open_device
 
@@ -304,3 +308,32 @@ def test_large_scenes_view_by_view(monkeypatch):
     assert sum(shares) == len(cameras)
     assert found.data == expected.data
     assert [device.allocated for device in devices] == [0] * 3
+
+
+class SlowToMake(Part):
+    """Takes memory once it may, and goes on being made when somebody else has lost patience."""
+
+    def __init__(self, device, memory, begun, go):
+        begun.set()
+        assert go.wait(60)
+        self._memory = Memory(device)
+        self._memory.allocate(1 << 16, "a test")
+
+    def close(self):
+        self._memory.close()
+
+
+def test_what_is_still_being_made_is_given_back_after_ctrl_c():
+    devices = [open_device("cpu"), open_device("cpu")]
+    begun, go = threading.Event(), threading.Event()
+
+    def interrupted():
+        with HostPool(devices) as pool, ExitStack() as stack:
+            stack.callback(go.set)  # when nobody wants the part any more
+            stack.enter_context(Parts(pool, SlowToMake, [(begun, go)]))
+            assert begun.wait(60)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert [device.allocated for device in devices] == [0, 0]

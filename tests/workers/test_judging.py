@@ -255,6 +255,40 @@ def test_views_of_a_large_scene_are_judged_by_what_they_see(family, monkeypatch)
 
 
 @pytest.mark.usefixtures("_small_groups")
+def test_with_little_memory_a_decoded_file_is_judged_by_what_views_see_too(family, monkeypatch):
+    """On a CPU, whose memory is the host's: neither scene lies whole on the device."""
+    scene, cameras = street(5, 500, across=True)
+    views = EvaluationViews.of(
+        [dataclasses.replace(c, split="test" if k % 2 else "train") for k, c in enumerate(cameras)]
+    )
+    coded = CodedScene(Potr(), encode(scene, None, OPTIONS.changed(prune=False, refit=False, compact=False)).data)
+    device = open_device(family)
+    with monkeypatch.context() as patch:
+        patch.setattr(seen_rasterizer, "_LEAST_SPLATS", 1 << 30)
+        expected = judged(device, scene, coded, views)
+    projected = []
+    made = Rasterizer.__init__
+
+    def noted(self, device, scene, *args):
+        projected.append(len(scene))
+        made(self, device, scene, *args)
+
+    monkeypatch.setattr(Rasterizer, "__init__", noted)
+    with (
+        KeptScene(device, scene, memory=scene.nbytes) as kept,
+        Potr().seen(coded.data, device, memory=scene.nbytes) as candidate,
+        Evaluator(device, kept, views, BACKGROUND) as evaluator,
+    ):
+        if device.info.kind != "cpu":
+            assert isinstance(candidate, SceneBuffers)
+            return
+        assert device.allocated == 0
+        assert evaluator.judge(candidate, lambda _what, _done: None) == expected
+        assert len(projected) == 2 * (len(views.views) + len(views.beside))
+        assert np.mean(projected) < 0.4 * len(scene)
+
+
+@pytest.mark.usefixtures("_small_groups")
 def test_an_encode_leaves_the_groups_that_it_has_found(family, monkeypatch):
     monkeypatch.setattr("potr_cl.stages.pruning.visible_parts.LEAST_SPLATS", 1)
     scene, cameras = street(5, 500, across=True)

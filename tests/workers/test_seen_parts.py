@@ -17,6 +17,7 @@ from potr_cl.raster.culling import Sights
 from potr_cl.raster.rules import INRIA
 from potr_cl.raster.view_shares import Excerpt, ViewShares
 from potr_cl.stages.pruning import part, visible_parts
+from potr_cl.stages.refitting.drawn_rows import DrawnRows
 from potr_cl.stages.refitting.part import ColourPart
 from tests.cases.elsewhere import ElsewherePool
 from tests.cases.streets import street
@@ -94,6 +95,22 @@ def test_the_same_bytes(family, options, monkeypatch):
         constant = 2 * 56 * len(scene)
         assert pool.scenes < sum(made[:3]) * scene.nbytes / len(scene) + constant
     assert [device.allocated for device in devices] == [0] * 4
+
+
+def test_a_re_fit_sends_what_views_draw(family, monkeypatch):
+    """Of a direction, each worker gets the coefficients of these splats alone; what it finds is the same."""
+    scene, cameras = street(5, 500, across=True)
+    scene = with_a_house_that_nobody_sees(scene)
+    options = OPTIONS.changed(prune={"keep": None}, refit={"at": ()})
+    found, sent = [], []
+    for left_out in (False, True):
+        with monkeypatch.context() as patched, ElsewherePool([open_device(family) for _ in range(4)]) as pool:
+            if not left_out:
+                patched.setattr(DrawnRows, "are_worth_it", lambda drawn: False)
+            found.append(encode(scene, cameras, options, device=pool.first, pool=pool).data)
+            sent.append(pool.traffic.of["normal"].sent)
+    assert found[0] == found[1]
+    assert 0 < sent[1] < 0.8 * sent[0]
 
 
 def test_the_uncompressed_scene_travels_once(family, monkeypatch):

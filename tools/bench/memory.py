@@ -48,17 +48,20 @@ class Sampler(threading.Thread):
     def __init__(self, device: Device) -> None:
         super().__init__(daemon=True)
         self._device = device
+        self._lock = threading.Lock()  # what was seen before a stage began is not of it
         self.begin()
         self.start()
 
     def begin(self) -> None:
         """Forget what was seen."""
-        self.anonymous = self.device = 0.0
+        with self._lock:
+            self.anonymous = self.device = 0.0
         self._look()
 
     def _look(self) -> None:
-        self.anonymous = max(self.anonymous, resident("RssAnon"))
-        self.device = max(self.device, self._device.allocated / 1e9)
+        with self._lock:
+            self.anonymous = max(self.anonymous, resident("RssAnon"))
+            self.device = max(self.device, self._device.allocated / 1e9)
 
     def run(self) -> None:
         """Until the process ends."""
@@ -82,8 +85,8 @@ class StagePeaks:
 
     def _begin(self, stage: str) -> None:
         self._stage, self._began, self._processors = stage, time.perf_counter(), sum(os.times()[:2])
-        self._sampler.begin()
         reset_peak()
+        self._sampler.begin()
 
     def __call__(self, stage: str, done: float = 0.0) -> None:
         if stage == self._stage:

@@ -57,7 +57,15 @@ _PUBLIC = {
     ),
     "Pictures": ("render", "Rendering", "Renderings", "preview", "compare", "SceneComparison", "view"),
     "Views for scenes without cameras": ("place_cameras", "look_around", "turntable"),
-    "Errors": ("PotrError", "DataError", "UsageError", "DeviceError", "DeviceMemoryError", "UnreachableError"),
+    "Errors": (
+        "PotrError",
+        "DataError",
+        "UsageError",
+        "DeviceError",
+        "DeviceMemoryError",
+        "UnreachableError",
+        "WriteError",
+    ),
 }
 
 #: Modules that are told in full to those who build on the package or change it; of a name that ends with a dot, all

@@ -12,8 +12,8 @@ from potr_cl.model.camera import Camera, test_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
-from potr_cl.quality.compare import compare, find_ground_truth, mean_view
-from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.quality.compare import find_ground_truth, mean_view
+from potr_cl.quality.judging import Judging, Looks
 
 
 class EvaluatedScene(Owner):
@@ -41,8 +41,7 @@ class EvaluatedScene(Owner):
             raise DataError(f"'{folder / 'cameras.json'}' has no test views")
         images = folder / "images"
         self._ground_truth = find_ground_truth(images, self.views) if images.is_dir() else None
-        self._device = device
-        self._rasterizer = Rasterizer(device, self.source)
+        self._judging = Judging(device, self.source, Looks(ground_truth=self._ground_truth))
 
     def __call__(self, candidate: Scene) -> dict[str, float | None]:
         """Means over the test views.
@@ -52,8 +51,9 @@ class EvaluatedScene(Owner):
             ``truth_ssim`` against those, and ``psnr_loss`` and ``ssim_loss``, what the uncompressed scene has more.
             A PSNR of None means identical pictures.
         """
-        with Rasterizer(self._device, candidate) as rasterizer:
-            mean = mean_view(compare(self._rasterizer, rasterizer, self.views, self._ground_truth).views).figures
+        self._judging.take(candidate)
+        mean = mean_view(list(self._judging.figures(self.views))).figures
+        self._judging.forget()
         names = {"b_against_a": ("psnr", "ssim")}
         if self._ground_truth is not None:
             names["b_against_truth"] = ("truth_psnr", "truth_ssim")
@@ -76,4 +76,4 @@ class EvaluatedScene(Owner):
 
     def close(self) -> None:
         """Give the device's memory back."""
-        self._rasterizer.close()
+        self._judging.close()

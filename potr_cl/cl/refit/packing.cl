@@ -10,6 +10,20 @@ inline int may_change(global const uint *active, ulong stride, size_t splat, int
     return active[(column / 24) * stride + splat] >> (column % 24) & 1;
 }
 
+/* A flag for each coefficient of which any bit is set, that of the sign too. */
+kernel void mark_nonzero(global const float *columns, ulong stride, ulong splats, global uint *flags)
+{
+    const size_t splat = get_global_id(0);
+    if (splat >= splats)
+        return;
+    uint words[2] = {0, 0};
+    for (int column = 0; column < 3 * SH_COUNT; ++column)
+        if (as_uint(columns[column * stride + splat]))
+            words[column / 24] |= 1u << (column % 24);
+    flags[splat] = words[0];
+    flags[stride + splat] = words[1];
+}
+
 /* How many coefficients of a run of splats may change. */
 kernel void count_active(global const uint *active, ulong stride, ulong splats, global ulong *counts)
 {

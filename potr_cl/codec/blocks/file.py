@@ -6,10 +6,11 @@ taken for its splats, and with its centres afterwards.
 
 from __future__ import annotations
 
+import contextvars
 import os
 import zlib
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -21,6 +22,7 @@ from potr_cl.codec.blocks.table import BlockTable
 from potr_cl.codec.container import Header
 from potr_cl.codec.versions import VERSIONS
 from potr_cl.errors import DataError, UsageError
+from potr_cl.host import mapped
 from potr_cl.model.box import Box
 from potr_cl.model.scene import Scene, joined, most_coefficients
 
@@ -51,7 +53,7 @@ class BlockedFile(Generic[B]):
 
     Attributes:
         table: verified.
-        read: gives so many bytes of the file from an offset on, or fewer where the file has got shorter.
+        read: gives so many bytes of the file from an offset on, or fewer where it ends.
         open_body: opens a block that was read; its header is verified again.
         trust: as of :func:`potr_cl.codec.blocks.table.read_table`.
     """
@@ -155,15 +157,19 @@ class BlockedFile(Generic[B]):
         threads = threads or os.cpu_count() or 1
         at_once = max(min(_SIDE_BY_SIDE, threads, len(numbers)), 1)
         with ThreadPoolExecutor(at_once) as pool:
-            waiting = [
-                pool.submit(self.part, number, -(-threads // at_once), sh_degree, box) for number in numbers[:at_once]
-            ]
+
+            def begun(number: int) -> Future[Scene | None]:
+                # Memory that is bounded here is bounded in threads too.
+                run = contextvars.copy_context().run
+                return pool.submit(run, self.part, number, -(-threads // at_once), sh_degree, box)
+
+            waiting = [begun(number) for number in numbers[:at_once]]
             left = numbers[at_once:]
             try:
                 while waiting:
                     part = waiting.pop(0).result()
                     if left:
-                        waiting.append(pool.submit(self.part, left.pop(0), -(-threads // at_once), sh_degree, box))
+                        waiting.append(begun(left.pop(0)))
                     if part is not None:
                         yield part
             finally:
@@ -223,7 +229,7 @@ def _empty(table: BlockTable, splats: int, count: int) -> Scene:
         np.empty((splats, 3), np.float32),
         np.empty((splats, 4), np.float32),
         np.empty(splats, np.float32),
-        np.empty((count, 3, splats), np.float32).transpose(2, 0, 1),
+        mapped.array((count, 3, splats), np.float32, "SH coefficients").transpose(2, 0, 1),
         table.antialiased,
         table.low_pass,
     )

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import DataError, UsageError
+from potr_cl.host.unchanged import unchanged
 from potr_cl.model.camera import Camera
 from potr_cl.model.lens import MOST_HALF_FIELD, Lens, Pinhole
 
@@ -32,9 +33,11 @@ def read_bytes(path: Path) -> bytes:
 
     Raises:
         UsageError: it cannot be opened or read.
+        DataError: it was changed meanwhile.
     """
     try:
-        return path.read_bytes()
+        with path.open("rb") as file, unchanged(path, file):
+            return file.read()
     except (OSError, ValueError) as error:
         raise UsageError(f"cannot read '{path}': {getattr(error, 'strerror', None) or error}") from error
 

@@ -9,7 +9,6 @@ import stat
 from collections.abc import Iterator
 from contextvars import ContextVar
 from dataclasses import replace
-from io import IOBase
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import BinaryIO
 
@@ -20,6 +19,7 @@ from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.errors import DataError, PotrError, UsageError
 from potr_cl.formats.lfs_pointer import refuse_lfs_pointer
 from potr_cl.host import mapped
+from potr_cl.host.unchanged import unchanged
 from potr_cl.model.scene import LOW_PASS, CleanReport, FloatArray, Scene
 
 #: Where somebody wants to know what was mended in files that are read.
@@ -62,40 +62,6 @@ def opened(path: str | os.PathLike[str]) -> Iterator[tuple[BinaryIO, int]]:
             raise UsageError(f"'{path}' is not a regular file")
         with unchanged(path, file), reading(path):
             yield file, status.st_size
-
-
-@contextlib.contextmanager
-def unchanged(path: str | os.PathLike[str], file: IOBase) -> Iterator[None]:
-    """Of a block that reads a file: nobody may write to it meanwhile, or a part of it would be older than another.
-
-    Raises:
-        DataError: the file has another size or time of change than at the beginning, whatever else went wrong.
-    """
-    descriptor = os.dup(file.fileno())  # whoever reads may close the file
-    try:
-        before = _written(descriptor)
-        try:
-            yield
-        except DataError as error:
-            _refuse_changed(path, before, _written(descriptor), error)
-            raise
-        _refuse_changed(path, before, _written(descriptor))
-    finally:
-        os.close(descriptor)
-
-
-def _written(descriptor: int) -> tuple[int, int]:
-    status = os.fstat(descriptor)
-    return status.st_size, status.st_mtime_ns
-
-
-def _refuse_changed(
-    path: str | os.PathLike[str], before: tuple[int, int], after: tuple[int, int], error: Exception | None = None
-) -> None:
-    if after != before:
-        raise DataError(
-            f"'{path}' was changed while it was read: wait until the program that writes it has finished"
-        ) from error
 
 
 @contextlib.contextmanager

@@ -20,9 +20,10 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner, Scratch
+from potr_cl.opencl.narrow import Narrowing
 from potr_cl.opencl.relay import Lent, Relay
 from potr_cl.stages.pruning.alive_packing import AlivePacking
-from potr_cl.stages.pruning.changed_totals import AddedChanges
+from potr_cl.stages.pruning.changed_totals import AddedChanges, numbers_of
 from potr_cl.stages.pruning.fixed_point import FixedPoint, zero_totals
 from potr_cl.stages.pruning.removal import F64, Indices, RemovalSweep
 from potr_cl.stages.pruning.steering import Steered, Steering
@@ -72,6 +73,8 @@ class SharedRemoval(Owner):
         self._own, self._others, self._sparse, self._in_process = own, others, pool.sparse, pool.in_process
         self._numbers = numbers
         assert numbers is None or pool.sparse
+        self._device = device
+        self._narrowing: Narrowing | None = None
         self._fixed_point = FixedPoint.of_views(cameras)
         self._found: NDArray[np.int64] | None = None
         self._alive = np.ones(splats, bool)
@@ -156,8 +159,13 @@ class SharedRemoval(Owner):
         if self._sparse:
             if self._found is None:  # what the others have found; of removed splats anything
                 self._found = np.zeros((self.splats, 2), np.int64)
-            for part, (splats, changes) in enumerate(pending.results()):
-                self._found[splats if self._numbers is None else self._numbers_of(part)[splats]] += changes
+            if self._narrowing is None:
+                self._narrowing = self._owned.enter_context(Narrowing(self._device))
+            for part, (told, changes) in enumerate(pending.results()):
+                splats = numbers_of(told)
+                splats = splats if self._numbers is None else self._numbers_of(part)[splats]
+                for column, more in enumerate(self._narrowing.widened(changes)):
+                    self._found[splats, column] += more
             return self._found
         totals: list[NDArray[np.int64]] = pending.results()
         found = totals[0]

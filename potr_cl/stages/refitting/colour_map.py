@@ -44,6 +44,8 @@ from potr_cl.stages.refitting.view_errors import ViewErrors
 #: Bytes a splat and view of a sweep's own buffers: the colours' change and the sums.
 _CHANGE, _TOTALS = 16, 32
 
+#: Work-items of a work-group.
+_GROUP = 64
 #: Views are divided into so many parts, every second one in each, where each has as many as are enough: with 62 in
 #: each, steps by one part lost 0.01 dB on a captured scene, and 0.03 on its pictures a third as wide.
 _PARTS, ENOUGH = 2, 80
@@ -245,12 +247,21 @@ class ColourMap(Owner):
         """
         self._targets.fill(targets)
 
-    def sum_gradient(self, x: cl.Buffer, targets: Targets, blocks: cl.Buffer | None, constant: bool = False) -> None:
+    def sum_gradient(
+        self,
+        x: cl.Buffer,
+        targets: Targets,
+        blocks: cl.Buffer | None,
+        constant: bool = False,
+        drawn: cl.Buffer | None = None,
+    ) -> None:
         """Enqueue the part of :meth:`gradient` that is a sum over this device's views: it is added to :attr:`sums`.
 
         Args:
             x, targets, constant: as of :meth:`gradient`.
             blocks: (M (M + 1) / 2, n) int64, the same of the first n splats' own blocks; None: they are not wanted.
+            drawn: (stride,) uint8, becomes 1 for each splat that any of these views draws; not where each view has
+                splats of its own. None: it is not wanted.
         """
         for group in self._groups_of(None):
             for slot, numbers in zip(self._slots, group, strict=False):
@@ -259,6 +270,8 @@ class ColourMap(Owner):
                     self._view_colours.enqueue(views, self._picks(numbers), x, views.colours, None)
                     pictures = self._targets.pictures(targets, numbers)
                     self._enqueue_sweep(numbers, views, views.colours, pictures, blocks is not None, slot)
+                    if drawn is not None:
+                        self._enqueue_drawn(views, drawn)
                     # Which of them are cut, the gathering asks.
                     nbytes = _CHANGE * views.stride * len(numbers)
                     cl.enqueue_copy(self._device.queue, slot.change, views.colours, byte_count=nbytes)
@@ -370,6 +383,19 @@ class ColourMap(Owner):
             slot.totals,
             weights,
         )
+
+    def _enqueue_drawn(self, views: ViewSet, drawn: cl.Buffer) -> None:
+        """Enqueue: mark what views draw."""
+        kernel = self._device.shared_kernel("refit/drawn.cl", "mark_drawn")
+        for number, view in enumerate(views.views):
+            kernel.bind(
+                views=views.table,
+                number=number,
+                offsets=views.offsets,
+                intersections=views.intersections,
+                marks=drawn,
+            )
+            kernel.launch((-(-view.tiles // _GROUP) * _GROUP,), (_GROUP,))
 
     def _enqueue_table(self, numbers: range, group: Sequence[range], views: ViewSet) -> None:
         """Enqueue a launch's part of the table of the views that are gathered together."""

@@ -254,7 +254,13 @@ class ColourRefit(Owner):
         """A grid as :meth:`round_to` takes it. Another thread may ask for it."""
         return Steps.of(grid, self.coefficients.layout.stride)
 
-    def round_to(self, steps_of_splats: Steps, targets: Targets, options: RefitOptions) -> Solved:
+    def round_to(
+        self,
+        steps_of_splats: Steps,
+        targets: Targets,
+        options: RefitOptions,
+        after_first: Callable[[], None] = lambda: None,
+    ) -> Solved:
         """Make of the solution what a file can hold, but for the last constant coefficients.
 
         :meth:`error` still knows what it was.
@@ -262,6 +268,7 @@ class ColourRefit(Owner):
         Args:
             steps_of_splats: what the file can hold.
             targets, options: that the solution was found with.
+            after_first: called when all rounds but the last are done.
 
         Returns:
             The errors after the first round of rounding, and in the end.
@@ -282,6 +289,7 @@ class ColourRefit(Owner):
                 gone_on = solver.go_on(self.colour_map, targets, Descent(each.steps, 0.0, ridge, part=0))
                 steps += gone_on.steps
                 errors.append(gone_on.start)
+            after_first()
             round_some(solver.x, last, worth)
             solved = solver.solve(self.colour_map, targets, Descent(last.steps, 0.0, ridge, part=1), constant=True)
         return Solved((errors[0], solved.errors[1]), steps + solved.steps, solved.start)

@@ -11,12 +11,10 @@ from potr_cl.opencl.memory import Owner, Scratch, Staging
 from potr_cl.opencl.narrow import Narrowed, Narrowing
 from potr_cl.opencl.relay import Lent, Relay, done_so_far
 from potr_cl.stages.refitting.coefficients import Coefficients
+from potr_cl.stages.refitting.packed_row import PackedRow, packing_kernel
 
-_SOURCE = "refit/packing.cl"
 #: Work-items of a work-group.
 _GROUP = 64
-#: Splats whose coefficients a work-item counts one after the other.
-_RUN = 64
 #: Bytes of lent sums that are added at a time.
 _AT_ONCE = 1 << 27
 
@@ -27,52 +25,31 @@ class Packing(Owner):
     Args:
         coefficients: whose vectors and flags they are.
 
-    Attributes:
-        count: coefficients that were active when :meth:`take_flags` or :meth:`give_flags` was called last.
-
     Raises:
         DeviceError: the kernels cannot be built.
     """
 
     def __init__(self, coefficients: Coefficients) -> None:
-        self._coefficients, layout = coefficients, coefficients.layout
-        device = coefficients.device
-        self._kernels = {
-            name: device.kernel(_SOURCE, name, LANES=1, SH_COUNT=layout.sh_count, RUN=_RUN)
-            for name in (
-                "pack_floats",
-                "unpack_floats",
-                "pack_sums",
-                "add_sums",
-                "add_rows",
-                "count_active",
-                "place_active",
-            )
-        }
+        self._coefficients, device = coefficients, coefficients.device
+        self._add_rows = packing_kernel(coefficients, "add_rows")
+        self._row = PackedRow(coefficients, coefficients.active)
         self._staging = Staging(device)
         self._relay = Relay(device)
         self._narrowing = Narrowing(device)
-        self.count = 0
-        self._places = Scratch(device, "the coefficients' places")
-        self._starts = Scratch(device, "the coefficients' places")
         self._packed = Scratch(device, "the packed coefficients")
         # What comes from others has a place of its own: it arrives while the device still computes.
         self._arrived = Scratch(device, "the packed coefficients")
         # When that place is looked at no more; None: what comes next waits for everything.
         self._free: cl.Event | None = None
 
+    @property
+    def count(self) -> int:
+        """Coefficients that were active when :meth:`take_flags` or :meth:`give_flags` was called last."""
+        return self._row.count
+
     def take_flags(self) -> None:
         """Pack by the flags as they are on the device from now on."""
-        layout, device = self._coefficients.layout, self._coefficients.device
-        runs = -(-layout.splats // _RUN)
-        self._starts.reserve(8 * runs)
-        self._places.reserve(8 * layout.splats)
-        self._launch_runs("count_active", counts=self._starts.buffer)
-        counts = device.download(self._starts.buffer, (runs,), np.uint64)
-        ends = np.cumsum(counts, dtype=np.uint64)
-        self.count = int(ends[-1])
-        self._copy_to(self._starts, ends - counts)
-        self._launch_runs("place_active", starts=self._starts.buffer, places=self._places.buffer)
+        self._row.settle()
 
     def flags(self) -> NDArray[np.uint32]:
         """(2, N) uint32, the flags as they are on the device."""
@@ -93,23 +70,30 @@ class Packing(Owner):
             self._coefficients.restore_flags(words)
         self.take_flags()
 
-    def floats(self, x: cl.Buffer) -> FloatArray:
-        """(count,) float32, a vector's active coefficients; valid until something else is packed."""
-        self._packed.reserve(4 * self.count)
-        self._launch("pack_floats", x)
-        packed: FloatArray = self._staging.download(self._packed.buffer, (self.count,), np.float32)
+    def floats(self, x: cl.Buffer, row: PackedRow | None = None, staging: Staging | None = None) -> FloatArray:
+        """(count,) float32, a vector's active coefficients; valid until something else is packed.
+
+        Args:
+            x: the vector.
+            row: another row than that of all active coefficients.
+            staging: where they are put, and valid as long as nothing else is put there; None: a place of this.
+        """
+        row = row or self._row
+        self._packed.reserve(max(4 * row.count, 1))
+        row.pack_floats(x, self._packed.buffer)
+        packed: FloatArray = (staging or self._staging).download(self._packed.buffer, (row.count,), np.float32)
         return packed
 
     def lend_floats(self, x: cl.Buffer) -> Lent:
         """The same on the device, for others of this process."""
         self._packed.reserve(4 * self.count)
-        self._launch("pack_floats", x)
+        self._row.pack_floats(x, self._packed.buffer)
         return Lent(self._coefficients.device, self._packed.buffer, 4 * self.count)
 
     def set_floats(self, x: cl.Buffer, packed: FloatArray | Lent) -> None:
         """Set a vector; coefficients that are not active become 0."""
-        self._take(packed, 4)
-        self._launch("unpack_floats", x, self._arrived)
+        self._take(packed, 4, self.count)
+        self._row.unpack_floats(x, self._arrived.buffer)
         self._looked_at(packed)
 
     def sums(self, columns: cl.Buffer) -> Narrowed:
@@ -118,24 +102,25 @@ class Packing(Owner):
         All sums become 0.
         """
         self._packed.reserve(8 * self.count)
-        self._launch("pack_sums", columns)
+        self._row.pack_sums(columns, self._packed.buffer)
         return self._narrowing.download(self._packed.buffer, (self.count,))
 
     def rows(self, sums: cl.Buffer, row: int, rows: int) -> Narrowed:
         """(rows, stride) int64, rows of sums from one on; valid until something else is narrowed."""
         stride = self._coefficients.layout.stride
-        return self._narrowing.download(sums, (rows, stride), stride * row)
+        return self._narrowing.download(sums, (rows, stride), stride * row, turned=True)
 
     def lend_sums(self, columns: cl.Buffer) -> Lent:
         """The same on the device, for others of this process."""
         self._packed.reserve(8 * self.count)
-        self._launch("pack_sums", columns)
+        self._row.pack_sums(columns, self._packed.buffer)
         return Lent(self._coefficients.device, self._packed.buffer, 8 * self.count)
 
-    def add_sums(self, columns: cl.Buffer, packed: Narrowed | Lent) -> None:
-        """Add to sums over views."""
-        self._take(packed, 8)
-        self._launch("add_sums", columns, self._arrived)
+    def add_sums(self, columns: cl.Buffer, packed: Narrowed | Lent, row: PackedRow | None = None) -> None:
+        """Add to sums over views; those of another row than that of all active coefficients."""
+        row = row or self._row
+        self._take(packed, 8, row.count)
+        row.add_sums(columns, self._arrived.buffer)
         self._looked_at(packed)
 
     def add_rows(self, sums: cl.Buffer, row: int, more: Narrowed) -> None:
@@ -163,7 +148,7 @@ class Packing(Owner):
             self._looked_at(more)
 
     def _add_arrived(self, sums: cl.Buffer, start: int, count: int) -> None:
-        kernel = self._kernels["add_rows"]
+        kernel = self._add_rows
         kernel.bind(sums=sums, start=start, more=self._arrived.buffer, count=count)
         kernel.launch((-(-count // _GROUP) * _GROUP,), (_GROUP,))
 
@@ -171,11 +156,11 @@ class Packing(Owner):
         """Take a whole vector from another device, which lays it out in the same way."""
         self._relay.fetch(x, lent)
 
-    def _take(self, packed: NDArray[np.generic] | Narrowed | Lent, nbytes: int) -> None:
-        """Have packed coefficients of so many bytes each on the device."""
+    def _take(self, packed: NDArray[np.generic] | Narrowed | Lent, nbytes: int, expected: int) -> None:
+        """Have so many packed coefficients, of so many bytes each, on the device."""
         count = packed.count if isinstance(packed, Narrowed) else packed.nbytes // nbytes
-        if count != self.count:
-            raise ValueError(f"{count} packed coefficients, where {self.count} are active")
+        if count != expected:
+            raise ValueError(f"{count} packed coefficients, where {expected} are active")
         self._make_room(nbytes * count)
         if isinstance(packed, Narrowed):
             self._narrowing.upload(self._arrived.buffer, packed)
@@ -201,27 +186,9 @@ class Packing(Owner):
             with device.errors("failed while computing"):
                 cl.enqueue_copy(device.queue, scratch.buffer, array, is_blocking=True)
 
-    def _launch_runs(self, name: str, **buffers: cl.Buffer) -> None:
-        layout, kernel = self._coefficients.layout, self._kernels[name]
-        kernel.bind(active=self._coefficients.active, stride=layout.stride, splats=layout.splats, **buffers)
-        kernel.launch((-(-layout.splats // (_RUN * _GROUP)) * _GROUP,), (_GROUP,))
-
-    def _launch(self, name: str, columns: cl.Buffer, packed: Scratch | None = None) -> None:
-        layout, kernel = self._coefficients.layout, self._kernels[name]
-        kernel.bind(
-            columns=columns,
-            active=self._coefficients.active,
-            stride=layout.stride,
-            splats=layout.splats,
-            places=self._places.buffer,
-            packed=(packed or self._packed).buffer,
-        )
-        kernel.launch((-(-layout.splats // _GROUP) * _GROUP,), (_GROUP,))
-
     def close(self) -> None:
         """Give the device's memory back."""
-        self._places.close()
-        self._starts.close()
+        self._row.close()
         self._packed.close()
         self._arrived.close()
         self._staging.close()

@@ -30,6 +30,7 @@ from potr_cl.stages.refitting.launcher import launcher_for
 from potr_cl.stages.refitting.packing import Packing
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.stages.refitting.reached import reached_splats
+from potr_cl.stages.refitting.sparse_vector import SentVector, SparseVectors
 from potr_cl.stages.refitting.targets import RenderedTargets, Targets
 from potr_cl.stages.refitting.vector_space import Layout
 from potr_cl.stages.refitting.visible_targets import VisibleTargets
@@ -45,16 +46,23 @@ class Gradient:
         errors: the squared error by W of each view, by number.
         sums: (active coefficients,) int64.
         blocks: (M (M + 1) / 2, stride) int64, the sums of the splats' own blocks, where they are lent.
+        drawn: (N / 8, rounded up) uint8, a bit for each splat that the views draw, the lowest first, if that is asked:
+            whatever the others' colours are, the sums are the same, and theirs are 0.
     """
 
     errors: dict[int, float]
     sums: Narrowed | Lent
     blocks: Lent | None = None
+    drawn: NDArray[np.uint8] | None = None
 
     @property
     def nbytes(self) -> int:
         """Bytes that travel."""
-        return 16 * len(self.errors) + self.sums.nbytes + (self.blocks.nbytes if self.blocks else 0)
+        return (
+            16 * len(self.errors)
+            + self.sums.nbytes
+            + sum(each.nbytes for each in (self.blocks, self.drawn) if each is not None)
+        )
 
 
 class ColourPart(Part):
@@ -96,6 +104,8 @@ class ColourPart(Part):
             self._coefficients = owned.enter_context(Coefficients(device, layout))
             self._packing = owned.enter_context(Packing(self._coefficients))
             self._x, self._direction = self._coefficients.vector(), self._coefficients.vector()
+            self._coefficients.zero(self._x)
+            self._vectors: SparseVectors | None = None
             ahead, kept = (source, source.source) if isinstance(source, PicturesAhead) else (None, source)
             pictured = owned.enter_context(lying_on(device, kept))
             if sights is not None:
@@ -108,7 +118,7 @@ class ColourPart(Part):
                 of_source = RenderedTargets(rendering, cameras)
             here = arrived(scene)
             rasterizer = owned.enter_context(Rasterizer(device, colourless(here), rules))
-            reach = reached_splats(rasterizer, cameras, numbers, memory)
+            self._reach = reach = reached_splats(rasterizer, cameras, numbers, memory)
             self._map = owned.enter_context(
                 ColourMap(launcher, rasterizer, self._coefficients, cameras, background, memory, numbers, reach=reach)
             )
@@ -126,16 +136,21 @@ class ColourPart(Part):
         return [(*before, cameras, own, sights) for own in in_pieces(numbers, pieces, parts_of(len(cameras)))]
 
     def gradient(
-        self, x: FloatArray | Lent, flags: NDArray[np.uint32] | Lent, blocks: bool, constant: bool
+        self,
+        x: SentVector | Lent,
+        flags: NDArray[np.uint32] | Lent,
+        blocks: bool,
+        constant: bool,
+        tell_drawn: bool = False,
     ) -> Gradient:
         """What these views add to :meth:`~potr_cl.stages.refitting.colour_map.ColourMap.gradient`.
 
         Args:
-            x: (3 M, N or more) float32, the columns of the coefficients. If they are lent, the sums are lent too, and
-                the blocks with them.
+            x: the coefficients. If they are lent, the sums are lent too, and the blocks with them.
             flags: (2, N) uint32, which of them are active.
             blocks: whether the splats' own blocks are wanted; see :meth:`block_rows`.
             constant: whether only the constant coefficients are active.
+            tell_drawn: whether it is asked which splats the views draw.
         """
         self._forget_blocks()
         layout = self._coefficients.layout
@@ -143,17 +158,47 @@ class ColourPart(Part):
         if isinstance(x, Lent):
             self._packing.fetch(self._x, x)
         else:
-            self._coefficients.write_columns(self._x, x)
+            if self._vectors is None:
+                self._vectors = self._owned.enter_context(SparseVectors(self._coefficients))
+            self._vectors.give(self._x, x)
         if blocks:
             triangle = layout.sh_count * (layout.sh_count + 1) // 2
             self._block_sums = self._blocks.allocate(8 * triangle * layout.stride, "the splats' normal equations")
             self._coefficients.zero(self._block_sums)
-        self._map.sum_gradient(self._x, self._targets, self._block_sums, constant)
+        drawn = None
+        with Memory(self._device) as memory:
+            marks = None
+            if tell_drawn and self._reach is None:
+                marks = memory.allocate(layout.stride, "the splats that views draw")
+                self._device.fill(marks, np.uint8(0))
+            self._map.sum_gradient(self._x, self._targets, self._block_sums, constant, marks)
+            if tell_drawn:
+                drawn = self._drawn(marks)
         if isinstance(x, Lent):
             sums = self._packing.lend_sums(self._map.sums)
             lent = None if self._block_sums is None else Lent(self._device, self._block_sums, self._block_sums.size)
             return Gradient(self._map.found_errors(), sums, lent)
-        return Gradient(self._map.found_errors(), self._packing.sums(self._map.sums))
+        return Gradient(self._map.found_errors(), self._packing.sums(self._map.sums), drawn=drawn)
+
+    def leave_out(self, drawn: NDArray[np.uint8]) -> None:
+        """Have no coefficient active of splats that these views do not draw.
+
+        Args:
+            drawn: (N / 8, rounded up) uint8, those that they draw, as of :attr:`Gradient.drawn`.
+        """
+        self._packing.give_flags(self._packing.flags() * unpacked(drawn, self._coefficients.layout.splats))
+
+    def _drawn(self, marks: cl.Buffer | None) -> NDArray[np.uint8]:
+        """A bit for each splat that is marked, or that any view reaches."""
+        splats = self._coefficients.layout.splats
+        if marks is not None:
+            found = self._device.download(marks, (splats,), np.uint8)
+        else:
+            assert self._reach is not None
+            found = np.zeros(splats, np.uint8)
+            for numbers in self._reach.of.values():
+                found[numbers] = 1
+        return np.packbits(found, bitorder="little")
 
     def block_rows(self, first: int, rows: int) -> Narrowed:
         """Some rows of the sums of the splats' own blocks after a gradient; valid until the next call.
@@ -192,3 +237,8 @@ class ColourPart(Part):
     def close(self) -> None:
         """Give all device memory back."""
         self._owned.close()
+
+
+def unpacked(bits: NDArray[np.uint8], splats: int) -> NDArray[np.bool_]:
+    """(N,), the splats whose bits are set, as of :attr:`Gradient.drawn`."""
+    return np.unpackbits(bits, count=splats, bitorder="little").astype(bool)

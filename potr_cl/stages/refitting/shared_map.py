@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
+from numpy.typing import NDArray
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
-from potr_cl.opencl.memory import Owner, Staging
+from potr_cl.opencl.memory import Owner
+from potr_cl.opencl.narrow import Narrowed
 from potr_cl.opencl.relay import Lent
 from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import KeptScene
@@ -20,11 +23,13 @@ from potr_cl.raster.view_shares import ViewShares
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.colour_map import parts_of
 from potr_cl.stages.refitting.coming_scene import AnyScene, arrived
+from potr_cl.stages.refitting.drawn_rows import DrawnRows
 from potr_cl.stages.refitting.packing import Packing
-from potr_cl.stages.refitting.part import ColourPart, Gradient
+from potr_cl.stages.refitting.part import ColourPart, Gradient, unpacked
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
+from potr_cl.stages.refitting.sparse_vector import SentVector, SparseVectors
 from potr_cl.workers.dealing import Shares, shares
-from potr_cl.workers.parts import Parts, Pending
+from potr_cl.workers.parts import Each, Parts, Pending
 from potr_cl.workers.pool import Pool, Shared
 
 #: Bytes of the splats' own blocks that are added at a time.
@@ -50,28 +55,41 @@ class SharedViews(Owner):
         self._coefficients, self._others, self._in_process = coefficients, others, in_process
         self._x: Lent | None = None
         self._packing = Packing(coefficients)
-        self._columns = Staging(coefficients.device)
+        self._vectors = None if in_process else SparseVectors(coefficients)
         self._pending: Pending | None = None
+        # Which splats the others' views draw, the first gradient tells; for one alone nothing is left out.
+        self._ask_drawn = not in_process and len(others) > 1
+        self._drawn: DrawnRows | None = None
 
     def begin_gradient(self, x: cl.Buffer, blocks: bool, constant: bool) -> None:
         """Have them begin with a gradient at x."""
+        flags: Lent | Each | NDArray[np.uint32]
         flags = self._packing.lend_flags() if self._in_process else self._packing.flags()
-        self._pending = self._others.begin("gradient", self._sent(x), flags, blocks, constant, anew=True)
+        if self._drawn is not None:
+            assert isinstance(flags, np.ndarray)
+            flags = Each(self._drawn.take_flags(flags))
+        args = (self._sent(x), flags, blocks, constant, self._ask_drawn)
+        self._pending = self._others.begin("gradient", *args, anew=True)
         self._packing.take_flags()
 
-    def _sent(self, x: cl.Buffer) -> Lent | FloatArray:
+    def _sent(self, x: cl.Buffer) -> Lent | SentVector:
+        if self._vectors is not None:
+            return self._vectors.take(x)
         layout = self._coefficients.layout
-        if self._in_process:
-            self._x = Lent(self._coefficients.device, x, 4 * layout.columns * layout.stride)
-            return self._x
-        columns: FloatArray = self._columns.download(x, (layout.columns, layout.stride), np.float32)
-        return columns[:, : layout.splats]
+        self._x = Lent(self._coefficients.device, x, 4 * layout.columns * layout.stride)
+        return self._x
 
     def begin_normal(self, direction: cl.Buffer, at: cl.Buffer, unit: float, constant: bool, part: int | None) -> None:
         """Have them begin with a product of the normal matrix."""
         if self._x is not None:
             self._x.lend(at)  # a part that is made again asks for it; where it was before it may have changed
-        packed = self._packing.lend_floats(direction) if self._in_process else self._packing.floats(direction)
+        packed: Lent | Each | FloatArray
+        if self._in_process:
+            packed = self._packing.lend_floats(direction)
+        elif self._drawn is not None:
+            packed = Each(self._drawn.floats(direction))
+        else:
+            packed = self._packing.floats(direction)
         self._pending = self._others.begin("normal", packed, unit, constant, part, logged=False)
 
     def add(self, sums: cl.Buffer, blocks: cl.Buffer | None) -> dict[int, float]:
@@ -79,12 +97,18 @@ class SharedViews(Owner):
         pending, self._pending = self._pending, None
         assert pending is not None, "nothing was begun"
         errors: dict[int, float] = {}
-        results = pending.results()
-        for found in results:
-            if isinstance(found, Gradient):
-                errors |= found.errors
-                found = found.sums
-            self._packing.add_sums(sums, found)
+        results: list[Any] = pending.results()
+        for place, result in enumerate(results):
+            errors |= result.errors if isinstance(result, Gradient) else {}
+            found = result.sums if isinstance(result, Gradient) else result
+            if self._drawn is not None:
+                assert isinstance(found, Narrowed)
+                self._drawn.add_sums(sums, self._others.origin(place), found)
+            else:
+                self._packing.add_sums(sums, found)
+        if self._ask_drawn:
+            self._ask_drawn = False
+            self._note_drawn(results)
         if blocks is not None and not self._in_process:
             self._add_blocks(blocks, None)
         elif blocks is not None:
@@ -94,6 +118,19 @@ class SharedViews(Owner):
                 else:
                     self._add_blocks(blocks, place)
         return errors
+
+    def _note_drawn(self, results: Sequence[Gradient]) -> None:
+        """Have the others' views get no more from now on than what they draw, if that is less."""
+        drawn: dict[int, NDArray[np.bool_]] = {}
+        for place, found in enumerate(results):
+            assert found.drawn is not None
+            part, seen = self._others.origin(place), unpacked(found.drawn, self._coefficients.layout.splats)
+            drawn[part] = drawn[part] | seen if part in drawn else seen
+        if DrawnRows.are_worth_it(drawn):
+            self._drawn = DrawnRows(self._coefficients, self._packing, drawn)
+            self._drawn.take_flags(self._packing.flags())
+            bits = [np.packbits(drawn[part], bitorder="little") for part in range(len(drawn))]
+            self._others.tell("leave_out", Each(bits))
 
     def _add_blocks(self, blocks: cl.Buffer, place: int | None) -> None:
         """Add those of one part, or of all: some rows at a time, as all of them take more memory than anything else."""
@@ -111,8 +148,11 @@ class SharedViews(Owner):
 
     def close(self) -> None:
         """Give the master's device memory back; the parts are the caller's."""
+        if self._drawn is not None:
+            self._drawn.close()
         self._packing.close()
-        self._columns.close()
+        if self._vectors is not None:
+            self._vectors.close()
 
 
 def colour_shares(pool: Pool, views: int) -> Shares:

@@ -163,15 +163,37 @@
     return svg;
   }
 
+  // What is pressed in the panel is not made anew before it is let go: a click needs the same element at both ends.
+  let pressed = false;
+  const waiting = new Set();
+  window.addEventListener("pointerdown", event => {
+    pressed = event.target instanceof Element && event.target.closest("[data-potr]") !== null;
+  }, true);
+  for (const end of ["pointerup", "pointercancel"])
+    window.addEventListener(end, () => setTimeout(() => {  // behind the click
+      pressed = false;
+      if (waiting.size) refresh([...waiting]);
+      waiting.clear();
+    }), true);
+
   function refresh(names) {
+    const focused = document.activeElement && document.activeElement.dataset.view;
     for (const box of document.querySelectorAll("[data-potr]")) {
       const name = box.dataset.potr;
       if (!fill[name] || (names && !names.includes(name) && box.dataset.filled)) continue;
+      if (pressed && box.dataset.filled) {
+        waiting.add(name);
+        continue;
+      }
       const list = box.querySelector(".potr-views"), scrolled = list ? list.scrollTop : 0;
       box.replaceChildren();
       fill[name](box);
       box.dataset.filled = "yes";
       if (scrolled) box.querySelector(".potr-views").scrollTop = scrolled;
+    }
+    if (focused !== undefined && !document.activeElement.dataset.view) {
+      const row = document.querySelector(`[data-view="${focused}"]`);
+      if (row) row.focus({ preventScroll: true });
     }
   }
 

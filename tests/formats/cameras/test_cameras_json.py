@@ -10,6 +10,7 @@ import pytest
 
 from potr_cl.formats import load_cameras
 from tests.cases.cameras import pixel, refused, view, write_image, write_json
+from tests.cases.own_warnings import warnings_are_errors
 
 
 def test_cameras_json_is_camera_to_world(tmp_path: Path) -> None:
@@ -66,6 +67,6 @@ def test_cameras_json_with_equal_names(tmp_path: Path, caplog: pytest.LogCapture
         ({"img_name": ""}, "'img_name' is '', not the name"),
     ],
 )
-@pytest.mark.filterwarnings("error")
+@warnings_are_errors
 def test_bad_views_in_cameras_json(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
     refused(write_json(tmp_path / "cameras.json", [view(**changes)]), message)

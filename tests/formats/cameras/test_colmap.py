@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from potr_cl import UsageError
 from potr_cl.formats import load_cameras
 from tests.cases.cameras import load_or_refuse, refused, write_image
+from tests.cases.own_warnings import warnings_are_errors
 
 
 @pytest.fixture
@@ -226,7 +227,7 @@ def test_numbers_that_only_python_reads(text_model_lines: Callable[[str], Path],
     refused(text_model_lines(f"1 PINHOLE {field} 742 800 800 495 371\n"), "is not a whole number|is truncated")
 
 
-@pytest.mark.filterwarnings("error")
+@warnings_are_errors
 @pytest.mark.parametrize("model", ["plush_sparse_binary", "plush_sparse_text"])
 @given(draw=st.data())
 @settings(max_examples=200, deadline=None)

@@ -14,6 +14,7 @@ from potr_cl.formats import load_cameras
 from potr_cl.model.lens import Lens
 from tests.cases.cameras import IDENTITY, nerfstudio, pixel, refused, write_image, write_json
 from tests.cases.images import png_of
+from tests.cases.own_warnings import warnings_are_errors
 
 
 def test_transforms_have_opengl_axes(tmp_path: Path) -> None:
@@ -202,7 +203,7 @@ def test_bad_dataparser_transforms(tmp_path: Path) -> None:
         refused(path, message)
 
 
-@pytest.mark.filterwarnings("error")
+@warnings_are_errors
 @pytest.mark.parametrize(
     ("size", "message"),
     [

@@ -18,6 +18,7 @@ from potr_cl import DataError, PotrError, Scene, UsageError
 from potr_cl.formats import load_scene
 from potr_cl.formats.scenes import ply
 from potr_cl.reference.scenes import random_scene
+from tests.cases.own_warnings import warnings_are_errors
 
 XYZ = ["x", "y", "z"]
 NORMALS = ["nx", "ny", "nz"]
@@ -197,7 +198,7 @@ def test_drops_non_finite_splats_and_mends_zero_quaternions(tmp_path: Path, capl
     assert "turned 1 quaternions of length zero" in caplog.text
 
 
-@pytest.mark.filterwarnings("error")
+@warnings_are_errors
 def test_a_double_too_large_for_float32_drops_its_splat(tmp_path: Path) -> None:
     scene = random_scene(10, degree=0)
     path = write(tmp_path / "a.ply", scene, types={"x": "double"})
@@ -421,14 +422,14 @@ def check_mutations(draw: st.DataObject, seeds: list[bytes], folder: Path) -> No
     load_or_refuse(bytes(content), folder)
 
 
-@pytest.mark.filterwarnings("error")
+@warnings_are_errors
 @given(draw=st.data())
 @settings(max_examples=300, deadline=None)
 def test_mutated_files(draw: st.DataObject, fuzz_seeds: list[bytes], tmp_path_factory: pytest.TempPathFactory) -> None:
     check_mutations(draw, fuzz_seeds, tmp_path_factory.getbasetemp())
 
 
-@pytest.mark.filterwarnings("error")
+@warnings_are_errors
 @given(tokens=st.lists(st.sampled_from(TOKENS), max_size=40), body=st.binary(max_size=60))
 @settings(max_examples=300, deadline=None)
 def test_made_up_headers(tokens: list[bytes], body: bytes, tmp_path_factory: pytest.TempPathFactory) -> None:
@@ -437,7 +438,7 @@ def test_made_up_headers(tokens: list[bytes], body: bytes, tmp_path_factory: pyt
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("error")
+@warnings_are_errors
 @given(draw=st.data())
 @settings(max_examples=5_000, deadline=None)
 def test_many_mutated_files(

@@ -1,0 +1,106 @@
+"""Files that somebody writes while they are read."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import potr_cl
+from potr_cl.codec.decoder import open_file
+from potr_cl.errors import DataError
+from potr_cl.formats import load_cameras
+from potr_cl.host.unchanged import unchanged
+from tests.cli.calls import cameras_json
+
+SAID = r"was changed while it was read: wait until the program that writes it has finished"
+
+
+@pytest.fixture
+def written_while_read(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], None]:
+    """Has a byte of a file written once it has been opened."""
+
+    def prepare(path: Path) -> None:
+        os.utime(path, ns=(0, 0))
+        plainly = Path.open
+
+        def opened(self: Path, mode: str = "r", *args: Any, **keywords: Any) -> Any:
+            file = plainly(self, mode, *args, **keywords)
+            if self == path and mode == "rb":
+                read = file.read
+
+                def disturbed(size: int = -1) -> bytes:
+                    with plainly(path, "r+b") as writer:
+                        writer.seek(-1, os.SEEK_END)
+                        writer.write(b" ")
+                    return read(size)
+
+                file = _Disturbed(file, disturbed)
+            return file
+
+        monkeypatch.setattr(Path, "open", opened)
+
+    return prepare
+
+
+class _Disturbed:
+    """An open file whose content is read in another way."""
+
+    def __init__(self, file: Any, read: Callable[[int], bytes]) -> None:
+        self._file, self.read = file, read
+
+    def __enter__(self) -> _Disturbed:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._file.close()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+
+def test_cameras(tmp_path: Path, written_while_read: Callable[[Path], None]) -> None:
+    path = cameras_json(tmp_path / "cameras.json")
+    written_while_read(path)
+    with pytest.raises(DataError, match=rf"cameras\.json' {SAID}$"):
+        load_cameras(path)
+
+
+def test_a_compressed_scene(tmp_path: Path, data: Path, written_while_read: Callable[[Path], None]) -> None:
+    path = tmp_path / "a.potr"
+    shutil.copy(data / "golden_v3_degree3_steps.potr", path)
+    written_while_read(path)
+    with pytest.raises(DataError, match=rf"^'[^']*a\.potr' {SAID}$"):
+        potr_cl.decode(path)
+
+
+@pytest.mark.parametrize("how", ["replaced", "written"])
+def test_a_file_of_blocks_that_is_written_between_two_of_them(tmp_path: Path, data: Path, how: str) -> None:
+    """Another encode may end meanwhile, whose file takes this one's place."""
+    path = tmp_path / "a.potr"
+    shutil.copy(data / "golden_v4_degree1_antialiased_blocks.potr", path)
+    file = open_file(path)
+    if how == "replaced":
+        shutil.copy(path, tmp_path / "b.potr")
+        (tmp_path / "b.potr").replace(path)
+    else:
+        os.utime(path, ns=(1, 1))
+    with pytest.raises(DataError, match=rf"a\.potr' {SAID}$"):
+        file.scene()  # type: ignore[union-attr]
+    assert len(potr_cl.decode(path))
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes on this system")
+def test_a_pipe_is_not_said_to_change(tmp_path: Path) -> None:
+    path = tmp_path / "pipe"
+    os.mkfifo(path)
+    writer = threading.Thread(target=path.write_bytes, args=(bytes(1000),))
+    writer.start()
+    with path.open("rb") as file, unchanged(path, file):
+        assert len(file.read()) == 1000
+    writer.join()
