@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import TimeoutError as NotInTime
 from contextlib import ExitStack, contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
@@ -36,6 +37,8 @@ _POLL_GROWS, _MOST_POLL = 1.5, 1.0
 _NEW = 2.0
 #: Seconds in which the handle of a part arrives once it is made.
 _FETCH = 30.0
+#: Seconds in which the scheduler says who is alive: at once, unless it stands still, or the client is closed meanwhile.
+_WHO = 120.0
 #: Threads that wait for workers.
 _MOST_WAITING = 256
 
@@ -120,7 +123,7 @@ class ClusterPool(Pool):
     def _alive(self) -> set[str]:
         """Addresses of the workers that the scheduler knows."""
         try:
-            return set(self.client.nthreads())
+            return set(self.client.sync(self.client.scheduler.ncores, callback_timeout=_WHO))
         except Exception as error:
             raise WorkerLost(
                 f"the cluster's scheduler does not answer any more ({first_line(error)}): start it and its workers, "
@@ -395,8 +398,9 @@ class _HeldThere(Held):
             self._pool.begin(lambda: self._worker.ask("drop", self._number))
 
     def close(self) -> None:
-        with suppress(PotrError):
-            self._pool.begin(lambda: self._worker.ask("drop", self._number)).result()
+        # One that stands still, though Dask knows it, is not waited for ever: it forgets the part when it goes on.
+        with suppress(PotrError, NotInTime):
+            self._pool.begin(lambda: self._worker.ask("drop", self._number)).result(self._pool.patience)
 
 
 def _check(address: str, version: str, name: str, family: str, first: Device) -> None:

@@ -168,8 +168,12 @@ class Parts(Owner):
                 # Nobody waits for it, and nobody wants it: its memory is given back as soon as it is made.
                 each.add_done_callback(_abandon_made)
             else:
-                with suppress(PotrError):
-                    held[place] = each.result()
+                try:
+                    held[place] = self._answer(each)
+                except WorkerLost:
+                    each.add_done_callback(_abandon_made)  # it stands still: when it goes on, nobody wants it
+                except PotrError:
+                    pass
         for part, by in zip(held, self._by, strict=True):
             if part is not None:
                 with suppress(PotrError):

@@ -11,7 +11,9 @@ reached, or does not know this package, goes on as before.
 from __future__ import annotations
 
 import asyncio
+import threading
 import weakref
+from collections.abc import Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +25,8 @@ if TYPE_CHECKING:
 #: Milliseconds between two looks. A loop that is looked at less often than every three seconds seems to hang.
 _SELDOM = {"tick": 1000.0, "monitor": 5000.0, "profile": 2000.0}
 _NAME = "potr_cl seldom looks"
+#: Seconds to wait for the cluster: its scheduler waits for all of its processes, also for one that stands still.
+_MOST = 60.0
 
 #: Milliseconds of each server of this process as they were, while it looks seldom.
 _before: weakref.WeakKeyDictionary[Any, dict[str, float]] = weakref.WeakKeyDictionary()
@@ -34,19 +38,34 @@ def look_seldom_for(client: Client) -> None:
     Workers that come later do so too.
     """
     name = f"{_NAME} {client.id}"
-    with suppress(Exception):
-        # The scheduler first: it sees to the end of all of them.
-        client.register_plugin(_OfScheduler(client.id, name), name)
-        client.register_plugin(_OfWorkers(), name)
-        client.register_plugin(_OfNannies(), name)
+
+    def register() -> None:
+        with suppress(Exception):
+            # The scheduler first: it sees to the end of all of them.
+            client.register_plugin(_OfScheduler(client.id, name), name)
+            client.register_plugin(_OfWorkers(), name)
+            client.register_plugin(_OfNannies(), name)
+
+    _wait_for(register)
 
 
 def look_as_before_for(client: Client) -> None:
     """Undo :func:`look_seldom_for` for a client that stays; the scheduler waits until it leaves."""
-    if client.status == "running":
+
+    def unregister() -> None:
         for nanny in (False, True):
             with suppress(Exception):
                 client.unregister_worker_plugin(f"{_NAME} {client.id}", nanny=nanny)
+
+    if client.status == "running":
+        _wait_for(unregister)
+
+
+def _wait_for(work: Callable[[], None]) -> None:
+    """Have something done, and wait for it, but not for ever; a process that ends does not wait for it either."""
+    thread = threading.Thread(target=work, name=_NAME, daemon=True)
+    thread.start()
+    thread.join(_MOST)
 
 
 def look_seldom(server: Any) -> None:

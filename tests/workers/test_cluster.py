@@ -29,7 +29,8 @@ from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.stages.pruning import visible_parts
 from potr_cl.workers import pace
 from potr_cl.workers.cluster import ClusterPool
-from potr_cl.workers.pool import WorkerLost
+from potr_cl.workers.parts import Parts
+from potr_cl.workers.pool import Part, WorkerLost
 from tests.cases.streets import street
 
 distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
@@ -39,6 +40,13 @@ OPTIONS = EncodeOptions.for_preset(
     "best", q=0.3, prune={"keep": 0.4, "iterations": 6}, refit={"at": (0.4,), "steps": 3, "drop": 1e-7}, compact=True,
     between={"views": 0},
 )  # fmt: skip
+
+
+#: The program ``potr-cl``, as patient as the tests are with a scheduler. One that is gone is waited for as long.
+PATIENT_PROGRAM = [
+    sys.executable, "-c", "import sys; from potr_cl import __main__; from potr_cl.workers import client; "
+    "client._CONNECT = 30.0; sys.exit(__main__.main())",
+]  # fmt: skip
 
 
 @pytest.fixture(autouse=True)
@@ -323,13 +331,16 @@ def test_what_is_printed_when_the_cluster_is_gone(lost, tmp_path, data):
     output = tmp_path / "out.potr"
     with processes_of_a_cluster(2) as (address, (scheduler, *workers)):
         command = [
-            sys.executable, "-m", "potr_cl", "encode", data / "plush_excerpt.ply", "-o", output, "--cameras",
+            *PATIENT_PROGRAM, "encode", data / "plush_excerpt.ply", "-o", output, "--cameras",
             data / "plush_excerpt_cameras.json", "--cluster", address, "--iterations", "5000",
             "--keep", "0.001", "--no-quality", "--views-between", "0",
         ]  # fmt: skip
         running = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
         try:
-            before = "".join(iter(lambda: running.stderr.readline(), "prune …\n"))
+            before = ""
+            while "prune …" not in (line := running.stderr.readline()):
+                assert line, f"it has ended before pruning: {before}"
+                before += line
             time.sleep(1)
             for each in [scheduler] if lost == "scheduler" else workers:
                 each.kill()
@@ -370,6 +381,54 @@ def test_a_worker_stands_still(scene, cameras, device, expected, caplog):
     assert caplog.text.count(f"worker {address} gave up (it does not answer)") == 1
 
 
+@contextlib.contextmanager
+def standing_still(process):
+    os.kill(process, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        os.kill(process, signal.SIGCONT)
+
+
+class Idle(Part):
+    """Does nothing."""
+
+    def __init__(self, device, memory):
+        pass
+
+    def close(self):
+        pass
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="sends a signal")
+def test_nobody_waits_for_ever_in_the_end(device, monkeypatch):
+    """For a worker that stands still, though Dask takes it for alive for minutes."""
+    monkeypatch.setattr("potr_cl.workers.seldom_looks._MOST", 2.0)
+    with local_cluster(1) as cluster, distributed.Client(cluster, set_as_default=False) as client:
+        (worker,) = cluster.workers.values()
+        with contextlib.ExitStack() as still:
+
+            def left():
+                with ClusterPool(client, device, patience=2.0) as pool, Parts(pool, Idle, [()]) as parts:
+                    parts.ready()
+                    still.enter_context(standing_still(process_of(worker)))
+
+            leaving = threading.Thread(target=left, daemon=True)
+            leaving.start()
+            leaving.join(200)
+            assert not leaving.is_alive()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="sends a signal")
+def test_a_scheduler_that_stands_still_is_told(device, monkeypatch):
+    with processes_of_a_cluster(1) as (address, (scheduler, _)), ClusterPool(address, device) as pool:
+        monkeypatch.setattr("potr_cl.workers.cluster._WHO", 1.0)
+        with standing_still(scheduler.pid), pytest.raises(WorkerLost, match="scheduler does not answer any more"):
+            pool.workers()
+
+
 def seats(dask_worker):
     """On a worker: how many seats there are."""
     return len(dask_worker.state.actors)
@@ -388,7 +447,7 @@ def test_ctrl_c_leaves_no_worker_busy(tmp_path, data, scene, cameras, device, ex
     output = tmp_path / "out.potr"
     with local_cluster(2) as cluster, distributed.Client(cluster, set_as_default=False) as client:
         command = [
-            sys.executable, "-m", "potr_cl", "encode", data / "plush_excerpt.ply", "-o", output, "--cameras",
+            *PATIENT_PROGRAM, "encode", data / "plush_excerpt.ply", "-o", output, "--cameras",
             data / "plush_excerpt_cameras.json", "--cluster", cluster.scheduler_address, "--iterations", "5000",
             "--keep", "0.001", "--no-quality", "--views-between", "0",
         ]  # fmt: skip

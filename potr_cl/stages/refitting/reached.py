@@ -71,7 +71,7 @@ def reached_splats(
         memory: bytes of the device's memory that the user would have taken; None: as much as there is.
 
     Returns:
-        None where views had better share all splats: there are few, or views reach many of them,.
+        None where views had better share all splats: there are few, or views reach many of them.
 
     Raises:
         DeviceError: a view with all splats does not fit the device.
