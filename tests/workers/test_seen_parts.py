@@ -10,6 +10,7 @@ from itertools import chain
 import numpy as np
 import pytest
 
+from potr_cl.errors import DeviceMemoryError
 from potr_cl.model import splat_groups
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
@@ -18,6 +19,7 @@ from potr_cl.raster.rules import INRIA
 from potr_cl.raster.view_shares import Excerpt, ViewShares
 from potr_cl.stages.pruning import part, visible_parts
 from potr_cl.stages.refitting.drawn_rows import DrawnRows
+from potr_cl.stages.refitting.packed_row import PackedRow
 from potr_cl.stages.refitting.part import ColourPart
 from tests.cases.elsewhere import ElsewherePool
 from tests.cases.streets import street
@@ -111,6 +113,27 @@ def test_a_re_fit_sends_what_views_draw(family, monkeypatch):
             sent.append(pool.traffic.of["normal"].sent)
     assert found[0] == found[1]
     assert 0 < sent[1] < 0.8 * sent[0]
+
+
+def test_a_re_fit_without_room_for_that_sends_all(monkeypatch):
+    """The bytes are the same, and nothing stays taken."""
+    scene, cameras = street(5, 500, across=True)
+    scene = with_a_house_that_nobody_sees(scene)
+    options = OPTIONS.changed(prune={"keep": None}, refit={"at": ()})
+    devices = [open_device("cpu") for _ in range(4)]
+    expected = encode(scene, cameras, options, device=devices[0]).data
+    refused = []
+
+    class WithoutRoom(PackedRow):
+        def settle(self):
+            refused.append(self)
+            raise DeviceMemoryError("no room")
+
+    monkeypatch.setattr("potr_cl.stages.refitting.drawn_rows.PackedRow", WithoutRoom)
+    with ElsewherePool(devices) as pool:
+        assert encode(scene, cameras, options, device=devices[0], pool=pool).data == expected
+    assert refused
+    assert [device.allocated for device in devices] == [0] * 4
 
 
 def test_the_uncompressed_scene_travels_once(family, monkeypatch):

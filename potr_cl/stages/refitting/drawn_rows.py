@@ -24,12 +24,12 @@ class DrawnRows(Owner):
     """Rows of active coefficients, one for each part of the views.
 
     Args:
-        coefficients: whose vectors are packed.
+        coefficients: whose vectors are packed, by their flags as they are now until :meth:`take_flags`.
         packing: of the same.
         drawn: (N,) which splats the views of each part draw, by the part's number.
 
     Raises:
-        DeviceError: the device has no room.
+        DeviceMemoryError: the device has no room.
     """
 
     def __init__(self, coefficients: Coefficients, packing: Packing, drawn: Mapping[int, NDArray[np.bool_]]) -> None:
@@ -40,6 +40,7 @@ class DrawnRows(Owner):
             self._flags = [memory.allocate(8 * self._layout.stride, "the active coefficients") for _ in self._drawn]
             self._rows = [owned.enter_context(PackedRow(coefficients, flags)) for flags in self._flags]
             self._staging = [owned.enter_context(Staging(self._device)) for _ in self._drawn]
+            self.take_flags(packing.flags())
             self._owned = owned.pop_all()
 
     @staticmethod

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
+from potr_cl.errors import DeviceMemoryError
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.memory import Owner
@@ -127,8 +128,9 @@ class SharedViews(Owner):
             part, seen = self._others.origin(place), unpacked(found.drawn, self._coefficients.layout.splats)
             drawn[part] = drawn[part] | seen if part in drawn else seen
         if DrawnRows.are_worth_it(drawn):
-            self._drawn = DrawnRows(self._coefficients, self._packing, drawn)
-            self._drawn.take_flags(self._packing.flags())
+            with suppress(DeviceMemoryError):  # a device without room for that many rows goes on with one for all
+                self._drawn = DrawnRows(self._coefficients, self._packing, drawn)
+        if self._drawn is not None:
             bits = [np.packbits(drawn[part], bitorder="little") for part in range(len(drawn))]
             self._others.tell("leave_out", Each(bits))
 
