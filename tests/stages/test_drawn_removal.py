@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -47,6 +49,21 @@ def test_some_views_stay_and_others_pass(device):
         removal(device, SOME) as got,
     ):
         assert 0 < got.kept_views < len(cameras)
+        assert_same_bits(wanted, got, scene, np.random.default_rng(1))
+
+
+@pytest.mark.parametrize("memory", [0, None])
+def test_views_that_draw_nothing_are_views_too(device, memory):
+    scene, cameras = street()
+    away = dataclasses.replace(cameras[0], translation=cameras[0].translation + np.array([0, 0, -500.0]))
+    cameras = [away, *cameras, away]
+    parts, options = parts_of_views(scene, cameras, INRIA.near), SweepOptions(0.0, memory=memory)
+    with (
+        Rasterizer(device, scene) as rasterizer,
+        RemovalSweep(rasterizer, cameras, SweepOptions(0.0)) as wanted,
+        DrawnRemoval(device, scene, scene, cameras, parts, options) as got,
+    ):
+        assert got.kept_views == (2 if memory == 0 else len(cameras))
         assert_same_bits(wanted, got, scene, np.random.default_rng(1))
 
 

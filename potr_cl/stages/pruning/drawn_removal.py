@@ -120,7 +120,7 @@ class DrawnRemoval(Owner):
     Attributes:
         splats: N.
         steering: None: the host decides.
-        kept_views: views that stay prepared.
+        kept_views: views that stay prepared, or draw nothing.
 
     Raises:
         DeviceError: a view does not fit the device.
@@ -148,6 +148,7 @@ class DrawnRemoval(Owner):
         self._fixed_point = FixedPoint.of_views(cameras)
         self._alive = np.ones(self.splats, bool)
         self._views: list[_View] = []
+        self._idle: list[int] = []  # views that draw nothing: nothing is ever measured there
         memory = default_memory(device) if options.memory is None else options.memory
         passing = int(_PASSING * memory)
         left, done = memory - passing, 0
@@ -165,7 +166,9 @@ class DrawnRemoval(Owner):
             others: list[_Drawn] = []
             # The widest first: they take most while they are made, and most again each time if they are not kept.
             for view in sorted(found, key=lambda each: (-each.nbytes, each.number)):
-                if view.nbytes <= left and _MAKING * view.count <= left - view.nbytes + passing:
+                if not view.count:
+                    self._idle.append(view.number)
+                elif view.nbytes <= left and _MAKING * view.count <= left - view.nbytes + passing:
                     self._keep(view.number, view.part.splats[view.drawn])
                     left -= view.nbytes
                 else:
@@ -173,7 +176,7 @@ class DrawnRemoval(Owner):
             for part in parts:
                 self._pass([view for view in others if view.part is part], passing)
             self._owned = owned.pop_all()
-        self.kept_views = len(self._views)
+        self.kept_views = len(self._views) + len(self._idle)
 
     def _find_drawn(self, part: ViewPart) -> list[_Drawn]:
         """What the views of a part draw, each by itself."""
@@ -201,8 +204,6 @@ class DrawnRemoval(Owner):
 
     def _keep(self, number: int, splats: Indices) -> None:
         """Have a view stay prepared."""
-        if not len(splats):
-            return  # nothing is ever measured there
         device, scene = self._device, self._scene
         own = SceneBuffers(device, len(splats), scene.sh.shape[1], scene.antialiased, scene.low_pass)
         self._owned.enter_context(own)
@@ -316,7 +317,8 @@ class DrawnRemoval(Owner):
     def known_importances(self) -> Iterator[tuple[int, Indices, F64]]:
         """:meth:`view_importances` right after :meth:`sweep_changed`."""
         found = [self._importances(view) for view in self._views]
-        yield from heapq.merge(*found, self._passing.importances(self._alive), key=lambda each: each[0])
+        idle = ((number, np.zeros(0, np.int64), np.zeros(0)) for number in sorted(self._idle))
+        yield from heapq.merge(*found, idle, self._passing.importances(self._alive), key=lambda each: each[0])
 
     def _importances(self, view: _View) -> Iterator[tuple[int, Indices, F64]]:
         for number, seen, importances in view.sweep.known_importances():
