@@ -325,7 +325,8 @@ class SceneBuffers(Owner):
             ]
 
         with Memory(self.device) as memory, Ahead(taken, range(0, self.splats, _TAKEN)) as made:
-            room = memory.allocate(12 * self.sh_count * min(self.splats, _TAKEN) + 16, "a scene's parameters")
+            widest = max(3 * self.sh_count, 4)  # of rotations
+            room = memory.allocate(4 * widest * min(self.splats, _TAKEN), "a scene's parameters")
             for start, found in made:
                 for parameter, rows, what in found:
                     self.write_rows(parameter, rows, what, start=start, room=room)

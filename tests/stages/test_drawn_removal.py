@@ -95,9 +95,12 @@ def test_views_that_pass_are_measured_when_they_have_lost_enough(device):
             assert np.array_equal(wanted[left], got[left])
 
 
-def test_some_splats_of_the_host_go_to_the_device_as_all_do(device):
-    """Piece by piece, of more than one piece."""
+@pytest.mark.parametrize("sh_count", [1, 4])
+def test_some_splats_of_the_host_go_to_the_device_as_all_do(device, sh_count):
+    """Piece by piece, of more than one piece; also where no parameter has more columns than rotations have."""
     scene, _ = street(2, 50_000)
+    scene = dataclasses.replace(scene, sh=scene.sh[:, :sh_count])
+    assert scene.sh.shape[1] == sh_count
     splats = np.flatnonzero(np.arange(len(scene)) % 7 > 0)
     with (
         uploaded(device, scene.subset(splats)) as wanted,
