@@ -54,6 +54,15 @@ def with_a_house_that_nobody_sees(scene):
     return dataclasses.replace(scene, **named)
 
 
+def smaller(camera, width):
+    factor = width / camera.width
+    height = round(camera.height * factor)
+    return dataclasses.replace(
+        camera, width=width, height=height, fx=camera.fx * factor, fy=camera.fy * factor, cx=width / 2,
+        cy=camera.cy * factor,
+    )  # fmt: skip
+
+
 def array_fields(scene):
     return [f for f in dataclasses.fields(scene) if isinstance(getattr(scene, f.name), np.ndarray)]
 
@@ -113,6 +122,32 @@ def test_a_re_fit_sends_what_views_draw(family, monkeypatch):
             sent.append(pool.traffic.of["normal"].sent)
     assert found[0] == found[1]
     assert 0 < sent[1] < 0.8 * sent[0]
+
+
+@pytest.mark.parametrize("lost_at", [3, 6])
+def test_who_is_told_again_is_told_the_colours_of_then(lost_at, monkeypatch, plush_excerpt, plush_excerpt_cameras):
+    """Of two re-fits on the way; the worker is lost after the first or the second one."""
+    monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1 << 40)
+    options = EncodeOptions.for_preset(
+        "best", q=0.3, prune={"keep": 0.4, "iterations": 8}, refit={"at": (0.3, 0.6), "steps": 3, "drop": 1e-7},
+        between=False,
+    )  # fmt: skip
+    cameras = [smaller(camera, 80) for camera in plush_excerpt_cameras[:5]]
+    devices = [open_device("cpu") for _ in range(3)]
+    expected = encode(plush_excerpt, cameras, options, device=devices[0]).data
+    measure, asked = part.RemovalPart.measure_changes, []
+
+    def losing(removal):
+        if not asked or asked[0] is removal:
+            asked.append(removal)
+            if asked.count(removal) == lost_at:
+                raise DeviceMemoryError("no room")
+        return measure(removal)
+
+    monkeypatch.setattr(part.RemovalPart, "measure_changes", losing)
+    with ElsewherePool(devices) as pool:
+        assert encode(plush_excerpt, cameras, options, device=devices[0], pool=pool).data == expected
+    assert asked.count(asked[0]) == lost_at
 
 
 def test_a_re_fit_without_room_for_that_sends_all(monkeypatch):

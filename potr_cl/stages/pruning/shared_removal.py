@@ -108,7 +108,9 @@ class SharedRemoval(Owner):
     def replace_sh(self, sh: FloatArray) -> None:
         """Continue with other colours, (N, M, 3) float32 of the same degree. The target pictures stay as they are."""
         numbers = self._numbers
-        pending = self._others.begin("replace_sh", sh if numbers is None else Each([sh[own] for own in numbers]))
+        # Copies: who does a lost worker's views later is told the same, whatever has become of the caller's array.
+        told = sh.copy() if numbers is None else Each([sh[own] for own in numbers])
+        pending = self._others.begin("replace_sh", told)
         if self._own is not None:
             self._own.replace_sh(sh)
         pending.results()
