@@ -362,7 +362,7 @@ def test_what_is_printed_when_the_cluster_is_gone(lost, tmp_path, data):
 @pytest.mark.slow
 def test_a_worker_stands_still(scene, cameras, device, expected, caplog):
     """It is waited for once, not in each stage again."""
-    with local_cluster(2) as cluster, ClusterPool(cluster.scheduler_address, device, patience=8.0) as pool:
+    with local_cluster(2) as cluster, ClusterPool(cluster.scheduler_address, device, patience=20.0) as pool:
         worker = next(iter(cluster.workers.values()))
         process, address = process_of(worker), worker.worker_address
         stopped = []
