@@ -43,6 +43,20 @@ def test_a_marked_test_passes_foreign_warnings_over(kind):
         warnings.warn("ours", RuntimeWarning, stacklevel=1)
 
 
+@warnings_are_errors
+def test_what_others_forget_is_none_of_ours():
+    """As a library's coroutine that nobody awaits, which Python collects when it likes; or a thread that ends so."""
+
+    async def forgotten():
+        pass
+
+    _ = forgotten()
+    del _
+    thread = threading.Thread(target=warnings.warn, args=("not ours", RuntimeWarning))
+    thread.start()
+    thread.join()
+
+
 def test_the_log_is_this_packages(caplog):
     logging.getLogger("somebody.else").warning("not ours")
     assert not caplog.records

@@ -151,7 +151,8 @@ def encode(
             workers = stack.enter_context(open_workers(device, cluster))
         opened, pool = (None, None) if workers is None else (workers.device, workers.pool)
         before = Traffic() if pool is None else replace(pool.traffic)
-        file = stack.enter_context(replacing_or_keeping(output)) if output is not None else None
+        own = stack.enter_context(contextlib.ExitStack())
+        file = own.enter_context(replacing_or_keeping(output)) if output is not None else None
         page = stack.enter_context(replacing(report)) if report is not None else None
         found: Found | None = None
         kept: KeptScene | None = None
@@ -169,6 +170,7 @@ def encode(
         written = stack.enter_context(proved(encoded, trust, judged_on))
         if file is not None:
             file.write(written.data)
+            own.close()  # a report that fails takes nothing from the file
         if page is not None:
             quality: dict[str, Any] | str = "not judged: there are no cameras to look from"
             pictures: list[PicturePair] = []

@@ -275,18 +275,17 @@ def open_file(source: bytes | str | os.PathLike[str], trust: bool = False) -> An
         return _opened(source, len(source), trust, lambda offset, nbytes: source[offset : offset + nbytes])
     path = Path(source)
     try:
-        with path.open("rb") as file:
-            status = os.fstat(file.fileno())
+        with path.open("rb") as file, unchanged(path, file):
+            status, state = os.fstat(file.fileno()), state_of(file.fileno())
             if not (stat.S_ISREG(status.st_mode) or stat.S_ISFIFO(status.st_mode)):
                 raise UsageError(f"'{path}' is not a regular file")
             # The header must be sound before the rest is worth its memory.
             start = file.read(FIXED_BYTES)
             if stat.S_ISREG(status.st_mode) and is_of_blocks(start):
                 start += file.read(max(min(header_bytes_of(start), status.st_size) - len(start), 0))
-                return _opened(start, status.st_size, trust, partial(_read, path, state_of(file.fileno())))
+                return _opened(start, status.st_size, trust, partial(_read, path, state))
             if start.startswith(container.MAGIC):
-                with unchanged(path, file):
-                    start += file.read()
+                start += file.read()
         return _opened(
             start, max(len(start), status.st_size), trust, lambda offset, nbytes: start[offset : offset + nbytes]
         )

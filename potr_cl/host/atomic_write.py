@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from potr_cl.errors import UnwritableError, UsageError, WriteError
+from potr_cl.errors import UnwritableError, WriteError
 from potr_cl.host.leftovers import removed_at_end
 
 
@@ -94,7 +94,7 @@ def _mode_of_existing(target: Path, path: str | os.PathLike[str]) -> int | None:
     except OSError as error:
         raise UnwritableError(f"cannot write '{path}': {error.strerror}", os.fspath(path)) from error
     if stat.S_ISDIR(mode):
-        raise UsageError(f"cannot write '{path}': it is a directory; give the name of a file")
+        raise UnwritableError(f"cannot write '{path}': it is a directory; give the name of a file", os.fspath(path))
     if not stat.S_ISREG(mode):
-        raise UsageError(f"cannot write '{path}': it is not a regular file")
+        raise UnwritableError(f"cannot write '{path}': it is not a regular file", os.fspath(path))
     return stat.S_IMODE(mode)

@@ -16,8 +16,15 @@ import pytest
 #: Kinds of warnings that come when they like, from whatever thread. Nothing in the package gives one of these.
 FOREIGN: tuple[type[Warning], ...] = (cl.CompilerWarning, ResourceWarning)
 
-#: For a test that fails at any warning but foreign ones.
-warnings_are_errors = pytest.mark.filterwarnings("error", "ignore::pyopencl.CompilerWarning", "ignore::ResourceWarning")
+#: For a test that fails at any warning but foreign ones. What pytest tells of errors elsewhere is foreign too: warnings
+#: that became errors in the garbage collector, or in a thread that another test has left.
+warnings_are_errors = pytest.mark.filterwarnings(
+    "error",
+    "ignore::pyopencl.CompilerWarning",
+    "ignore::ResourceWarning",
+    "ignore::pytest.PytestUnraisableExceptionWarning",
+    "ignore::pytest.PytestUnhandledThreadExceptionWarning",
+)
 
 
 @contextmanager

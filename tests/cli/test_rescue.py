@@ -116,6 +116,16 @@ def test_from_python(tmp_path, scene_path, cameras_path, temporary):
     assert np.array_equal(refitted.means, ply.load(scene_path).means)
 
 
+def test_a_report_that_cannot_be_written_takes_nothing_from_the_file(tmp_path, scene_path, cameras_path):
+    (tmp_path / "gone").mkdir()
+    with pytest.raises(potr_cl.WriteError, match=r"page\.html': the folder '.*gone' is gone$"):
+        potr_cl.encode(
+            scene_path, cameras_path, preset="fast", output=tmp_path / "a.potr", report=tmp_path / "gone" / "page.html",
+            progress=lambda what, done: shutil.rmtree(tmp_path / "gone", ignore_errors=True),
+        )  # fmt: skip
+    assert len(potr_cl.decode(tmp_path / "a.potr")) > 0
+
+
 def test_a_ladder(tmp_path, scene_path, temporary):
     """A quality that cannot be written is kept; so is the description, where it alone cannot."""
     folder = tmp_path / "ladder"

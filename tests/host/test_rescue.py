@@ -36,7 +36,8 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     if shutil.which("mount") is None or subprocess.run(mount, capture_output=True, check=False).returncode:
         pytest.skip("no file system can be mounted here")
     yield folder
-    subprocess.run(["umount", str(folder)], check=True)
+    # Lazily: whoever looks at all that is mounted may be in it for a moment.
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)
 
 
 def told_place(message: str) -> Path:
@@ -95,6 +96,17 @@ def test_what_several_calls_write(tmp_path: Path, places: tuple[Path, Path]) -> 
         "meta.json": "meta.json",
         "beside.webp": "beside.webp",
     }
+
+
+def test_a_folder_that_has_come_where_the_file_belongs(tmp_path: Path, places: tuple[Path, Path]) -> None:
+    def write(path: Path) -> None:
+        with replacing(path) as file:
+            file.write(b"precious")
+
+    (tmp_path / "scene.ply").mkdir()
+    with pytest.raises(WriteError, match="it is a directory; give the name of a file; the result is kept") as caught:
+        written_or_kept(tmp_path / "scene.ply", write)
+    assert told_place(str(caught.value)).read_bytes() == b"precious"
 
 
 def test_no_room_anywhere(tmp_path: Path, places: tuple[Path, Path]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import threading
@@ -22,12 +23,12 @@ SAID = r"was changed while it was read: wait until the program that writes it ha
 
 
 @pytest.fixture
-def written_while_read(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], None]:
-    """Has a byte of a file written once it has been opened."""
+def written_while_read(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Has a byte of a file written once it has been opened, before each time that it is read or before the first."""
 
-    def prepare(path: Path) -> None:
+    def prepare(path: Path, times: float = math.inf) -> None:
         os.utime(path, ns=(0, 0))
-        plainly = Path.open
+        plainly, written = Path.open, []
 
         def opened(self: Path, mode: str = "r", *args: Any, **keywords: Any) -> Any:
             file = plainly(self, mode, *args, **keywords)
@@ -35,9 +36,11 @@ def written_while_read(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], None
                 read = file.read
 
                 def disturbed(size: int = -1) -> bytes:
-                    with plainly(path, "r+b") as writer:
-                        writer.seek(-1, os.SEEK_END)
-                        writer.write(b" ")
+                    if len(written) < times:
+                        written.append(size)
+                        with plainly(path, "r+b") as writer:
+                            writer.seek(-1, os.SEEK_END)
+                            writer.write(b" ")
                     return read(size)
 
                 file = _Disturbed(file, disturbed)
@@ -64,17 +67,22 @@ class _Disturbed:
         return getattr(self._file, name)
 
 
-def test_cameras(tmp_path: Path, written_while_read: Callable[[Path], None]) -> None:
+def test_cameras(tmp_path: Path, written_while_read: Callable[..., None]) -> None:
     path = cameras_json(tmp_path / "cameras.json")
     written_while_read(path)
     with pytest.raises(DataError, match=rf"cameras\.json' {SAID}$"):
         load_cameras(path)
 
 
-def test_a_compressed_scene(tmp_path: Path, data: Path, written_while_read: Callable[[Path], None]) -> None:
+@pytest.mark.parametrize("times", [1, math.inf])
+@pytest.mark.parametrize("name", ["golden_v3_degree3_steps", "golden_v4_degree1_antialiased_blocks"])
+def test_a_compressed_scene(
+    tmp_path: Path, data: Path, written_while_read: Callable[..., None], name: str, times: float
+) -> None:
+    """Also one that is written only while its header is read."""
     path = tmp_path / "a.potr"
-    shutil.copy(data / "golden_v3_degree3_steps.potr", path)
-    written_while_read(path)
+    shutil.copy(data / f"{name}.potr", path)
+    written_while_read(path, times)
     with pytest.raises(DataError, match=rf"^'[^']*a\.potr' {SAID}$"):
         potr_cl.decode(path)
 

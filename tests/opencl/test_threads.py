@@ -34,10 +34,10 @@ def test_a_thread_that_fails_takes_nothing_from_another(device: Device) -> None:
     def goes_on() -> None:
         try:
             with device.all_or_nothing():
-                entered.wait(1120)  # now the other one has begun, and is the last that did
+                entered.wait(120)  # now the other one has begun, and is the last that did
                 kept.append(device.upload(array, "a test"))
                 failed.set()
-                other.join(1120)
+                other.join(120)
                 kept.append(device.upload(array + 1, "a test"))
         except BaseException as error:
             errors.append(error)
@@ -45,7 +45,7 @@ def test_a_thread_that_fails_takes_nothing_from_another(device: Device) -> None:
     def is_cancelled() -> None:
         with contextlib.suppress(KeyboardInterrupt), device.all_or_nothing():
             entered.set()
-            failed.wait(1120)
+            failed.wait(120)
             device.allocate(1000, "a test")
             raise KeyboardInterrupt
 

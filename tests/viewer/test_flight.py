@@ -52,6 +52,12 @@ class Camera:
         self.told = Gaze(np.asarray(self.position, float), rotation_of(wxyz) @ around, self.fov), time.monotonic()
 
 
+@pytest.fixture(autouse=True)
+def patient(monkeypatch):
+    """A camera that arrives is waited for, however busy the machine is."""
+    monkeypatch.setattr("potr_cl.viewer.flight.LANDING", 300.0)
+
+
 @pytest.fixture
 def gazes(plush_excerpt_cameras) -> list[Gaze]:
     return [gaze_on(camera, 1.5) for camera in plush_excerpt_cameras]

@@ -363,7 +363,7 @@ def test_what_is_printed_when_the_cluster_is_gone(lost, tmp_path, data):
 def test_a_worker_stands_still(scene, cameras, device, expected, monkeypatch, caplog):
     """It is waited for once, not in each stage again."""
     monkeypatch.setattr(pace, "_AT_LEAST", 600.0)  # it is not merely slow
-    with local_cluster(2) as cluster, ClusterPool(cluster.scheduler_address, device, patience=8.0) as pool:
+    with local_cluster(2) as cluster, ClusterPool(cluster.scheduler_address, device, patience=20.0) as pool:
         worker = next(iter(cluster.workers.values()))
         process, address = process_of(worker), worker.worker_address
         stopped = []
