@@ -251,7 +251,7 @@ def coded_for(workers: Workers, source: SceneSource, trust: bool = False) -> Cod
     None for anything else.
 
     Raises:
-        UsageError: it cannot be read.
+        As :func:`potr_cl.api.inputs.coded_scene`.
     """
     far = workers.pool is not None and not workers.pool.in_process
     return coded_scene(source, trust) if far else None

@@ -12,6 +12,7 @@ from potr_cl.codec.blocks.file import BlockedFile
 from potr_cl.codec.container import MAGIC
 from potr_cl.codec.decoder import AnyFile, PotrFile, decode, open_file
 from potr_cl.errors import DataError, UsageError
+from potr_cl.host.unchanged import unchanged
 from potr_cl.model.camera import Camera, test_views, train_views
 from potr_cl.model.scene import Scene, joined
 
@@ -149,6 +150,7 @@ def coded_scene(source: SceneSource, trust: bool = False) -> CodedScene | None:
 
     Raises:
         UsageError: it cannot be read.
+        DataError: it was changed meanwhile.
     """
     if not _is_potr(source):
         return None
@@ -159,7 +161,8 @@ def coded_scene(source: SceneSource, trust: bool = False) -> CodedScene | None:
     if data is None:
         assert isinstance(source, (str, os.PathLike))
         try:
-            data = Path(source).read_bytes()
+            with Path(source).open("rb") as file, unchanged(source, file):
+                data = file.read()
         except OSError as error:
             raise UsageError(f"cannot read '{source}': {error.strerror}") from None
     return CodedScene(Potr(), data, trust)

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 import potr_cl
+from potr_cl.api.inputs import coded_scene
 from potr_cl.codec.decoder import open_file
 from potr_cl.errors import DataError
 from potr_cl.formats import load_cameras
@@ -27,12 +28,14 @@ def written_while_read(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Has a byte of a file written once it has been opened, before each time that it is read or before the first."""
 
     def prepare(path: Path, times: float = math.inf) -> None:
-        os.utime(path, ns=(0, 0))
         plainly, written = Path.open, []
 
         def opened(self: Path, mode: str = "r", *args: Any, **keywords: Any) -> Any:
+            watched = self == path and mode == "rb"
+            if watched:  # what is written now is of another time, however coarse the clock of the file system is
+                os.utime(path, ns=(0, 0))
             file = plainly(self, mode, *args, **keywords)
-            if self == path and mode == "rb":
+            if watched:
                 read = file.read
 
                 def disturbed(size: int = -1) -> bytes:
@@ -85,6 +88,16 @@ def test_a_compressed_scene(
     written_while_read(path, times)
     with pytest.raises(DataError, match=rf"^'[^']*a\.potr' {SAID}$"):
         potr_cl.decode(path)
+
+
+def test_a_compressed_scene_for_other_computers(
+    tmp_path: Path, data: Path, written_while_read: Callable[..., None]
+) -> None:
+    path = tmp_path / "a.potr"
+    shutil.copy(data / "golden_v3_degree3_steps.potr", path)
+    written_while_read(path)
+    with pytest.raises(DataError, match=rf"a\.potr' {SAID}$"):
+        coded_scene(path)
 
 
 @pytest.mark.parametrize("how", ["replaced", "written"])

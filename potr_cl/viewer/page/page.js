@@ -177,7 +177,7 @@
     }), true);
 
   function refresh(names) {
-    const focused = document.activeElement && document.activeElement.dataset.view;
+    const focused = document.activeElement?.dataset.view;
     for (const box of document.querySelectorAll("[data-potr]")) {
       const name = box.dataset.potr;
       if (!fill[name] || (names && !names.includes(name) && box.dataset.filled)) continue;
@@ -191,7 +191,7 @@
       box.dataset.filled = "yes";
       if (scrolled) box.querySelector(".potr-views").scrollTop = scrolled;
     }
-    if (focused !== undefined && !document.activeElement.dataset.view) {
+    if (focused !== undefined && !document.activeElement?.dataset.view) {
       const row = document.querySelector(`[data-view="${focused}"]`);
       if (row) row.focus({ preventScroll: true });
     }
