@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from potr_cl.codec.bundles import encoder
+from potr_cl.codec.bundles import encoder, native_encoder
 from potr_cl.codec.bundles.decoder import Reader, Wanted
 from potr_cl.codec.bundles.sections import MAIN, ORDER, ROTATION
 from potr_cl.codec.decoder import PotrFile
@@ -160,6 +160,18 @@ def test_both_paths_write_the_same_bytes(monkeypatch, splats, spread):
         monkeypatch.setenv(VARIABLE, way)
         coded.append(encoder.encode(values, classes))
     assert coded[0] == coded[1]
+
+
+def test_streams_that_several_threads_ask_for_first(monkeypatch):
+    """Each may get its own, as where blocks are coded side by side; the bytes are the same."""
+    monkeypatch.delenv(VARIABLE, raising=False)
+    if native() is None:
+        pytest.skip("the compiled library is not there")
+    values = integers(400, spread=200)
+    classes = classes_of(values, steps_of(400))
+    expected = encoder.encode(values, classes)
+    monkeypatch.setattr(native_encoder, "streams_of", native_encoder.streams_of.__wrapped__)
+    assert encoder.encode(values, classes) == expected
 
 
 def test_a_part_of_the_bundles_and_of_the_sections(path):

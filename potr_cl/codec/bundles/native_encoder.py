@@ -44,7 +44,10 @@ def encode_natively(
 ) -> dict[Key, bytes]:
     """:func:`potr_cl.codec.bundles.encoder.encode` of integers that :func:`narrow` lets through."""
     bundles = Bundles(len(values[MAIN[0]][0]))
-    streams = [stream for key in ORDER for stream in streams_of(*key)]
+    # Asked for once: threads that ask for the first time side by side get each their own.
+    of_section = [streams_of(*key) for key in ORDER]
+    streams = [stream for own in of_section for stream in own]
+    first_of_section = np.cumsum([0, *map(len, of_section)]).tolist()
     of_degrees = [(index, section) for (prop, index), section in values.items() if prop == Property.SH and index]
     encoder = functions.bundle_encoder(
         bundles.splats,
@@ -78,7 +81,7 @@ def encode_natively(
 
     def section(number: int) -> bytes:
         key = ORDER[number]
-        own = [each for each in fitted if each.stream in streams_of(*key)]
+        own = fitted[first_of_section[number] : first_of_section[number + 1]]
         first = None
         if key in states:
             first = np.concatenate([part[:lanes] for part, lanes in zip(states[key], bundles.lanes, strict=True)])
