@@ -109,6 +109,7 @@ def twice(tmp_path: Path, *commands: str) -> None:
     assert {row["same bytes"] for row in rows} == {"yes"}
 
 
+@pytest.mark.slow
 def test_files_are_the_same_the_second_time(tmp_path):
     twice(tmp_path, "decode", "convert to spz")
 

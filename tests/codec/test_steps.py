@@ -75,6 +75,7 @@ def skip_without_library(monkeypatch):
         pytest.skip("the compiled library is not there")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("degree", "splats", "entropy"), [(3, 700, "context"), (1, 900, "zstd"), (0, 300, "npz")])
 def test_the_independent_decoder_agrees(degree, splats, entropy, path):
     scene = random_scene(splats, degree, seed=degree)

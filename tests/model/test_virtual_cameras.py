@@ -199,6 +199,7 @@ def test_colours_tell_the_side_that_was_photographed(around_ball, degree):
     assert np.mean(blind[:, 2] < 0) > 0.3
 
 
+@pytest.mark.slow
 def test_colours_tell_a_room_from_an_object():
     rng = np.random.default_rng(4)
     from_inside = trained(ROOM, -WALLS, rng.uniform(-0.6, 0.6, (60, 3)) * INSIDE_ROOM)
@@ -304,6 +305,7 @@ def test_lego_is_looked_at_from_above(lego):
     assert 1.3 < np.median(distance) < 5
 
 
+@pytest.mark.slow
 def test_plush_is_looked_at_from_where_it_was_photographed(plush):
     scene, cameras = load_scene(plush / "point_cloud.ply"), load_cameras(plush / "cameras.json")
     centres, true = camera_centres(place_cameras(scene)), camera_centres(cameras)

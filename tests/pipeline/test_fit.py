@@ -121,6 +121,7 @@ def test_a_search_fits(device, plush_excerpt, plush_excerpt_cameras, target, kep
         assert round(math.exp(found.value)) == again.nbytes <= target.max_bytes
 
 
+@pytest.mark.slow
 def test_what_files_said_of_one_quality_is_not_asked_of_another(device, plush_excerpt, plush_excerpt_cameras):
     """A search goes on with other qualities from what has been fitted: its last options have to make the same file."""
     coarse = HALF.changed(q=0.3)

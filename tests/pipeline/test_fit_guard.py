@@ -38,6 +38,7 @@ def few(cameras, count):
     return [views[round(place)] for place in np.linspace(0, len(views) - 1, count)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("views", "threshold", "steps"),
     [
@@ -72,6 +73,7 @@ def test_what_pays_is_taken(judged, plush_excerpt_cameras):
     assert made.fitted.spared == 0, "where as many splats go as a fit is to make up for, it does not pay here"
 
 
+@pytest.mark.slow
 def test_without_room_to_compare_files_the_fit_judges_itself(judged, plush_excerpt_cameras, monkeypatch):
     def no_room(*anything):
         raise DeviceMemoryError("two scenes at a time do not fit")

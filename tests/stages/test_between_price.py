@@ -128,6 +128,7 @@ def test_scenes_that_are_seen_whole_and_the_papers_preset_stay_as_they_are(
     assert paper.parameters == HyperParameters.from_quality(0.5, "paper")
 
 
+@pytest.mark.slow
 def test_a_search_and_an_encode_with_what_it_found_are_the_same(device, plush_excerpt, plush_excerpt_cameras):
     scene, cameras = row(plush_excerpt, train_views(plush_excerpt_cameras), 4)
     options = EncodeOptions.for_preset("best", cameras_anyway=True, prune={"iterations": 4}, refit={"steps": 2})

@@ -62,6 +62,7 @@ def test_where_views_are_made_again_in_batches_some_are_added_anyway():
     assert found[-1] == len(cameras[1::2])
 
 
+@pytest.mark.slow
 def test_elsewhere_as_many_as_fit_with_what_each_may_draw(monkeypatch):
     device = open_device("cpu")
     memories = [k << 20 for k in range(0, 60, 3)]

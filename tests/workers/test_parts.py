@@ -132,6 +132,7 @@ def test_a_silent_worker_is_given_up():
     assert course(FakePool(FakeWorker("a", 4, silent=True), FakeWorker("b"), patience=PATIENCE)) == EXPECTED
 
 
+@pytest.mark.slow
 def test_who_should_do_it_instead_is_silent_too():
     """Several stand still at the same time; each is waited for once."""
     workers = FakeWorker("a", 3, silent=True), FakeWorker("b", 4, silent=True), FakeWorker("c")

@@ -186,6 +186,7 @@ def test_the_uncompressed_scene_travels_once(family, monkeypatch):
         assert pool.scenes < scene.nbytes + constant
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("keep", [0.4, None])
 def test_workers_with_gpus_look_at_each_view_with_what_it_may_draw(keep, monkeypatch):
     """As a GPU with memory of its own does: a CPU that runs its kernels has none."""

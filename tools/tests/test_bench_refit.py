@@ -16,6 +16,7 @@ def call(monkeypatch, *arguments):
     bench_refit.main()
 
 
+@pytest.mark.slow
 def test_measure_and_report(monkeypatch, tmp_path, data, capsys):
     scene = tmp_path / "excerpt"
     scene.mkdir()

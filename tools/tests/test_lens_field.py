@@ -11,6 +11,7 @@ import pytest
 from tools.study import lens_field
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k1", [-0.15, 0.1])
 def test_table(monkeypatch, tmp_path, data, capsys, k1):
     shutil.copy(data / "plush_excerpt.ply", tmp_path / "point_cloud.ply")
