@@ -46,12 +46,12 @@ if TYPE_CHECKING:
     from potr_cl.formats import load_cameras, load_scene, read_cameras, read_scene
     from potr_cl.model.camera import Camera
     from potr_cl.model.scene import Scene
-    from potr_cl.model.viewpoints import look_around, turntable
-    from potr_cl.model.virtual_cameras import place_cameras
     from potr_cl.pipeline.encoded import Encoded
     from potr_cl.pipeline.options import EncodeOptions
     from potr_cl.pipeline.search import encode_to_target
     from potr_cl.pipeline.target import Target
+    from potr_cl.placement.viewpoints import look_around, turntable
+    from potr_cl.placement.virtual import place_cameras
 
 __version__ = "0.1.0"
 
@@ -136,8 +136,8 @@ _HOMES = {
     "info": "api.describing",
     "load_cameras": "formats",
     "load_scene": "formats",
-    "look_around": "model.viewpoints",
-    "place_cameras": "model.virtual_cameras",
+    "look_around": "placement.viewpoints",
+    "place_cameras": "placement.virtual",
     "preview": "api.pictures",
     "prune": "api.editing",
     "read_cameras": "formats",
@@ -145,7 +145,7 @@ _HOMES = {
     "refit": "api.editing",
     "render": "api.pictures",
     "save": "api.files",
-    "turntable": "model.viewpoints",
+    "turntable": "placement.viewpoints",
     "view": "api.viewing",
 }
 

@@ -14,9 +14,7 @@ import pytest
 
 from potr_cl import Camera, Scene
 from potr_cl.formats import load_cameras, load_scene
-from potr_cl.model import agreement, virtual_cameras
-from potr_cl.model.placement.candidates import Candidates, Run
-from potr_cl.model.placement.matter import Frame, Matter
+from potr_cl.model import agreement
 from potr_cl.opencl.loader import register_runtimes
 
 DATA = Path(__file__).parent / "data"
@@ -76,25 +74,6 @@ def judged_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(agreement, "judge_cameras", judged)
         yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def candidates_once() -> Iterator[dict[bytes, Candidates]]:
-    """Places that virtual cameras could stand at are found once for the same scene: they take most of a second.
-
-    Gives what is known; a test that wants to see them found again empties it.
-    """
-    find, known = virtual_cameras.candidates_of, {}
-
-    def found(frame: Frame, matter: Matter, half_view: float, run: Run) -> Candidates:
-        key = hashlib.sha256(pickle.dumps((frame, matter, half_view))).digest()
-        if key not in known:
-            known[key] = find(frame, matter, half_view, run)
-        return known[key]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(virtual_cameras, "candidates_of", found)
-        yield known
 
 
 @pytest.fixture(scope="session")

@@ -19,7 +19,7 @@ bench.presets          what does each preset take, by stage and as a whole comma
 bench.whole_command    what is the time of a fresh command `encode` made of?
 bench.codec            speed, memory and size of the codec alone
 bench.search           what does encoding to a size or a PSNR cost, against one plain encode?
-bench.virtual_cameras  what does encoding without cameras cost?
+bench.virtual_cameras  what does encoding without cameras cost, and what is left of places?
 bench.viewer           how many pictures a second does the viewer show while a camera moves?
 bench.forecast         how far off is what an encode says beforehand of its time and memory?
 bench.install          what does an installation take, and where are there wheels?
@@ -46,7 +46,6 @@ study.colour_steps         what does version 3 of the format bring over version 
 study.compare_formats      what would people use instead?
 study.output_formats       how small are encodes to the formats that viewers open, and what do others read of them?
 study.elsewhere            what is left of a scene, with cameras and without, where nobody has photographed it?
-study.virtual_views        how many virtual views, how large, how wide, at what time and memory?
 study.rates                where do the bits go, and what do they buy?
 study.fit_guards           is a file with the fit ever worse than one without: few views, thresholds by hand?
 study.photographs          how much nearer to unseen photographs does a fit to others bring a scene and its file?

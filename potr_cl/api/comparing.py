@@ -210,12 +210,12 @@ def compare(
         points.refuse_with_cameras()
     elif truth is not None:
         raise UsageError("--truth needs --cameras, the views that the photographs show")
-    # Views are placed around a scene on the host.
+    # Views are placed in a scene that the host has.
     source_a = a if given is not None else scene_of(a, trust, antialiased)
-    there = given or points.placed(scene_of(source_a))
-    chosen = chosen_views(there, views, split)
     with contextlib.ExitStack() as stack:
         workers = stack.enter_context(open_workers(device, cluster))
+        there = given or points.judging(scene_of(source_a), workers.device)
+        chosen = chosen_views(there, views, split)
         coded = [coded_for(workers, each, trust) if antialiased is None else None for each in (source_a, b)]
         scene_a, scene_b = (
             stack.enter_context(drawable_of(each, workers.device, trust, antialiased, read))

@@ -43,6 +43,7 @@ from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.compact import Compact
+from potr_cl.stages.guarded import Unresolved
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.pruning.schedule import Pruned
 from potr_cl.stages.pruning.unseen import Unseen
@@ -95,7 +96,7 @@ class PrunedScene(Edited):
     """
 
     pruned: Pruned
-    unseen: Unseen
+    unseen: Unseen | Unresolved
 
     @property
     def said(self) -> str:
@@ -275,7 +276,7 @@ def _run(
     """What a stage alone makes of a scene, and the device that it was done on."""
     check_frame(scene, cameras, options.cameras_anyway)
     opened = device_of(device)
-    views = train_views(views_or_placed(scene, cameras, count))
+    views = train_views(views_or_placed(scene, cameras, count, opened))
     run = Run(options, Stopwatch(progress), opened)
     state = run.stages(State.of(scene, views), [kind])
     return state, run.device or opened
@@ -334,7 +335,7 @@ def refit(
     check_rendered_alike((str(name_of(scene)), reduced), (str(name_of(reference)), original))
     check_frame(original, given, cameras_anyway)
     opened = device_of(device)
-    there = views_or_placed(original, given, virtual_views)
+    there = views_or_placed(original, given, virtual_views, opened)
     views = train_views(there)
     if ground_truth is not None:
         views = ground_truth.of(views)

@@ -28,7 +28,6 @@ from potr_cl.host.mapped import bounded
 from potr_cl.host.rescue import replacing_or_keeping
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
-from potr_cl.model.virtual_cameras import place_cameras
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import several_are_named
 from potr_cl.outputs.output import Output
@@ -43,6 +42,7 @@ from potr_cl.pipeline.proof import Proved, proved
 from potr_cl.pipeline.search import encode_to_target
 from potr_cl.pipeline.stopwatch import Stopwatch
 from potr_cl.pipeline.target import Found, Target
+from potr_cl.placement.virtual import place_cameras
 from potr_cl.quality.by_photographs import judge_by_photographs
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.quality.ground_truth import GroundTruth
@@ -138,10 +138,8 @@ def encode(
     views = cameras_of(cameras, virtual_views)
     with bounded(settings.memory):
         what = scene_of(scene, trust, antialiased)
-    if views is None and virtual_views is not None and settings.look_at_views(what):
-        views = place_cameras(what, virtual_views)
-    if views is None and report is not None and settings.look_at_views(what):
-        views = place_cameras(what)
+    if views is None and (virtual_views is not None or report is not None) and settings.look_at_views(what):
+        views = place_cameras(what, virtual_views, device=device if isinstance(device, Device) else None)
     judging = EvaluationViews.of(views) if views is not None and report is not None else None
     if report_view is not None and judging is not None:
         judging.named(report_view)  # an unknown name is told before the work
@@ -379,6 +377,8 @@ class Judge:
         return self.ground_truth.picture(found[0]) if self.ground_truth is not None and found else None
 
 
-def views_or_placed(scene: Scene, cameras: Sequence[Camera] | None, count: int | None) -> Sequence[Camera]:
+def views_or_placed(
+    scene: Scene, cameras: Sequence[Camera] | None, count: int | None, device: Device | None = None
+) -> Sequence[Camera]:
     """The cameras, or virtual ones."""
-    return cameras if cameras is not None else place_cameras(scene, count)
+    return cameras if cameras is not None else place_cameras(scene, count, device=device)

@@ -107,7 +107,7 @@ def fit(
     check_rendered_alike((str(name_of(scene)), reduced), (str(name_of(reference)), original))
     check_frame(original, given, cameras_anyway)
     opened = device_of(device)
-    there = views_or_placed(original, given, virtual_views)
+    there = views_or_placed(original, given, virtual_views, opened)
     views = train_views(there)
     added = [] if is_virtual(views) or len(views) < 2 else place_between(original, views, views_between)
     looked_at = [*views, *added]

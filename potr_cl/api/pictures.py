@@ -223,13 +223,13 @@ def render(
     given = cameras_of(cameras)
     if given is not None:
         points.refuse_with_cameras()
-    # Views are placed around a scene on the host.
+    # Views are placed in a scene that the host has.
     source = scene if given is not None else scene_of(scene, trust, antialiased)
-    there = given or points.placed(scene_of(source))
+    opened = device_of(device)
+    there = given or points.placed(scene_of(source), opened)
     note = "" if given else told(there)
     chosen = chosen_views(there, views, split or (None if views is not None else "all"))
     paths = picture_files(Path(output), chosen) if output is not None else []
-    opened = device_of(device)
     with (
         drawable_of(source, opened, trust, antialiased) as drawable,
         rasterizer_for(opened, drawable, chosen, wanted, colour) as rasterizer,

@@ -11,7 +11,9 @@ from potr_cl.api.inputs import placed_beside_cameras
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera, camera_centres, focus
 from potr_cl.model.scene import Scene
-from potr_cl.model.viewpoints import AXES, SIZE, VIEWS, look_around, turntable
+from potr_cl.opencl.device import Device
+from potr_cl.placement.viewpoints import AXES, SIZE, VIEWS, look_around, turntable
+from potr_cl.placement.virtual import judging_views
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ class Viewpoints:
             raise UsageError(f"'{self.up}' is no direction: give --up={'|'.join(AXES)}, X,Y,Z or auto")
         return parts
 
-    def placed(self, scene: Scene) -> list[Camera]:
+    def placed(self, scene: Scene, device: Device | None = None) -> list[Camera]:
         """The views.
 
         Raises:
@@ -78,8 +80,12 @@ class Viewpoints:
         """
         size = SIZE if self.size is None else self.size
         if self.turntable is not None:
-            return turntable(scene, self.turntable, size, self.direction)
-        return look_around(scene, VIEWS if self.count is None else self.count, size, self.direction)
+            return turntable(scene, self.turntable, size, self.direction, device)
+        return look_around(scene, VIEWS if self.count is None else self.count, size, self.direction, device)
+
+    def judging(self, scene: Scene, device: Device | None = None) -> list[Camera]:
+        """The views to judge by: those that an encode without cameras is judged by, where nothing else is asked for."""
+        return self.placed(scene, device) if self.asked_for else judging_views(scene, device=device)
 
     def refuse_with_cameras(self) -> None:
         """Say that cameras are given and that views are to be placed contradict each other.

@@ -44,7 +44,7 @@ def _prune(args: argparse.Namespace) -> None:
     with contextlib.ExitStack() as stack:
         order = stack.enter_context(replacing(args.order)) if args.order is not None else None
         progress = stack.enter_context(contextlib.closing(Progress()))
-        cameras = cameras or virtual_cameras(args, scene, progress)
+        cameras = cameras or virtual_cameras(args, scene, progress, device)
         tell_what_is_ahead(device, scene, cameras, options)
         result = prune(
             scene, cameras, q=args.quality, memory=args.memory, background=args.background,
@@ -113,7 +113,7 @@ def _compact(args: argparse.Namespace) -> None:
     options = stage_options(Compact, args.quality, args.background, args.memory, choices, args.sf_sh)
     scene, cameras, device = _inputs(args)
     with contextlib.closing(Progress()) as progress:
-        cameras = cameras or virtual_cameras(args, scene, progress)
+        cameras = cameras or virtual_cameras(args, scene, progress, device)
         tell_what_is_ahead(device, scene, cameras, options)
         result = compact(
             scene, cameras, q=args.quality, sf_sh=args.sf_sh, memory=args.memory, background=args.background,
@@ -150,7 +150,7 @@ def _refit(args: argparse.Namespace) -> None:
     check_rendered_alike((str(args.scene), scene), (str(args.reference), reference))
     device = Device(args.device)
     with contextlib.closing(Progress()) as progress:
-        cameras = cameras or virtual_cameras(args, reference, progress)
+        cameras = cameras or virtual_cameras(args, reference, progress, device)
         # An encode that does nothing else which takes long.
         alone = EncodeOptions(memory=as_bytes(args.memory)).changed(prune=False, refit={"steps": args.steps})
         tell_what_is_ahead(device, scene, cameras, alone)

@@ -172,7 +172,7 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Non
         search: dict[str, Any] | None = None
         with writing(args.output, options.output.suffix) as file:
             if cameras is None and device is not None:
-                cameras = virtual_cameras(args, scene, placing)
+                cameras = virtual_cameras(args, scene, placing, device)
             if device is not None and cameras is not None:
                 tell_what_is_ahead(device, scene, cameras, options, target is not None, kept)
             views = EvaluationViews.of(cameras) if cameras is not None and not args.no_quality else None

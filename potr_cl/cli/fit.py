@@ -28,7 +28,7 @@ def _fit(args: argparse.Namespace) -> None:
     check_rendered_alike((str(args.scene), scene), (str(args.reference), reference))
     device = Device(args.device)
     with contextlib.closing(Progress()) as progress:
-        cameras = cameras or virtual_cameras(args, reference, progress)
+        cameras = cameras or virtual_cameras(args, reference, progress, device)
         # An encode that does nothing else which takes long.
         alone = EncodeOptions(memory=as_bytes(args.memory)).changed(
             prune=False, refit=False, fit={"steps": args.steps}, between={"views": args.views_between}

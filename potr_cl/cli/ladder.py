@@ -45,8 +45,8 @@ def encode_ladder(args: argparse.Namespace, options: EncodeOptions) -> None:
         if looks or not (cameras is None or args.no_quality):
             workers = stack.enter_context(open_workers(args.device, args.cluster))
         device, pool = (None, None) if workers is None else (workers.device, workers.pool)
-        if cameras is None and looks:
-            cameras = virtual_cameras(args, scene, progress)
+        if cameras is None and looks and device is not None:
+            cameras = virtual_cameras(args, scene, progress, device)
         if device is not None and cameras is not None:
             tell_what_is_ahead(device, scene, cameras, options)
             note(f"{len(steps)} qualities: so many times as long", "detail")

@@ -37,12 +37,10 @@ from potr_cl.errors import UsageError, WriteError
 from potr_cl.formats.images import parse_colour
 from potr_cl.formats.registry import suffixes_read
 from potr_cl.host.atomic_write import replacing
-from potr_cl.model.camera import Camera
-from potr_cl.model.scene import Scene
-from potr_cl.model.viewpoints import AXES, SIZE, VIEWS
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import list_devices
 from potr_cl.outputs.coded_scene import CodedScene
+from potr_cl.placement.viewpoints import AXES, SIZE, VIEWS
 from potr_cl.quality.compare import format_sizes, size_report
 from potr_cl.raster.rules import RULES
 from potr_cl.raster.scene_buffers import Drawable
@@ -80,28 +78,19 @@ def _viewpoints(args: argparse.Namespace) -> Viewpoints:
     return points
 
 
-def _cameras(args: argparse.Namespace, points: Viewpoints, scene: Scene, hint: str = "") -> list[Camera]:
-    """The cameras that are given; or views placed for a scene, and a line that says so and ends in a hint."""
-    if args.cameras is not None:
-        return read_cameras(args)
-    cameras = points.placed(scene)
-    note(f"no --cameras: {told(cameras)}{hint}")
-    return cameras
-
-
 def _render(args: argparse.Namespace) -> None:
     background = parse_colour(args.background)  # a wrong option is told before anything is read
     points = _viewpoints(args)
     cameras = None if args.cameras is None else read_cameras(args)
-    scene = None
+    scene, device = None, Device(args.device)
     if cameras is None:
         scene = read_scene(args, args.scene)
-        cameras = _cameras(args, points, scene)
+        cameras = points.placed(scene, device)
+        note(f"no --cameras given: {told(cameras)}")
     views = chosen_views(cameras, args.views, None if args.views is not None else args.split or "all")
     written = picture_files(args.output, views)
     check_files(args, written)
     check_photographs(args, cameras, written)
-    device = Device(args.device)
     make_folder(args.output)
     stage = f"rendering {len(views)} view{'s' if len(views) > 1 else ''}"
     with contextlib.ExitStack() as stack:
@@ -155,10 +144,11 @@ def _compare(args: argparse.Namespace) -> None:
             coded: list[CodedScene | None] = []
             if cameras is None:
                 scenes = [read_scene(args, path) for path in (args.a, args.b)]
-                cameras = _cameras(args, points, scenes[0], "; a scene encoded with cameras looks best from those")
+                workers = stack.enter_context(open_workers(args.device, args.cluster))
+                cameras = points.judging(scenes[0], workers.device)
+                note(f"no --cameras given: {told(cameras)}. A scene encoded with cameras looks best from those.")
                 drawables += scenes
                 views = chosen_views(cameras, args.views, args.split)
-                workers = stack.enter_context(open_workers(args.device, args.cluster))
                 coded += [_coded(args, path, workers) for path in (args.a, args.b)]
             else:
                 views = chosen_views(cameras, args.views, args.split)

@@ -15,7 +15,9 @@ from potr_cl.formats import load_cameras
 from potr_cl.model.agreement import judge_cameras
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
-from potr_cl.model.virtual_cameras import FEWEST, MOST, describe, place_cameras
+from potr_cl.model.virtual_cameras import describe
+from potr_cl.opencl.device import Device
+from potr_cl.placement.virtual import place_cameras
 from potr_cl.stages.stage import Progress
 
 
@@ -28,7 +30,7 @@ def add_cameras_options(p: argparse.ArgumentParser) -> None:
         "--virtual-views",
         type=whole_number,
         metavar="N",
-        help=f"to place without --cameras; default {FEWEST} to {MOST}, the fewer the more splats",
+        help="how many to place without --cameras (default: 200 to 600, more for larger scenes)",
     )
     p.add_argument(
         "--cameras-anyway",
@@ -69,10 +71,10 @@ def warn_of_frame(path: Path, scene: Scene, views: Sequence[Camera]) -> None:
         note(f"warning: {path}: {said}", "warning")
 
 
-def virtual_cameras(args: argparse.Namespace, scene: Scene, progress: Progress) -> list[Camera]:
+def virtual_cameras(args: argparse.Namespace, scene: Scene, progress: Progress, device: Device) -> list[Camera]:
     """Virtual cameras, and a line that says so."""
     progress("place cameras", 0.0)
-    cameras = place_cameras(scene, args.virtual_views)
+    cameras = place_cameras(scene, args.virtual_views, device=device)
     progress("place cameras", 1.0)
-    note(f"no --cameras: {describe(cameras)}; the cameras of the photographs do better")
+    note(f"no --cameras given: {describe(cameras)}. With the real cameras the file would be smaller.")
     return cameras

@@ -1,14 +1,5 @@
-"""Virtual cameras for scenes that come with none: where would someone stand who looks at this? Pure numpy.
-
-A trained scene remembers how it was looked at. Splats are where the photographs had detail, empty space is where the
-photographer stood, and the SH coefficients of a splat are a sum of basis functions in the directions of the views that
-trained it, so its colour varies most in those directions and hardly in others. :func:`place_cameras` draws candidates
-all around and inside the scene, rejects those that stand in dense matter or from where the colours were never trained,
-and picks, one after the other, the view that adds most: splats seen from directions from which they were not seen yet.
-
-Visibility is that of points in a coarse cube map, not a rendering: no device is needed, and the same scene gives the
-same cameras everywhere.
-"""
+"""What is known of virtual cameras, which stand in for those that a scene comes without: how many (:func:`plan`), and
+that they are virtual (:func:`is_virtual`). :mod:`potr_cl.placement` places them."""
 
 from __future__ import annotations
 
@@ -20,35 +11,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
-from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera, camera_centres
-from potr_cl.model.placement.candidates import candidates_of
-from potr_cl.model.placement.choice import pick
-from potr_cl.model.placement.matter import frame_of, matter_of
-from potr_cl.model.placement.sampling import F64
-from potr_cl.model.scene import Scene
 from potr_cl.model.views_between import is_between
 
 F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
 
-#: Training views that are placed unless told otherwise. Each costs time and memory for every splat, hardly less if it
-#: is small: so they are few and wide, and large scenes get fewer.
-FEWEST, MOST = 86, 128
-_SPLATS_TIMES_VIEWS = 67_000_000
-#: Pixels of all of them together, and along a side of each.
-_PIXELS = 46_080_000
-_SMALLEST, _LARGEST = 500, 740
+#: Training views that are placed unless told otherwise, and pixels along a side of each, on a GPU and on a CPU: so many
+#: up to so many splats, and more with these powers of the splats. Colours want many directions, so the views are many.
+_VIEWS, _VIEWS_ON_CPU, MOST = 240, 200, 600
+_SIZE, _SIZE_ON_CPU, _SPLATS = 700, 480, 300_000
+_VIEWS_GROW, _SIZE_GROWS = 0.27, 0.07
+#: An eighth as many judge, but no more than so many.
+_MOST_TESTS = 32
 #: Degrees from side to side. A wide view shows a splat together with more of the others, so that fewer views show each
 #: splat from as many directions.
 FIELD = 65.0
 #: What may be asked for: no more views than places are tried, no wider ones than are rendered.
-_MOST_ASKED, _WIDEST_ASKED = 4000, 16384
+MOST_ASKED, WIDEST_ASKED = 4000, 16384
 #: What the names of virtual cameras begin with.
-_PREFIX = "virtual_"
-
-#: More threads than these wait for each other: NumPy's calls are short here, and each needs the interpreter in between
-#: (with 1, 2, 4 and 16 of 16 processors: 2.2, 1.6, 1.7 and 2.1 s).
-_THREADS = 2
+PREFIX = "virtual_"
 
 #: Splats by which the distance of the scene is measured.
 _SOME = 3000
@@ -56,53 +38,9 @@ _SOME = 3000
 _AROUND = 0.35
 
 
-def place_cameras(
-    scene: Scene, count: int | None = None, size: int | None = None, field: float = FIELD
-) -> list[Camera]:
-    """Views that cover what someone would look at.
-
-    Args:
-        scene: clean, at least one splat.
-        count: training views; by default 86 to 128, the fewer the more splats there are. An eighth as many test views,
-            which lie among them, come on top.
-        size: of their square images, in pixels; by default 600 to 740, the smaller the more views there are.
-        field: of view from side to side, in degrees; less where the renderer's near plane would cut a small scene off.
-
-    Returns:
-        Cameras "virtual_000" and so on, in the order in which they were picked.
-
-    Raises:
-        UsageError: ``count`` or ``size`` below 1, or above what can be placed and rendered.
-    """
-    planned = plan(len(scene), count, size)
-    with thread_pool(_THREADS) as pool:
-        frame = frame_of(scene, pool.map)
-        matter = matter_of(scene, frame)
-        candidates = candidates_of(frame, matter, math.tan(math.radians(field / 2)), pool.map)
-    tests, views = planned.test, planned.training + planned.test
-    picked = pick(candidates, views)
-    every = views // tests if tests else 0
-    cameras = []
-    for number, view in enumerate(picked):
-        split = "test" if every and number % every == every - 1 and number // every < tests else "train"
-        camera_centre = frame.centre + frame.unit * candidates.centres[view]
-        cameras.append(
-            _camera(
-                f"{_PREFIX}{number:03d}",
-                camera_centre,
-                candidates.forward[view],
-                frame.up,
-                candidates.tangent[view],
-                planned.size,
-                split,
-            )
-        )
-    return cameras
-
-
 @dataclass(frozen=True)
 class Plan:
-    """What :func:`place_cameras` will place: known before anything is computed.
+    """:func:`potr_cl.placement.virtual.place_cameras` will place: known before anything is computed.
 
     Attributes:
         training: views that an encoder looks at.
@@ -123,33 +61,35 @@ class Plan:
         return f"{self.training} views of {self.size} x {self.size} pixels"
 
 
-def plan(splats: int, count: int | None = None, size: int | None = None) -> Plan:
+def plan(splats: int, count: int | None = None, size: int | None = None, slow: bool = False) -> Plan:
     """How many views, and how large.
 
     Args:
         splats: of the scene.
-        count, size: as :func:`place_cameras` takes them.
+        count, size: as :func:`potr_cl.placement.virtual.place_cameras` takes them.
+        slow: whether a CPU has to look at them.
 
     Raises:
         UsageError: ``count`` or ``size`` below 1, or above what can be placed and rendered.
     """
+    more = max(splats / _SPLATS, 1.0)
     if count is None:
-        count = min(max(_SPLATS_TIMES_VIEWS // max(splats, 1), FEWEST), MOST)
+        count = min(round((_VIEWS_ON_CPU if slow else _VIEWS) * more**_VIEWS_GROW), MOST)
     if size is None:
-        size = min(max(round(math.sqrt(_PIXELS / max(count, 1))), _SMALLEST), _LARGEST)
-    if not (1 <= count <= _MOST_ASKED and 1 <= size <= _WIDEST_ASKED):
+        size = round((_SIZE_ON_CPU if slow else _SIZE) * more**_SIZE_GROWS)
+    if not (1 <= count <= MOST_ASKED and 1 <= size <= WIDEST_ASKED):
         raise UsageError(
             f"{count} virtual views of {size} x {size} pixels: both must be at least 1, the views at most "
-            f"{_MOST_ASKED}, a side at most {_WIDEST_ASKED}"
+            f"{MOST_ASKED}, a side at most {WIDEST_ASKED}"
         )
-    return Plan(count, count // 8, size)
+    return Plan(count, min(count // 8, _MOST_TESTS), size)
 
 
 def is_virtual(cameras: Sequence[Camera]) -> bool:
-    """Whether they were placed by :func:`place_cameras`, or between such ones, by their names."""
-    if not cameras or not cameras[0].name.startswith(_PREFIX):
+    """Whether :func:`potr_cl.placement.virtual.place_cameras` placed them, by their names; or all that is between."""
+    if not cameras or not cameras[0].name.startswith(PREFIX):
         return False
-    return all(camera.name.startswith(_PREFIX) or is_between(camera) for camera in cameras)
+    return all(camera.name.startswith(PREFIX) or is_between(camera) for camera in cameras)
 
 
 def standpoints(cameras: Sequence[Camera], means: F32) -> F64:
@@ -184,13 +124,3 @@ def describe(cameras: Sequence[Camera]) -> str:
     train, test = (sum(c.split == split for c in cameras) for split in ("train", "test"))
     judges = f" and {test} to judge by" if test else ""
     return f"{train} virtual views{judges} placed {distance.min():.3g} to {distance.max():.3g} units from ({at})"
-
-
-def _camera(name: str, camera_centre: F64, forward: F64, up: F64, tangent: float, size: int, split: str) -> Camera:
-    right = np.cross(forward, up)
-    if np.linalg.norm(right) < 1e-3:  # looks straight up or down: any roll will do
-        right = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    focal = size / 2 / tangent
-    return Camera(name, size, size, focal, focal, size / 2, size / 2, rotation, -rotation @ camera_centre, split)

@@ -9,13 +9,13 @@ from contextlib import ExitStack
 from potr_cl.host.mapped import bounded
 from potr_cl.model.camera import Camera, train_views, within_photographs
 from potr_cl.model.scene import Scene
-from potr_cl.model.virtual_cameras import place_cameras
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encoded import Encoded
 from potr_cl.pipeline.frame import check_frame, frame_checked_beside
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.run import Run
 from potr_cl.pipeline.stopwatch import Stopwatch
+from potr_cl.placement.virtual import place_cameras
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.stages.stage import Progress, State
 from potr_cl.workers.pool import Pool
@@ -64,9 +64,10 @@ def encode(
     with ExitStack() as stack:
         stack.enter_context(bounded(options.memory))
         with frame_checked_beside(scene, cameras, options.cameras_anyway or in_frame):
-            cameras = cameras_or_virtual(scene, cameras, options, watch, in_frame=True)
-            if kept is None and cameras and options.look_at_views(scene):
+            if options.look_at_views(scene):
                 device = device or (Device() if pool is None else pool.first)
+            cameras = cameras_or_virtual(scene, cameras, options, watch, in_frame=True, device=device)
+            if kept is None and cameras and device is not None and options.look_at_views(scene):
                 others = () if pool is None else pool.devices
                 kept = stack.enter_context(KeptScene(device, scene, options.memory, others))
         run = Run(options, watch, device, kept, pool)
@@ -100,6 +101,7 @@ def cameras_or_virtual(
     options: EncodeOptions,
     watch: Stopwatch,
     in_frame: bool = False,
+    device: Device | None = None,
 ) -> Sequence[Camera] | None:
     """The cameras; or virtual ones, if there are none and a stage needs views.
 
@@ -111,7 +113,7 @@ def cameras_or_virtual(
     check_frame(scene, cameras, options.cameras_anyway or in_frame)
     if cameras is None and options.look_at_views(scene):
         watch("place cameras", 0.0)
-        cameras = place_cameras(scene)
+        cameras = place_cameras(scene, device=device)
         watch("place cameras", 1.0)
     if cameras is not None and any(getattr(stage, "ground_truth", None) is not None for stage in options.stages):
         return within_photographs(cameras)

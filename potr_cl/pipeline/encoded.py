@@ -15,6 +15,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.stages.fit import LeftOut
 from potr_cl.stages.fitting.fit import Fitted
+from potr_cl.stages.guarded import Unresolved
 from potr_cl.stages.pruning.schedule import Pruned
 from potr_cl.stages.pruning.unseen import Unseen
 from potr_cl.stages.refitting.photographs import PhotographChoice
@@ -51,7 +52,7 @@ class Encoded:
     nbytes: int
     order: NDArray[np.int64]
     pruned: Pruned | None
-    unseen: Unseen | None
+    unseen: Unseen | Unresolved | None
     fitted: Fitted | LeftOut | None
     refitted: Refitted | None
     photographs: PhotographChoice | None

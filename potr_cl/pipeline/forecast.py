@@ -25,7 +25,7 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.sampled_views import PIXEL, SampledViews, sample_views
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.view_cache import GEOMETRY
-from potr_cl.stages.between.amount import most_needed, needed_of_virtual
+from potr_cl.stages.between.amount import most_needed
 from potr_cl.stages.compact import Compact
 from potr_cl.stages.fit import Fit
 from potr_cl.stages.fitting.memory import fit_bytes
@@ -158,7 +158,7 @@ def _views(
     if between.views != "auto":
         return views * (1 + between.views)
     slow = device.info.kind == "cpu"  # nobody knows yet how many the scene needs
-    each = needed_of_virtual(slow) if is_virtual(cameras) else most_needed(len(cameras), slow)
+    each = 0.0 if is_virtual(cameras) else most_needed(len(cameras), slow)
     if device.family == "cpu":  # only as many are added as there is room for
         fit = _room_of_pruning(scene, options, device) / max(sampled.nbytes, 1)
         each = min(each, max(fit / views - 1, 0))

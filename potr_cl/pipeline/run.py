@@ -6,7 +6,11 @@ import dataclasses
 import json
 from collections.abc import Sequence
 
+import numpy as np
+from numpy.typing import NDArray
+
 from potr_cl.codec.encoder import Coded
+from potr_cl.host.threads import in_background
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encoded import Encoded, SharedOut
@@ -15,11 +19,14 @@ from potr_cl.pipeline.fit_trial import Trial, only_if_it_pays
 from potr_cl.pipeline.host_memory import for_views
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.stopwatch import Stopwatch
+from potr_cl.placement.guard import unresolved
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.stages.between.price import priced
 from potr_cl.stages.fit import Fit, LeftOut
 from potr_cl.stages.fitting.fit import Fitted
+from potr_cl.stages.guarded import UNRESOLVED, Unresolved, as_they_were
 from potr_cl.stages.prune import Prune
+from potr_cl.stages.pruning.unseen import part_of_area
 from potr_cl.stages.refit import Refit
 from potr_cl.stages.stage import Interlude, Stage, State, Workbench
 from potr_cl.workers.pool import Pool, Traffic
@@ -61,12 +68,28 @@ class Run:
         Raises:
             As :func:`potr_cl.pipeline.encode.encode`.
         """
+        state = self._guarded(state)
         for stage in self._options.stages:
             if only is None or type(stage) in only:
-                after = self._one(stage, state)
+                after = as_they_were(self._one(stage, state))
                 # What is before it is kept no longer than this: colours of a large scene take gigabytes.
                 state = self._fit_that_pays(state, after) if isinstance(stage, Fit) else after
         return state
+
+    def _guarded(self, state: State) -> State:
+        """The state that knows what no view has resolved, where nothing may be lost of that."""
+        prune = self._options.stage(Prune)
+        wanted = prune.unseen == "protect" or (prune.unseen == "keep" and is_virtual(state.views))
+        if not wanted or UNRESOLVED in state.learnt or not state.views or not self._options.look_at_views(state.source):
+            return state
+        self._watch("place cameras", 1.0)
+
+        def found(device: Device, memory: int | None) -> NDArray[np.bool_]:
+            return unresolved(device, state.source, state.views)
+
+        splats, self.device = on_device(self.device or self._given or Device(), self._options.memory, found)
+        area = in_background(part_of_area, state.source, splats).result if splats.any() else float
+        return state.having_learnt(UNRESOLVED, Unresolved(splats, area))
 
     def _fit_that_pays(self, before: State, after: State) -> State:
         """The state after a fit, or the one before it if a file says so."""

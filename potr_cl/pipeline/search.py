@@ -107,7 +107,7 @@ def encode_to_target(
     scene = scene.rendered(antialiased)
     tell_losses(scene, options)
     watch = Stopwatch(progress, tell)
-    cameras = cameras_or_virtual(scene, cameras, options, watch)
+    cameras = cameras_or_virtual(scene, cameras, options, watch, device=device)
     if target.min_psnr is not None and not cameras:
         raise UsageError("a PSNR can be reached with cameras only: without them there is no view to judge by")
 

@@ -16,7 +16,7 @@ from potr_cl.model.camera import Camera, camera_centres
 from potr_cl.model.quaternions import quaternions_of
 from potr_cl.model.scene import Scene
 from potr_cl.model.sh_rotation import rotated_sh
-from potr_cl.model.virtual_cameras import place_cameras
+from potr_cl.placement.virtual import place_cameras
 from potr_cl.reference.captures import looking
 from potr_cl.reference.raster import rotation_matrices
 

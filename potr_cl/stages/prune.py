@@ -17,6 +17,7 @@ from potr_cl.raster.kept_scene import lying_on
 from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.raster.surely_seen import surely_seen
 from potr_cl.raster.view_shares import ViewShares
+from potr_cl.stages.guarded import UNRESOLVED
 from potr_cl.stages.pruning.measured import Measured, Removal, measurement
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
@@ -52,7 +53,8 @@ class Prune(Stage):
         delta_mse_max: replaces q's ΔMSE_MAX: that of a scene that each view shows whole.
         iterations, decay, mapping_a: of the schedule (:class:`potr_cl.stages.pruning.schedule.PruningOptions`).
         unseen: "keep" or "drop": what becomes of splats that no training view's picture reaches
-            (:mod:`potr_cl.model.unseen`). With ``keep`` or ``count`` they go first in any case.
+            (:mod:`potr_cl.model.unseen`). With ``keep`` or ``count`` they go first in any case. "protect", and "keep"
+            where views were placed: what no view has resolved stays as it is (:mod:`potr_cl.placement.guard`).
         tolerance, turns, tighten, transmittance_threshold, sample, sampled, seed: of the measurements
             (:class:`potr_cl.stages.pruning.sweep_options.SweepOptions`).
 
@@ -115,8 +117,8 @@ class Prune(Stage):
         "keep",
         Flag(
             "--unseen",
-            "splats outside of every training view's picture: keep them, coarsely coded, or drop them; with --keep or "
-            "--count they always go first",
+            "what no training view shows: keep it, coarsely coded, or drop it (with --keep or --count it always goes "
+            "first); protect: keep all that no view shows from near enough, as it is. Without cameras, keep protects",
             choices=CHOICES,
         ),
     )
@@ -162,6 +164,8 @@ class Prune(Stage):
         not given, the ΔMSE below which a splat has gone; and as "shares" the
         :class:`potr_cl.raster.view_shares.ViewShares`, where workers elsewhere get what their views see.
         """
+        if UNRESOLVED in state.learnt:
+            return self._guarded(state, bench)
         with thread_pool(bench.threads) as pool, lying_on(bench.opened, bench.placed(state)) as placed:
             quick = partial(surely_seen, placed) if isinstance(placed, SceneBuffers) else None
             part = in_background(seen_part, state.scene, state.views)  # while a device finds the unseen ones
@@ -177,12 +181,7 @@ class Prune(Stage):
         splats = int(np.count_nonzero(hidden))
         kept = self.unseen == "keep" and self.keep is None and self.count is None
         told = state.having_learnt("unseen", Unseen(splats, len(state.scene), kept, area))
-        if state.scene is state.source:
-            told = replace(told, sights=sights)
-            if sights is not None and bench.kept is not None and bench.kept.is_of(state.source):
-                bench.kept.groups = sights.groups  # for who judges by pictures later
-        if self.keep is None and self.count is None:
-            told = told.having_learnt("price", bench.parameters.delta_mse_max)
+        told = self._told(told, bench, sights)
         if not (kept and splats):
             return self._pruned(told, bench, sights)
         # A copy of a large scene without them would take as much memory as the scene.
@@ -202,6 +201,27 @@ class Prune(Stage):
         if sights is not None:
             sights = sights_worth_it(state.scene.uncoloured().subset(seen), state.views, options)
         return self._pruned(told, bench, sights, seen, hidden)
+
+    def _guarded(self, state: State, bench: Workbench) -> State:
+        """Prune, but for what no view has resolved."""
+        with thread_pool(bench.threads) as pool:
+            likely = seen_part(state.scene, state.views) <= LIKELY
+            groups = groups_of_large(state.scene, pool.map) if likely else None
+            sights = sights_worth_it(state.scene, state.views, self._sweep_options(bench.memory), groups, pool.map)
+            if sights is not None and (bench.pool is None or bench.pool.in_process):
+                sights = sights.lasting()
+        told = self._told(state, bench, sights).having_learnt("unseen", state.learnt[UNRESOLVED])
+        return self._pruned(told, bench, sights)
+
+    def _told(self, state: State, bench: Workbench, sights: Sights | None) -> State:
+        """The state that knows what the views see, and what a splat may cost."""
+        if state.scene is state.source:
+            state = replace(state, sights=sights)
+            if sights is not None and bench.kept is not None and bench.kept.is_of(state.source):
+                bench.kept.groups = sights.groups  # for who judges by pictures later
+        if self.keep is None and self.count is None:
+            state = state.having_learnt("price", bench.parameters.delta_mse_max)
+        return state
 
     def _pruned(
         self,
@@ -225,12 +245,14 @@ class Prune(Stage):
         if sights is not None and bench.pool is not None and not bench.pool.in_process:
             dealt = _dealt(state, seen, bench.pool, sights)
             state = state.having_learnt("shares", dealt)
+        unresolved = state.learnt.get(UNRESOLVED)
+        stays = None if unresolved is None else unresolved.among(state.survivors)
         waiting = sorted(bench.interludes, key=lambda interlude: interlude.after)
         schedule = self._schedule(bench.parameters.delta_mse_max, len(state.scene) if seen is None else len(seen))
         bench.progress("prepare views", 0.0)
         with measurement(state, bench, self._sweep_options(bench.memory), sights, spared, dealt, seen) as removal:
             course = _Course(state, removal, seen)
-            stays = _views_that_stay(removal) >= (1 - _MADE_AGAIN) * len(state.views)
+            ready = _views_that_stay(removal) >= (1 - _MADE_AGAIN) * len(state.views)
 
             def after_iteration(iteration: int) -> None:
                 while waiting and iteration + 1 >= waiting[0].after:
@@ -241,8 +263,9 @@ class Prune(Stage):
             pruned = prune_scene(
                 removal,
                 schedule,
-                lambda done, _: bench.progress("prune", min(part_of_time(done / self.iterations, stays), 0.99)),
+                lambda done, _: bench.progress("prune", min(part_of_time(done / self.iterations, ready), 0.99)),
                 after_iteration,
+                stays,
             )
             bench.progress("prune", 1.0)
             for interlude in waiting:

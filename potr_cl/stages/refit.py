@@ -19,6 +19,7 @@ from potr_cl.outputs.output import Rounded
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers
+from potr_cl.stages.guarded import as_important
 from potr_cl.stages.refitting.colour_refit import ColourRefit, HelpFrom
 from potr_cl.stages.refitting.coming_scene import ComingScene
 from potr_cl.stages.refitting.photographs import PhotographChoice, hold_out
@@ -156,6 +157,7 @@ class Refit(Stage):
 
             def colour_grid(effects: FloatArray) -> ColourGrid:
                 nonlocal geometry
+                effects = as_important(effects, state)
                 geometry, grid = bench.output.colour_grid(rounded.result(), effects, bench.request(state))
                 return grid
 

@@ -13,7 +13,7 @@ from potr_cl.model.placement.given_views import GivenViews
 from potr_cl.model.scene import Scene
 from potr_cl.model.views_between import SPREAD, views_between
 from potr_cl.model.virtual_cameras import is_virtual
-from potr_cl.stages.between.amount import needed, needed_of_virtual, views_where_few
+from potr_cl.stages.between.amount import needed, views_where_few
 from potr_cl.stages.between.price import SHOWN
 from potr_cl.stages.between.room import room_for
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
@@ -56,7 +56,7 @@ class Added:
 class Between(Stage):
     """Add views between the training views, so that the scene keeps what is seen from there.
 
-    Virtual cameras get some on a GPU.
+    Where views were placed, as many as are needed have been, so auto adds none.
 
     Attributes:
         views: how many to add for each training view; 0.5: one for every second; 0: none; "auto": as many as the scene
@@ -103,36 +103,31 @@ class Between(Stage):
     def run(self, state: State, bench: Workbench) -> State:
         """Add them; ``learnt`` gets an :class:`Added`, if any are asked for.
 
-        And as "shown" which part of the given views shows a splat on the average, unless they are virtual: those are
-        placed so that many show it.
+        And as "shown" which part of the given views shows a splat on the average.
         """
         given = len(state.views)
         if given < 2 or state.added:
             return state
         slow = bench.opened.info.kind == "cpu"
         virtual = is_virtual(state.views)
-        if virtual and (self.views == 0 or (self.views == "auto" and not needed_of_virtual(slow))):
-            return state
         bench.progress("views between", 0.0)
         # More wait for each other longer than they work.
         with thread_pool(min(bench.threads or _THREADS, _THREADS)) as pool:
             known = GivenViews(state.source, state.views, pool.map)
             parts = known.views_of_parts()
-            if self.weigh and not virtual and (shown := known.part_of_views()) is not None:
+            if self.weigh and (shown := known.part_of_views()) is not None:
                 state = state.having_learnt(SHOWN, shown)
-            each, shown_by = self.views, None
-            if each == "auto" and virtual:
-                each = needed_of_virtual(slow)
-            elif each == "auto":
+            each, shown_by = 0.0 if virtual and self.views == "auto" else self.views, None
+            if each == "auto":
                 each = 0.0
                 if len(parts):
                     shown_by = views_where_few(parts)
                     each = needed(shown_by, given, slow)
             added = views_between(state.source, state.views, each, self.spread, known=known, run=pool.map)
-        if self.views == "auto":
+        if added and self.views == "auto":
             added = _evenly(added, room_for(added, state, bench))
         bench.progress("views between", 1.0)
-        if self.views == 0:
+        if self.views == 0 or (virtual and not added):
             return state
         then = replace(state, views=(*state.views, *added), added=len(added))
         return then.having_learnt(self.name, Added(given, len(added), shown_by))

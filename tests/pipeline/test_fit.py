@@ -9,13 +9,13 @@ from types import SimpleNamespace
 import pytest
 
 from potr_cl.model.camera import resized, train_views
-from potr_cl.model.virtual_cameras import place_cameras
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.run import as_done
 from potr_cl.pipeline.search import encode_to_target
 from potr_cl.pipeline.target import Target
+from potr_cl.placement.virtual import place_cameras
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.stages.fit import LeftOut
 from potr_cl.stages.fitting.fit import Fitted

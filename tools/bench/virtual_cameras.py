@@ -1,14 +1,11 @@
-"""What encoding without cameras costs.
+"""What encoding without cameras costs, and what is left of places: judged from where people stand.
 
-    python -m tools.bench.virtual_cameras SCENE … [options]
+    python -m tools.bench.virtual_cameras SCENE … [--q 0.5] [--without-guard] [--json FILE]
 
-A SCENE is a folder with point_cloud.ply and cameras.json. Each is encoded at several qualities, once with its training
-cameras and once with the cameras that :mod:`potr_cl.model.virtual_cameras` places. PSNR is the mean over the true test
-views, against the uncompressed scene's renders. Bytes at equal PSNR are interpolated between the qualities, in the
-logarithm of the bytes. Prints Markdown.
-
---quick uses views of half the size, every third test view and 8 pruning iterations: enough to compare placements on a
-CPU, not for publication.
+A SCENE is a folder with point_cloud.ply (or meta.json, lod-meta.json), and, if there are some, cameras.json. It is
+encoded without cameras. PSNR, against the uncompressed scene's renders, is told as ``encode`` tells it, by the views
+that it holds out itself, and from where people stand: in the test views of cameras.json. Where that has training views
+too, the scene is encoded with these as well, at this quality and a tenth more, and bytes are compared at equal PSNR.
 """
 
 from __future__ import annotations
@@ -18,121 +15,134 @@ import math
 import sys
 import time
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
 from potr_cl.codec.decoder import decode
+from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model.camera import Camera, test_views, train_views
-from potr_cl.model.scene import FloatArray, Scene
-from potr_cl.model.virtual_cameras import place_cameras
+from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.encoded import Encoded
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.placement.virtual import place_cameras
 from potr_cl.quality.metrics import psnr
 from tools.results import Column, Results
-from tools.workloads import pictures, read, scaled, scene_parser
+from tools.workloads import pictures, scene_parser
 
-QUALITIES = (0.1, 0.3, 0.5, 0.7, 0.9)
-#: Bytes are compared at the PSNR that the true cameras reach at these.
-COMPARED = (0.3, 0.5, 0.7)
+_FILES = ("point_cloud.ply", "meta.json", "lod-meta.json")
 
 
 @dataclasses.dataclass(frozen=True)
-class Point:
-    """One encode."""
+class Judged:
+    """An encode, judged by some views."""
 
-    q: float
-    splats: int
     nbytes: int
-    psnr: float
-    seconds: float
+    mean: float
+    worst: float
 
 
-def curve(
-    device: Device,
-    scene: Scene,
-    cameras: Sequence[Camera],
-    judges: Sequence[Camera],
-    wanted: Sequence[FloatArray],
-    qualities: Sequence[float],
-    options: EncodeOptions,
-) -> list[Point]:
-    """Encode at each quality and judge by the test views."""
-    points = []
-    for q in qualities:
-        began = time.perf_counter()
-        encoded = encode(scene, cameras, dataclasses.replace(options, q=q), device=device)
-        seconds = time.perf_counter() - began
-        got = pictures(device, decode(b"".join(encoded.pieces)), judges)
-        mean = float(np.mean([psnr(a, b) for a, b in zip(wanted, got, strict=True)]))
-        points.append(Point(q, len(encoded.order), encoded.nbytes, mean, seconds))
-        print(f"  {points[-1]}", file=sys.stderr, flush=True)
-    return points
+class Judge:
+    """Compares files with a scene in its own pictures."""
+
+    def __init__(self, device: Device, scene: Scene, views: Sequence[Camera]) -> None:
+        self._device, self._views = device, views
+        self._wanted = pictures(device, scene, views)
+
+    def __call__(self, encoded: Encoded) -> Judged:
+        got = pictures(self._device, decode(encoded.data), self._views)
+        values = [psnr(a, b) for a, b in zip(self._wanted, got, strict=True)]
+        return Judged(encoded.nbytes, float(np.mean(values)), min(values))
 
 
-def bytes_at(points: Sequence[Point], decibels: float) -> float:
-    """Bytes at a PSNR, between the qualities; NaN beyond them."""
-    ordered = sorted(points, key=lambda p: p.psnr)
-    values = [p.psnr for p in ordered]
-    if not values[0] <= decibels <= values[-1]:
-        return math.nan
-    return math.exp(float(np.interp(decibels, values, [math.log(p.nbytes) for p in ordered])))
+def bytes_at(points: Sequence[Judged], decibels: float) -> float:
+    """Bytes at a PSNR, on the line through two encodes."""
+    low, high = points
+    slope = math.log(high.nbytes / low.nbytes) / (high.mean - low.mean)
+    return low.nbytes * math.exp((decibels - low.mean) * slope)
 
 
 def main() -> None:
     """Command line."""
     parser = scene_parser(__doc__)
-    parser.add_argument("--qualities", nargs="+", type=float, default=QUALITIES)
-    parser.add_argument("--count", type=int, help="virtual views; default as encode places")
-    parser.add_argument("--size", type=int, help="of their images, in pixels; default as encode's")
-    parser.add_argument("--quick", action="store_true", help="few iterations, few and small views")
+    parser.add_argument("--q", type=float, default=0.5)
+    parser.add_argument("--without-guard", action="store_true", help="also encode without the guard")
     args = parser.parse_args()
     device = Device(args.device)
     results = Results(device.info, args.json)
+    table = results.table(
+        "places",
+        f"Without cameras, preset best, q = {args.q:g}",
+        Column("scene"),
+        Column("splats", format=","),
+        Column("views"),
+        Column("placed in", "s", ".1f"),
+        Column("resolved", "%", ".1f"),
+        Column("encoded in", "s", ".1f"),
+        Column("bytes", format=","),
+        Column("PSNR told", "dB", ".1f"),
+        Column("worst told", "dB", ".1f"),
+        Column("where people stand", "dB", ".1f"),
+        Column("worst there", "dB", ".1f"),
+        Column("bytes against true cameras", "%", "+.1f"),
+    )
+    best = EncodeOptions.for_preset("best")
     for folder in args.scenes:
-        scene, cameras = read(folder)
-        true, judges = train_views(cameras), test_views(cameras)
+        scene = load_scene(next(folder / name for name in _FILES if (folder / name).exists()))
+        cameras = load_cameras(folder / "cameras.json") if (folder / "cameras.json").exists() else []
+        encode(scene.subset(np.arange(0, len(scene), 100)), place_cameras(scene, 8, 64), best, device=device)  # kernels
         began = time.perf_counter()
-        placed = place_cameras(scene, args.count, args.size)
+        placed = place_cameras(scene, device=device)
         placing = time.perf_counter() - began
-        options = EncodeOptions.for_preset("best")
-        if args.quick:
-            options = options.changed(prune={"iterations": 8})
-            judges = [scaled(c, 0.5) for c in judges[::3]]
-            true, placed = [scaled(c, 0.5) for c in true], [scaled(c, 0.5) for c in placed]
-        wanted = pictures(device, scene, judges)
-        curves = {
-            name: curve(device, scene, views, judges, wanted, args.qualities, options)
-            for name, views in (("true", true), ("virtual", placed))
-        }
-        table = results.table(
-            folder.name,
-            f"{folder.name}: {len(true)} true, {len(train_views(placed))} virtual views placed in {placing:.1f} s",
-            Column("q", format="g"),
-            *(
-                Column(f"{name} {what}", unit, form)
-                for name in curves
-                for what, unit, form in (
-                    ("splats", "", ","),
-                    ("bytes", "", ","),
-                    ("PSNR", "dB", ".2f"),
-                    ("time", "s", ".1f"),
-                )
-            ),
-        )
-        for a, b in zip(*curves.values(), strict=True):
-            table.add(a.q, *(figure for p in (a, b) for figure in (p.splats, p.nbytes, p.psnr, p.seconds)))
-        table = results.table(
-            f"{folder.name}_at_equal_psnr",
-            f"{folder.name}: bytes with virtual cameras at the PSNR that true ones reach",
-            Column("q with true cameras", format="g"),
-            Column("PSNR", "dB", ".2f"),
-            Column("bytes", format="+.1%"),
-        )
-        for p in curves["true"]:
-            if p.q in COMPARED:
-                virtual = bytes_at(curves["virtual"], p.psnr)
-                table.add(p.q, p.psnr, None if math.isnan(virtual) else virtual / p.nbytes - 1)
+        people = Judge(device, scene, test_views(cameras)) if test_views(cameras) else None
+        told = Judge(device, scene, test_views(placed))
+        for guarded in (True, False) if args.without_guard else (True,):
+            options = best if guarded else best.changed(prune={"unseen": "drop"})
+            began = time.perf_counter()
+            encoded = encode(scene, placed, dataclasses.replace(options, q=args.q), device=device)
+            seconds = time.perf_counter() - began
+            here, there = told(encoded), people(encoded) if people is not None else None
+            unseen = encoded.unseen
+            more = None
+            if guarded and people is not None and there is not None and any(c.split == "train" for c in cameras):
+                more = _against_true(device, scene, cameras, placed, args.q, people, there)
+            table.add(
+                _name(folder) + ("" if guarded else ", without the guard"),
+                len(scene),
+                f"{len(train_views(placed))} of {placed[0].width}",
+                placing,
+                100 * (1 - unseen.splats / unseen.of) if guarded and unseen is not None else None,
+                seconds,
+                encoded.nbytes,
+                here.mean,
+                here.worst,
+                None if there is None else there.mean,
+                None if there is None else there.worst,
+                more,
+            )
+
+
+def _against_true(
+    device: Device,
+    scene: Scene,
+    cameras: Sequence[Camera],
+    placed: Sequence[Camera],
+    q: float,
+    people: Judge,
+    there: Judged,
+) -> float:
+    """Bytes without cameras, in per cent more than with the true ones at their PSNR."""
+    best = EncodeOptions.for_preset("best")
+    true = people(encode(scene, train_views(cameras), dataclasses.replace(best, q=q), device=device))
+    further = people(encode(scene, placed, dataclasses.replace(best, q=q + 0.1), device=device))
+    print(f"  with the true cameras: {true}", file=sys.stderr, flush=True)
+    return 100 * (bytes_at((there, further), true.mean) / true.nbytes - 1)
+
+
+def _name(folder: Path) -> str:
+    return folder.name
 
 
 if __name__ == "__main__":

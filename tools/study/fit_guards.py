@@ -30,11 +30,11 @@ import numpy as np
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model.camera import Camera, test_views, train_views
 from potr_cl.model.scene import Scene
-from potr_cl.model.virtual_cameras import place_cameras
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.encoded import Encoded
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.placement.virtual import place_cameras
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.stages.fitting.fit import Fitted
 from tools.results import ROOT, Column, Results, Table

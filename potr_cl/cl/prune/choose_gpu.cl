@@ -119,6 +119,7 @@ void rank(
     uint splats,
     global const uint *totals,
     global uchar *alive,
+    global const uchar *spared,
     float effect_unit,
     float weight,
     float limit,
@@ -142,7 +143,7 @@ void rank(
         /* In the first iteration the weight is 1. */
         const float mean = weight == 1.0f ? newest : smoothed[i] + (newest - smoothed[i]) / weight;
         smoothed[i] = mean;
-        if (mean < limit)
+        if (mean < limit && !spared[i])
             key = importance == 0 && mean == 0.0f ? GOES_AT_ONCE
                                                   : ordered(limit > 0.0f ? mapping(mean / limit, a) : mean);
     }

@@ -16,27 +16,12 @@ F32 = NDArray[np.float32]
 _INFORMATIVE = 100
 
 
-def remembered(places: F64, shown: list[F32], matter: Matter, run: Run = map) -> F64 | None:
-    """(places,) how well the colours of what one sees from a place remember a view from there; None: they cannot tell.
-
-    It is the energy of the visible splats' colours towards the place, as a part of what the same splats have towards
-    the best places. (Training moves coefficients along the basis functions of its views' directions, so their squared
-    deviation, averaged over many splats, follows the density of the views.)
-
-    Args:
-        places: (P, 3) positions in the frame's units.
-        shown: (K,) of each place, what can be seen of each target from there, 0 to 1.
-        matter: of the scene.
-        run: in place of :func:`map`, to work with several threads.
-    """
-    memory = ColourMemory(places, matter, run)
-    if not memory.tells:
-        return None
-    return np.array(list(run(lambda number: memory.of_known(number, shown[number]), range(len(places)))))
-
-
 class ColourMemory:
     """What colours remember, measured against some places that they are known, or thought, to be seen from.
+
+    That is the energy of the visible splats' colours towards a place, as a part of what the same splats have towards
+    the best of those places. (Training moves coefficients along the basis functions of its views' directions, so their
+    squared deviation, averaged over many splats, follows the density of the views.)
 
     Args:
         places: (P, 3) positions in the frame's units.
@@ -55,7 +40,7 @@ class ColourMemory:
         self._energies = np.stack(list(run(self._energy, places))) if self.tells else None
 
     def of(self, place: F64, shown: F32) -> float:
-        """How well they remember a place, (3,), from where ``shown``, (K,), is seen; see :func:`remembered`."""
+        """How well they remember a place, (3,), from where ``shown``, (K,), is seen, 0 to 1."""
         weights = shown * self._informative
         total = max(float(weights.sum()), 1e-6)
         own = float(weights @ self._energy(place)) / total

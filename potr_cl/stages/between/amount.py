@@ -21,10 +21,6 @@ _SHARE = 0.45
 _FEW, _SHARE_OF_FEW = 10, 1.0
 _BESIDES, _BESIDES_ON_CPU = 45, 4
 
-#: Views to add for each virtual one: they are as many as a scene needs, but chosen to show what others do not, so that
-#: what someone sees from between them counts too little. A CPU has enough to do with the virtual ones.
-_OF_VIRTUAL, _OF_VIRTUAL_ON_CPU = 0.5, 0.0
-
 
 def needed(shown_by: float, views: int, slow: bool) -> float:
     """How many to add for each training view.
@@ -47,15 +43,6 @@ def views_where_few(views_of_parts: NDArray[np.int64]) -> float:
             (:meth:`potr_cl.model.placement.given_views.GivenViews.views_of_parts`), at least one.
     """
     return float(np.quantile(views_of_parts, _PART))
-
-
-def needed_of_virtual(slow: bool) -> float:
-    """How many to add for each virtual camera.
-
-    Args:
-        slow: whether a CPU has to look at them.
-    """
-    return _OF_VIRTUAL_ON_CPU if slow else _OF_VIRTUAL
 
 
 def most_needed(views: int, slow: bool, few: bool = False) -> float:

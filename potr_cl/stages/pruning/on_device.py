@@ -34,6 +34,7 @@ def prune_scene(
     options: PruningOptions,
     progress: Callable[[int, int], None] | None = None,
     after_iteration: Callable[[int], None] | None = None,
+    spared: NDArray[np.bool_] | None = None,
 ) -> Pruned:
     """Run the schedule: on the device if it can decide for itself, else on the host.
 
@@ -42,10 +43,11 @@ def prune_scene(
         options: thresholds and iterations.
         progress: called with the iterations done and the number of splats left.
         after_iteration: called with the iteration.
+        spared: (N,) splats that stay, whatever their effect; None: none.
     """
     if removal.steering is None or options.count is not None or not np.isfinite(options.delta_mse_max):
-        return prune(removal, removal.splats, options, progress, after_iteration)
-    with _Controller(removal.steering, options) as controller:
+        return prune(removal, removal.splats, options, progress, after_iteration, spared)
+    with _Controller(removal.steering, options, spared) as controller:
         return controller.run(progress, after_iteration)
 
 
@@ -56,7 +58,7 @@ class _Controller(Owner):
         DeviceError: the device has no room for the state.
     """
 
-    def __init__(self, removal: Steered, options: PruningOptions) -> None:
+    def __init__(self, removal: Steered, options: PruningOptions, spared: NDArray[np.bool_] | None) -> None:
         self._removal, self._options = removal, options
         self._device = device = removal.device
         self._splats = removal.splats
@@ -66,6 +68,11 @@ class _Controller(Owner):
             self._keys = memory.allocate(4 * self._splats, "the splats' scores")
             self._removed = memory.allocate(_REMOVED.itemsize * self._splats, "the removed splats")
             device.fill(self._removed, np.uint32(0))
+            if spared is None:
+                self._spared = memory.allocate(self._splats, "the splats that stay")
+                device.fill(self._spared, np.uint8(0))
+            else:
+                self._spared = memory.upload(spared.view(np.uint8), "the splats that stay")
             self._state = memory.allocate(_STATE.itemsize, "the pruning's state")
             macros = totals_limits(device)
             self._rank, self._refine, self._mark = (
@@ -100,6 +107,7 @@ class _Controller(Owner):
         self._rank.bind(
             **everywhere,
             alive=removal.marks,
+            spared=self._spared,
             effect_unit=effect_unit,
             weight=weight,
             limit=options.delta_mse_max,

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from potr_cl.errors import UsageError
 from potr_cl.model.order import ascending
 
+#: The effect of what must stay.
+_BEYOND = 1e30
 #: Candidates that are looked at to guess how far an iteration's budget reaches.
 _SAMPLE = 2048
 
@@ -230,6 +232,7 @@ def prune(
     options: PruningOptions,
     progress: Callable[[int, int], None] | None = None,
     after_iteration: Callable[[int], None] | None = None,
+    spared: NDArray[np.bool_] | None = None,
 ) -> Pruned:
     """Run the schedule.
 
@@ -239,6 +242,7 @@ def prune(
         options: thresholds and iterations.
         progress: called with the iterations done and the number of splats left.
         after_iteration: called with the iteration.
+        spared: (N,) splats that stay, whatever their effect, unless there are too many of them; None: none.
     """
     alive = np.arange(splats, dtype=np.int64)
     iteration_of = np.full(splats, -1, np.int32)
@@ -249,6 +253,8 @@ def prune(
     smoothed = SmoothedEffects(effects, options.decay)
     for iteration in range(options.iterations):
         delta_mse, importance = smoothed.measure()
+        if spared is not None:
+            delta_mse = np.where(spared, _BEYOND, delta_mse)
         gone = choose(delta_mse, importance, alive, options.iterations - iteration, options)
         if len(gone) >= len(alive) and options.count is None:
             gone = gone[: len(alive) - 1]  # an empty scene is no scene

@@ -21,7 +21,7 @@ from potr_cl.stages.pruning.schedule import Course, Pruned
 from potr_cl.stages.stage import State
 
 #: What can be done with them.
-CHOICES = ("keep", "drop")
+CHOICES = ("keep", "drop", "protect")
 
 
 @dataclass(frozen=True)
@@ -87,10 +87,11 @@ def find_unseen(
             unseen[rest] = unseen_splats(scene.subset(rest), views, None, run)
     if not unseen.any():  # as usual
         return unseen, float
-    return unseen, in_background(_part_of_area, scene, unseen).result
+    return unseen, in_background(part_of_area, scene, unseen).result
 
 
-def _part_of_area(scene: Scene, splats: NDArray[np.bool_]) -> float:
+def part_of_area(scene: Scene, splats: NDArray[np.bool_]) -> float:
+    """The part of a scene's opacity-weighted area that some splats have, (N,), 0 to 1."""
     areas = opacity_weighted_areas(scene, map)
     return float(areas[splats].sum() / max(float(areas.sum()), 1e-300))
 

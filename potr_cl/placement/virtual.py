@@ -1,0 +1,123 @@
+"""Virtual cameras for scenes that come with none (:func:`place_cameras`): where would someone stand to look at this?"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from potr_cl.model.camera import Camera
+from potr_cl.model.placement.matter import frame_of
+from potr_cl.model.placement.sampling import F64
+from potr_cl.model.scene import Scene
+from potr_cl.model.virtual_cameras import FIELD, PREFIX, Plan, plan
+from potr_cl.opencl.device import Device
+from potr_cl.placement.candidates import Candidates, Targets, candidates_of, resolution
+from potr_cl.placement.choice import drawn, pick
+from potr_cl.placement.memory import Memory
+from potr_cl.placement.space import Space
+
+#: Targets for each view that is placed, and at least; places to stand for each view, and for each that judges; splats
+#: that say which way the scene lies.
+_TARGETS, _LEAST_TARGETS, _PLACES, _JUDGED, _FRAME = 40, 2000, 6, 3, 100_000
+#: Where in the sequence of places those begin that judge: far behind those that are tried to place views.
+_OTHERS = 1 << 16
+
+
+def place_cameras(
+    scene: Scene,
+    count: int | None = None,
+    size: int | None = None,
+    field: float = FIELD,
+    device: Device | None = None,
+) -> list[Camera]:
+    """Views that cover what someone would look at, and others to judge by.
+
+    Args:
+        scene: clean, at least one splat.
+        count: training views; by default 200 to 600, the more the more splats there are. An eighth as many test views,
+            32 at most, come on top (:func:`judging_views`).
+        size: of their square images, in pixels; by default 480 and more on a CPU, 700 and more on a GPU.
+        field: of view from side to side, in degrees; less where the renderer's near plane would cut a small scene off.
+        device: finds what is seen from where; by default the one that should be fastest.
+
+    Returns:
+        Cameras "virtual_000" and so on: the training views in the order in which they were picked, then the test views.
+
+    Raises:
+        UsageError: ``count`` or ``size`` below 1, or above what can be placed and rendered.
+        DeviceError: the device has no room, or failed.
+    """
+    ground = _Ground.of(scene, count, size, field, device)
+    planned = ground.planned
+    candidates = ground.candidates(_PLACES * planned.training, 0)
+    picked = [ground.camera(candidates, view, "train") for view in pick(candidates, planned.training)]
+    return _named([*picked, *ground.judges(planned.test)])
+
+
+def judging_views(
+    scene: Scene, count: int | None = None, size: int | None = None, device: Device | None = None
+) -> list[Camera]:
+    """The test views that :func:`place_cameras` places, or another number of them: near and far, wherever somebody
+    could stand, drawn without regard to what the training views show. Fewer are the first of more.
+
+    Args:
+        scene, size, device: as :func:`place_cameras` takes them.
+        count: of the views; None: as many as :func:`place_cameras` places.
+    """
+    ground = _Ground.of(scene, None, size, FIELD, device)
+    return _named(ground.judges(ground.planned.test if count is None else count))
+
+
+@dataclass(frozen=True)
+class _Ground:
+    """What is known of a scene before views are placed in it."""
+
+    device: Device
+    planned: Plan
+    space: Space
+    targets: Targets
+    half_view: float
+    pixels: float
+    memory: Memory | None
+    up: F64
+
+    @staticmethod
+    def of(scene: Scene, count: int | None, size: int | None, field: float, device: Device | None) -> _Ground:
+        opened = device or Device()
+        planned = plan(len(scene), count, size, opened.info.kind == "cpu")
+        half_view = math.tan(math.radians(field / 2))
+        space = Space.of(scene)
+        wanted = min(_TARGETS * plan(len(scene)).training, max(len(scene) // 10, _LEAST_TARGETS))
+        targets = Targets.of(scene, space, wanted)
+        pixels, memory = resolution(opened, scene, space, targets, planned.size / 2 / half_view)
+        frame = frame_of(scene.subset(np.arange(0, len(scene), max(len(scene) // _FRAME, 1))))
+        return _Ground(opened, planned, space, targets, half_view, pixels, memory, frame.up)
+
+    def candidates(self, places: int, first: int) -> Candidates:
+        focal = self.planned.size / 2 / self.half_view
+        return candidates_of(
+            self.device, self.space, self.targets, places, focal, self.half_view, self.pixels, self.memory, first
+        )
+
+    def judges(self, count: int) -> list[Camera]:
+        if not count:
+            return []
+        judges = self.candidates(max(_JUDGED * count, 64), _OTHERS)
+        return [self.camera(judges, view, "test") for view in drawn(judges, count)]
+
+    def camera(self, candidates: Candidates, view: int, split: str) -> Camera:
+        forward, size = candidates.forward[view], self.planned.size
+        right = np.cross(forward, self.up)
+        if np.linalg.norm(right) < 1e-3:  # looks straight up or down: any roll will do
+            right = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
+        right /= np.linalg.norm(right)
+        rotation = np.stack([right, np.cross(forward, right), forward])
+        focal = size / 2 / candidates.tangent[view]
+        translation = -rotation @ candidates.centres[view]
+        return Camera(PREFIX, size, size, focal, focal, size / 2, size / 2, rotation, translation, split)
+
+
+def _named(cameras: list[Camera]) -> list[Camera]:
+    return [replace(camera, name=f"{PREFIX}{number:03d}") for number, camera in enumerate(cameras)]

@@ -1,0 +1,125 @@
+"""The guard: what no view has resolved is found, and no stage touches it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from potr_cl.model.camera import Camera, resized
+from potr_cl.model.scene import Scene
+from potr_cl.opencl.device import Device
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.pipeline.run import Run
+from potr_cl.pipeline.stopwatch import Stopwatch
+from potr_cl.placement.guard import unresolved
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.reference.captures import looking
+from potr_cl.reference.surfaces import together
+from potr_cl.stages.code import Code
+from potr_cl.stages.guarded import UNRESOLVED
+from potr_cl.stages.pruning.on_device import prune_scene
+from potr_cl.stages.pruning.removal import RemovalSweep
+from potr_cl.stages.pruning.schedule import PruningOptions
+from potr_cl.stages.stage import State
+from tests.cases.surfaces import box
+from tests.devices import FAMILIES, open_device
+
+#: Splats of a room.
+_EACH = 4000
+
+
+def two_rooms() -> Scene:
+    """One beside the other, 20 apart, with colours of degree 1."""
+    rng = np.random.default_rng(0)
+    rooms = box(_EACH, (3, 4, 1.5), 0.2), box(_EACH, (3, 4, 1.5), 0.2, seed=1)
+    rooms = rooms[0], dataclasses.replace(rooms[1], means=rooms[1].means + np.array([20, 0, 0], np.float32))
+    scene = together(*rooms)
+    return dataclasses.replace(scene, sh=rng.normal(0, 0.3, (len(scene), 4, 3)).astype(np.float32))
+
+
+def in_the_first() -> list[Camera]:
+    """Views of all the first room from its middle, in pairs."""
+    sides = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
+    corners = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
+    return [
+        resized(
+            looking(
+                np.array([0.0, 0.0, 0.05 * turn]), np.array(side, float), (0.1, 0.2, 1), f"{turn}{number}", wide=1.2
+            ),
+            90,
+            60,
+        )
+        for turn in range(2)
+        for number, side in enumerate((*sides, *corners))
+    ]
+
+
+@pytest.fixture(params=FAMILIES)
+def device(request):
+    return open_device(request.param)
+
+
+@pytest.mark.one_runtime
+def test_the_room_that_nobody_looked_into_is_unresolved(device):
+    scene = two_rooms()
+    found = unresolved(device, scene, in_the_first())
+    assert found[_EACH:].all()
+    assert np.mean(found[:_EACH]) < 0.3, "but what is between the pictures"
+
+
+def options(unseen: str, **changes) -> EncodeOptions:
+    return EncodeOptions.for_preset("best", prune={"iterations": 4, "unseen": unseen}, between={"views": 0}, **changes)
+
+
+def kept(device: Device, unseen: str, **changes) -> State:
+    chosen = options(unseen, **changes)
+    names = [type(stage) for stage in chosen.stages if not isinstance(stage, Code)]
+    run = Run(dataclasses.replace(chosen, q=0.1), Stopwatch(), device)
+    return run.stages(State.of(two_rooms(), in_the_first()), names)
+
+
+@pytest.mark.parametrize("preset", ["best", pytest.param("paper", marks=pytest.mark.slow)])
+def test_no_stage_touches_what_no_view_resolved(device, preset):
+    scene = two_rooms()
+    found = unresolved(device, scene, in_the_first())
+    chosen = EncodeOptions.for_preset(preset, prune={"iterations": 4, "unseen": "protect", "delta_mse_max": 1e-5})
+    names = [type(stage) for stage in chosen.stages if not isinstance(stage, Code)]
+    state = Run(dataclasses.replace(chosen, q=0.1), Stopwatch(), device).stages(State.of(scene, in_the_first()), names)
+    assert np.isin(np.flatnonzero(found), state.survivors).all()
+    rows = np.flatnonzero(found[state.survivors])
+    for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
+        assert np.array_equal(getattr(state.scene, name)[rows], getattr(scene, name)[found]), name
+    assert len(state.survivors) < len(scene), "others go"
+    assert state.learnt[UNRESOLVED].splats == state.learnt["unseen"].splats == np.count_nonzero(found)
+
+
+def test_without_the_guard_they_are_lost(device):
+    dropped = kept(device, "drop")
+    assert np.count_nonzero(dropped.survivors >= _EACH) < 50
+    plain = kept(device, "keep")
+    assert UNRESOLVED not in plain.learnt, "given cameras say where people look"
+    assert np.count_nonzero(plain.survivors >= _EACH) < _EACH / 2
+
+
+def test_a_file_holds_what_was_kept(device):
+    encoded = encode(two_rooms(), in_the_first(), dataclasses.replace(options("protect"), q=0.5), device=device)
+    assert np.count_nonzero(encoded.order >= _EACH) == _EACH
+    back = encoded.scene
+    found, wanted = back.sh[encoded.order >= _EACH], two_rooms().sh[encoded.order[encoded.order >= _EACH]]
+    assert np.sqrt(np.mean((found - wanted) ** 2)) < 0.1
+    assert "from near enough to judge them: kept as they are" in str(encoded.unseen)
+
+
+@pytest.mark.parametrize("count", [None, _EACH + 500])
+def test_spared_splats_stay_whoever_decides(device, count):
+    scene = two_rooms()
+    spared = np.arange(len(scene)) % 3 == 0
+    with Rasterizer(device, scene) as rasterizer, RemovalSweep(rasterizer, in_the_first()) as removal:
+        schedule = PruningOptions(1e-3, 4, count=count)
+        left = prune_scene(removal, schedule, spared=spared).survivors
+    assert np.isin(np.flatnonzero(spared), left).all()
+    assert len(left) == (np.count_nonzero(spared) if count is None else count) or count is None
+    assert len(left) < len(scene)
