@@ -30,7 +30,7 @@ def add_cameras_options(p: argparse.ArgumentParser) -> None:
         "--virtual-views",
         type=whole_number,
         metavar="N",
-        help="how many to place without --cameras (default: 200 to 600, more for larger scenes)",
+        help="how many to place without --cameras (default: 200 to 1600, more for larger scenes)",
     )
     p.add_argument(
         "--cameras-anyway",

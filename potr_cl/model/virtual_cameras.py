@@ -18,10 +18,9 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 #: Training views that are placed unless told otherwise, and pixels along a side of each, on a GPU and on a CPU: so many
-#: up to so many splats, and more with these powers of the splats. Colours want many directions, so the views are many.
-_VIEWS, _VIEWS_ON_CPU, MOST = 240, 200, 600
-_SIZE, _SIZE_ON_CPU, _SPLATS = 700, 480, 300_000
-_VIEWS_GROW, _SIZE_GROWS = 0.27, 0.07
+#: up to so many splats, and more with the root of the splats. Colours want many directions, so the views are many.
+_VIEWS, _VIEWS_ON_CPU, MOST = 240, 200, 1600
+_SIZE, _SIZE_ON_CPU, _SPLATS = 600, 480, 300_000
 #: An eighth as many judge, but no more than so many.
 _MOST_TESTS = 32
 #: Degrees from side to side. A wide view shows a splat together with more of the others, so that fewer views show each
@@ -72,11 +71,10 @@ def plan(splats: int, count: int | None = None, size: int | None = None, slow: b
     Raises:
         UsageError: ``count`` or ``size`` below 1, or above what can be placed and rendered.
     """
-    more = max(splats / _SPLATS, 1.0)
     if count is None:
-        count = min(round((_VIEWS_ON_CPU if slow else _VIEWS) * more**_VIEWS_GROW), MOST)
+        count = min(round((_VIEWS_ON_CPU if slow else _VIEWS) * math.sqrt(max(splats / _SPLATS, 1.0))), MOST)
     if size is None:
-        size = round((_SIZE_ON_CPU if slow else _SIZE) * more**_SIZE_GROWS)
+        size = _SIZE_ON_CPU if slow else _SIZE
     if not (1 <= count <= MOST_ASKED and 1 <= size <= WIDEST_ASKED):
         raise UsageError(
             f"{count} virtual views of {size} x {size} pixels: both must be at least 1, the views at most "

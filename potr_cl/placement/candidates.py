@@ -28,6 +28,8 @@ NEAR = 0.25
 USUAL = 3.0
 #: Where colours tell from how far photographs were taken: their width, pixels, and what is asked for at most and least.
 _PHOTOGRAPH, _COARSEST, _FINEST = 1000, 2.0, 4.5
+#: The most that small pictures are asked for, as a part of the focal length: with more, each would show too little.
+_OF_PICTURE = 0.0076
 #: The distances that are tried, in those at which splats are resolved; rays; and how well, as a part of the best, a
 #: distance is remembered at which photographs were taken.
 _DISTANCES, _TRIED, _AS_WELL = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0), 600, 0.95
@@ -249,4 +251,5 @@ def resolution(
     good = np.flatnonzero(usual >= _AS_WELL * usual.max())
     farthest = _DISTANCES[good[-1]]
     photographs = _PHOTOGRAPH / (2 * math.tan(math.radians(32.5)))
-    return float(np.clip(USUAL * photographs / focal / farthest, _COARSEST, _FINEST)), memory
+    finest = max(min(_FINEST, _OF_PICTURE * focal), USUAL)
+    return float(np.clip(USUAL * photographs / focal / farthest, _COARSEST, finest)), memory

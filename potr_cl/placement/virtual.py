@@ -20,7 +20,7 @@ from potr_cl.placement.space import Space
 
 #: Targets for each view that is placed, and at least; places to stand for each view, and for each that judges; splats
 #: that say which way the scene lies.
-_TARGETS, _LEAST_TARGETS, _PLACES, _JUDGED, _FRAME = 40, 2000, 6, 3, 100_000
+_TARGETS, _LEAST_TARGETS, _PLACES, _JUDGED, _FRAME = 25, 2000, 6, 3, 100_000
 #: Where in the sequence of places those begin that judge: far behind those that are tried to place views.
 _OTHERS = 1 << 16
 
@@ -36,9 +36,9 @@ def place_cameras(
 
     Args:
         scene: clean, at least one splat.
-        count: training views; by default 200 to 600, the more the more splats there are. An eighth as many test views,
+        count: training views; by default 200 to 1600, the more the more splats there are. An eighth as many test views,
             32 at most, come on top (:func:`judging_views`).
-        size: of their square images, in pixels; by default 480 and more on a CPU, 700 and more on a GPU.
+        size: of their square images, in pixels; by default 480 on a CPU, 600 on a GPU.
         field: of view from side to side, in degrees; less where the renderer's near plane would cut a small scene off.
         device: finds what is seen from where; by default the one that should be fastest.
 

@@ -121,11 +121,11 @@ def test_a_plan_says_beforehand_what_is_placed(around_ball):
     assert str(planned) == f"{planned.training} views of {planned.size} x {planned.size} pixels"
 
 
-def test_large_scenes_get_more_and_larger_views_and_cpus_fewer_and_smaller_ones():
+def test_large_scenes_get_more_views_and_cpus_fewer_and_smaller_ones():
     plans = [plan(splats) for splats in (1, 10_000, 1_000_000, 10_000_000, 1_000_000_000)]
     counts, sizes = [p.training for p in plans], [p.size for p in plans]
     assert counts == sorted(counts)
-    assert sizes == sorted(sizes)
+    assert len(set(sizes)) == 1
     assert counts[0] == counts[1] < counts[2] < counts[3] <= counts[4] == MOST
     for splats in (1, 1_000_000):
         assert plan(splats, slow=True).pixels < plan(splats).pixels
