@@ -38,17 +38,19 @@ BINS = 32
 #: Views at each place.
 AIMS = 5
 #: How far a place is from its point, in distances at which that is resolved; of one place in so many, up to this.
-_NEAREST, _FARTHEST, _FAR_PLACES, _OVERVIEW = 0.5, 1.5, 4, 4.0
+_NEAREST, _FARTHEST, _FAR_PLACES, _OVERVIEW = 0.5, 1.5, 4, 6.0
 #: The part of the free way from its point that a place is away at most, and the cells that it is away from matter.
 _OF_WAY, _CLEAR = 0.7, 2
 #: The longest lens, as a part of the usual field of view.
 _LONGEST = 0.01
 #: What is seen from farther than this many times the distance at which it is resolved hardly counts.
-_HARDLY = 4.0
+_HARDLY = 6.0
 #: The SH energy towards a view, as a part of the same splats' highest: below the first it was never trained, above the
 #: second it was. Places among which the highest is looked for, and targets that are asked.
 _UNTRAINED, _TRAINED, _COMPARED, _ASKED = 0.6, 0.8, 300, 1500
 
+#: Directions that are looked in, and the part of them in which there must be matter, where a place counts as enclosed.
+_AROUND, _ENCLOSED = on_sphere(low_discrepancy(24, 2)), 0.8
 _BIN_DIRECTIONS = on_sphere(low_discrepancy(BINS, 2)).astype(np.float32)
 
 
@@ -93,6 +95,7 @@ class Candidates:
         shown: (E,) numbers of the targets that views show.
         worth: (E,) how well, 0 to 1.
         bins: (E,) from which of the directions.
+        enclosed: (C,) whether there is matter nearly all around, as in rooms.
     """
 
     centres: F64
@@ -102,6 +105,7 @@ class Candidates:
     shown: NDArray[np.int64]
     worth: F32
     bins: NDArray[np.int64]
+    enclosed: NDArray[np.bool_]
 
 
 def candidates_of(
@@ -154,7 +158,17 @@ def candidates_of(
         shown=target[every],
         worth=worth[every],
         bins=bins[every],
+        enclosed=np.tile(_enclosed(space, places), AIMS),
     )
+
+
+def _enclosed(space: Space, places: F64) -> NDArray[np.bool_]:
+    """(P,) whether rays in nearly all directions meet matter."""
+    rays = np.tile(_AROUND, (len(places), 1))
+    far = np.full(len(rays), 2 * space.cell * sum(space.shape))
+    met = space.reach(np.repeat(places, len(_AROUND), axis=0), rays, far) < far
+    found: NDArray[np.bool_] = np.mean(met.reshape(len(places), -1), axis=1) >= _ENCLOSED
+    return found
 
 
 def _places(
@@ -242,7 +256,7 @@ def resolution(
         memory.points,
         targets.sizes[asked],
         NEAR,
-        15 * _HARDLY,
+        10 * _HARDLY,
     )
     shown = np.zeros((len(every), len(memory.points)), np.float32)
     shown[place, target] = worth

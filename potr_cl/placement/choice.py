@@ -10,6 +10,10 @@ from potr_cl.placement.candidates import AIMS, BINS, Candidates
 
 #: A target that so many views show well is worth half of what it is at first.
 _ENOUGH = 4.0
+#: What a view counts from inside a room: it shows less than one from outside, and people stand there.
+_INDOORS = 1.5
+#: Where this part of the places is enclosed, this part of the views judge from there.
+_ROOMS, _JUDGE_ROOMS = 0.15, 0.75
 #: A view that shows less than this part of what the median one shows judges nothing.
 _PLAIN = 0.5
 
@@ -23,7 +27,8 @@ def pick(candidates: Candidates, count: int) -> list[int]:
     def gain(view: int) -> float:
         part = candidates.parts[view]
         had = (1 + from_there[places[part]]) * (1 + at_all[candidates.shown[part]] / _ENOUGH)
-        return float((candidates.worth[part] / had).sum(dtype=np.float64))
+        worth = float((candidates.worth[part] / had).sum(dtype=np.float64))
+        return worth * _INDOORS if candidates.enclosed[view] else worth
 
     # Gains only fall, so an old one bounds the new one from above.
     heap = [(-gain(view), view) for view in range(len(candidates.parts))]
@@ -44,13 +49,18 @@ def pick(candidates: Candidates, count: int) -> list[int]:
 
 def drawn(candidates: Candidates, count: int) -> list[int]:
     """Views that judge, one at a place: wherever somebody could stand, not where most is to be seen, but for those that
-    show little."""
+    show little. Where there are rooms, most of them stand in rooms."""
     worth = np.array([candidates.worth[part].sum() for part in candidates.parts])
     seen = worth[worth > 0]
     plain = (worth >= _PLAIN * np.median(seen) if len(seen) else np.ones(len(worth), bool)).reshape(AIMS, -1)
     places = plain.shape[1]
-    found = []
+    rooms = np.count_nonzero(candidates.enclosed[:places]) >= _ROOMS * places
+    found: list[int] = []
+    indoors = 0
     for place in range(places):
         good = [aim for aim in ((place + turn) % AIMS for turn in range(AIMS)) if plain[aim, place]]
-        found += [aim * places + place for aim in good[:1]]
+        inside = bool(candidates.enclosed[place])
+        if good and (not rooms or inside == (indoors < _JUDGE_ROOMS * (len(found) + 1))):
+            found.append(good[0] * places + place)
+            indoors += inside
     return found[:count]

@@ -20,7 +20,7 @@ from potr_cl.placement.rays import resolved_by
 from potr_cl.placement.space import Space
 
 #: Pixels that the larger standard deviation of a splat of median size must have, and the views in which it must.
-_PIXELS, _ENOUGH = 1.5, 2
+_PIXELS, _ENOUGH = 1.2, 2
 #: Who stands has so many free cells around; and what lies farther than this from there, in cells, is buried.
 _CLEAR, _DEEP = 2, 3
 #: Splats at a time.

@@ -20,7 +20,7 @@ from potr_cl.placement.space import Space
 
 #: Targets for each view that is placed, and at least; places to stand for each view, and for each that judges; splats
 #: that say which way the scene lies.
-_TARGETS, _LEAST_TARGETS, _PLACES, _JUDGED, _FRAME = 25, 2000, 6, 3, 100_000
+_TARGETS, _LEAST_TARGETS, _PLACES, _JUDGED, _FRAME = 32, 2000, 6, 16, 100_000
 #: Where in the sequence of places those begin that judge: far behind those that are tried to place views.
 _OTHERS = 1 << 16
 
@@ -104,7 +104,7 @@ class _Ground:
     def judges(self, count: int) -> list[Camera]:
         if not count:
             return []
-        judges = self.candidates(max(_JUDGED * count, 64), _OTHERS)
+        judges = self.candidates(_JUDGED * max(count, 8), _OTHERS)
         return [self.camera(judges, view, "test") for view in drawn(judges, count)]
 
     def camera(self, candidates: Candidates, view: int, split: str) -> Camera:

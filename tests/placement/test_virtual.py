@@ -81,7 +81,7 @@ def around_ball():
 
 def test_an_object_is_seen_from_all_sides(around_ball):
     outside = outside_ball(train_views(around_ball))
-    assert len(outside) >= len(train_views(around_ball)) // 2
+    assert len(outside) >= len(train_views(around_ball)) // 3, "it is hollow: the others are inside"
     assert times_seen(BALL, BALL.means, outside).min() >= 4
     # It fills a good part of the picture.
     assert np.median([np.mean(in_view(BALL, c)) for c in outside]) > 0.4
