@@ -78,8 +78,8 @@ class Run:
 
     def _guarded(self, state: State) -> State:
         """The state that knows what no view has resolved, where nothing may be lost of that."""
-        prune = self._options.stage(Prune)
-        wanted = prune.unseen == "protect" or (prune.unseen == "keep" and is_virtual(state.views))
+        unseen = next((each.unseen for each in self._options.stages if isinstance(each, Prune)), None)
+        wanted = unseen == "protect" or (unseen == "keep" and is_virtual(state.views))
         if not wanted or UNRESOLVED in state.learnt or not state.views or not self._options.look_at_views(state.source):
             return state
         self._watch("place cameras", 1.0)

@@ -214,7 +214,7 @@ def test_without_cameras_virtual_ones_are_placed(tmp_path, scene_path, capsys):
     few = ["--iterations", "2", "--virtual-views", "8", "--count", "90"]
     assert cli.main(["encode", str(scene_path), "-o", str(potr), *few]) == 0
     said = capsys.readouterr()
-    assert "no --cameras: 8 virtual views and 1 to judge by placed" in said.err
+    assert "no --cameras given: 8 virtual views and 1 to judge by placed" in said.err
     assert "1 held-out virtual view" in said.out
     assert "place cameras" in said.out
     assert json.loads(run(capsys, "info", potr, "--json"))["cameras"] == "virtual"
