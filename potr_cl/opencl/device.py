@@ -155,10 +155,10 @@ class Device:
             Done when all are loaded. Nobody need wait for it, and it raises nothing.
         """
         folder = program_cache.folder()
-        if not isinstance(folder, str) or self._variants or self._macros or self._build_options:
+        if folder is None or self._variants or self._macros or self._build_options:
             return in_background(lambda: None)
         about = (purpose, self.info.name, self.info.platform, self.info.version, self.family)
-        self._foresight = Foresight(Path(folder), repr(about))
+        self._foresight = Foresight(folder, repr(about))
 
         def load(program: Wanted) -> None:
             with suppress(DeviceError, OSError, Warning):
@@ -177,12 +177,11 @@ class Device:
                 if wanted not in self._programs:
                     options = ["-cl-std=CL1.2", *self._build_options, *(f"-D{name}={value}" for name, value in macros)]
 
-                    def build() -> cl.Program:
-                        program = cl.Program(self.context, kernel_source(source, self._variants))
-                        return program.build(options, cache_dir=program_cache.folder(repr(wanted)))
-
+                    text = kernel_source(source, self._variants)
                     with self.errors(f"failed to build {source}"):
-                        self._programs[wanted] = whatever_warns(build)
+                        self._programs[wanted] = whatever_warns(
+                            lambda: program_cache.built(self.context, text, options)
+                        )
         return self._programs[wanted]
 
     def kernel(self, source: str, name: str, **defines: str | int | float) -> Kernel:
