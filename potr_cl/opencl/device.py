@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
 import threading
@@ -366,6 +367,16 @@ class Device:
         values = np.linspace(-8, 0, 4096, dtype=np.float32)
         exact = np.exp2(values.astype(np.float64))
         return bool(np.abs(self._probe("probe_native_exp2", values, LANES=1) / exact - 1).max() < 5e-7)
+
+    def digits(self) -> str:
+        """What tells this device from one that rounds differently: a hash of what some of the kernels' maths gives.
+
+        Devices of the same name can be of hosts whose processors have other instructions.
+        """
+        values = np.linspace(-7.9, -0.1, 1600, dtype=np.float32)
+        macros = {"LANES": self.vector_width, **({"NATIVE_EXP2": 1} if self.native_exp2 else {})}
+        found = self._probe("probe_digits", values, **macros).tobytes()
+        return hashlib.sha256(repr((self.family, self.vector_width)).encode() + found).hexdigest()[:16]
 
     def _probe(self, name: str, values: np.ndarray[Any, Any], **defines: int) -> np.ndarray[Any, Any]:
         kernel = self.kernel("opencl/probe.cl", name, **defines)
