@@ -135,7 +135,7 @@ def _keep(folder: Path, contents: Mapping[str, str]) -> None:
         path = folder / name
         if not path.exists() or path.read_text(errors="replace") != text:
             with replacing(path) as file:
-                file.write(text.encode())
+                file.write(text.encode(errors="surrogateescape"))
 
 
 def _folder_of_this_process() -> Path:

@@ -493,6 +493,22 @@ def test_whoever_reads_has_gone(potr_path: Path, arguments: list[str]) -> None:
     assert result.stderr == "exit code 0\n"
 
 
+def test_numbers_beyond_single_precision_are_no_news(tmp_path: Path, potr_path: Path) -> None:
+    """Neither of a box nor of a scene, whose centres are far and whose colours are absurd."""
+    scene = random_scene(20, 1)
+    scene.means[:] *= np.float32(1e30)
+    scene.sh[:, 1] = np.float32(3e38)
+    ply.save(tmp_path / "a.ply", scene)
+    box = "-1e39 -1e39 -1e39 1e39 1e39 1e39".split()
+    for words in (
+        ["decode", potr_path, "-o", tmp_path / "b.ply", "--box", *box],
+        ["info", tmp_path / "a.ply"],
+        ["convert", tmp_path / "a.ply", tmp_path / "b.compressed.ply"],
+    ):
+        result = run('"$@"', *words)
+        assert (result.returncode, result.stderr) == (0, ""), words
+
+
 def test_a_terminal_of_another_alphabet(tmp_path: Path, potr_path: Path) -> None:
     result = run('"$@"', "decode", potr_path, "-o", tmp_path / "é中.ply", PYTHONIOENCODING="ascii")
     assert result.returncode == 0
