@@ -24,6 +24,11 @@ from potr_cl.host.atomic_write import replacing
 from potr_cl.opencl.cache_folder import cache_folder
 
 cl._PYOPENCL_NO_CACHE = True
+# For each kernel object pyopencl generates the code that calls it, and never forgets the source: once is enough for a
+# process, however many devices it opens.
+from pyopencl import invoker  # noqa: E402 (it opens its database where it may have one)
+
+invoker._generate_enqueue_and_set_args_module = functools.cache(invoker._generate_enqueue_and_set_args_module)
 
 #: Variables by which users have drivers compile something else, for one as the instructions of another processor.
 _OF_COMPILERS = ("CL_CONFIG_", "POCL_", "IGC_", "NEO", "AMD_", "GPU_", "LP_", "GALLIVM_", "RUSTICL_")

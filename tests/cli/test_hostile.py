@@ -499,7 +499,7 @@ def test_numbers_beyond_single_precision_are_no_news(tmp_path: Path, potr_path: 
     scene.means[:] *= np.float32(1e30)
     scene.sh[:, 1] = np.float32(3e38)
     ply.save(tmp_path / "a.ply", scene)
-    box = "-1e39 -1e39 -1e39 1e39 1e39 1e39".split()
+    box = [*["-1e39"] * 3, *["1e39"] * 3]
     for words in (
         ["decode", potr_path, "-o", tmp_path / "b.ply", "--box", *box],
         ["info", tmp_path / "a.ply"],

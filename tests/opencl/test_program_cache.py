@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import linecache
 import os
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import pytest
 
 from potr_cl.opencl import program_cache
 from potr_cl.opencl.cache_folder import cache_folder
+from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import list_devices
 
 ROOT = Path(__file__).parents[2]
@@ -87,6 +89,15 @@ def test_what_another_processor_computes_with_is_not_loaded(cache, context, monk
     monkeypatch.setenv("CL_CONFIG_CPU_TARGET_ARCH", "corei7")
     program_cache.built(context, SOURCE, [])
     assert len(list(cache.iterdir())) == 2
+
+
+def test_opening_devices_leaves_nothing_behind():
+    """But what pyopencl generates to call a kernel, which it keeps the source of, once a kernel."""
+    Device().shared_kernel("opencl/fill.cl", "fill")
+    known = len(linecache.cache)
+    for _ in range(3):
+        Device().shared_kernel("opencl/fill.cl", "fill")
+    assert len(linecache.cache) == known
 
 
 @pytest.mark.skipif(os.name != "posix", reason="folders have no such owners")
