@@ -3,6 +3,7 @@
 # Few imports: until the first lines of main have run, Ctrl-C ends in a traceback.
 import os
 import sys
+import warnings
 
 
 def main() -> int:
@@ -16,6 +17,8 @@ def main() -> int:
 
     end_cleanly_on_signals()
     open_standard_files()
+    # That a number of a file is beyond single precision, as NumPy remarks, is no news to who runs a command.
+    warnings.filterwarnings("ignore", category=RuntimeWarning, append=True)
     # NumPy's library for matrices starts a thread a processor, which wait for work at full speed. There is little of it
     # here, and others need the processors.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

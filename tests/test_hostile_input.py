@@ -87,6 +87,13 @@ def test_bombs(form, tmp_path):
     assert {row["outcome"] for row in rows} <= {"read", "refused"}
 
 
+def test_some_messages_to_the_viewer(tmp_path):
+    pytest.importorskip("viser", reason="the extra view is not installed")
+    (row,) = run("page", tmp_path, "--count", "2000", "--tabs", "2")
+    assert row["bytes printed"] == 0
+    assert row["answers to the honest tab"] > 0
+
+
 def signals(tmp_path: Path, moments: int, *commands: str) -> None:
     names = [argument for name in commands for argument in ("--command", name)]
     rows = run("signals", tmp_path, "--moments", str(moments), *names)

@@ -115,6 +115,8 @@ def ladder_files(folder: Path, scene: Path, steps: Sequence[float], suffix: str)
         UsageError: two qualities would have one file.
     """
     stem = stem_of_scene(scene) if scene.suffix or scene.is_dir() else "scene"
+    # The description names them, and a name in a file must be printable: this one need not even be UTF-8.
+    stem = "".join(each if each.isprintable() else "_" for each in stem)
     names = [f"{stem}_q{q:g}{suffix}" for q in steps]
     if len(set(names)) < len(names):
         raise UsageError("--ladder names qualities that are the same to six digits")

@@ -18,7 +18,7 @@ from potr_cl.cli.guard import StandardOutput, WrittenFile, WrittenFolder, named
 from potr_cl.errors import UsageError, WriteError
 from potr_cl.host.atomic_write import check_place
 from potr_cl.host.rescue import kept_elsewhere, replacing_or_keeping
-from potr_cl.host.standard_files import standard_output_for_data
+from potr_cl.host.standard_files import closed, standard_output_for_data
 
 
 class WrittenScene(WrittenFile):
@@ -121,6 +121,8 @@ def _check_standard_output(args: argparse.Namespace) -> None:
         raise UsageError("--json and the result both want standard output: give -o a name")
     if getattr(args, "to", None) is not None:
         args.to = suffix_of(args)
+    if 1 in closed:
+        raise UsageError("standard output is closed: redirect it, or give a name")
     with contextlib.suppress(OSError, ValueError, AttributeError):
         if sys.stdout.isatty():
             raise UsageError("the result is no text for a terminal: redirect standard output, or give a name")

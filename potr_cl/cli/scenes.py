@@ -20,6 +20,7 @@ from potr_cl.formats.scene_size import bytes_of_scene
 from potr_cl.formats.scenes import spz
 from potr_cl.formats.streams import received, send
 from potr_cl.host.rescue import written_or_kept
+from potr_cl.host.standard_files import closed
 from potr_cl.model.scene import Scene
 
 # What computes on a device is imported where it is needed: other commands do without.
@@ -174,6 +175,8 @@ def standard_input(args: argparse.Namespace) -> Iterator[None]:
         raise UsageError("--from is the format of standard input: give '-' as the scene")
     with contextlib.ExitStack() as stack:
         for path in inputs:
+            if 0 in closed:
+                raise UsageError("standard input is closed: pipe a scene into it, or give a name")
             with contextlib.suppress(OSError, ValueError, AttributeError):
                 if sys.stdin.isatty():
                     raise UsageError("standard input is a terminal: pipe a scene into it, or give a name")

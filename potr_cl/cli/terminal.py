@@ -16,6 +16,7 @@ import sys
 from typing import Any, Literal, TextIO
 
 from potr_cl.errors import PotrError
+from potr_cl.host.standard_files import closed
 from potr_cl.plain_text import plain_document, plain_lines
 
 #: What a line is: of an error or a warning, which are always shown; of what happens, which --quiet leaves out; or of
@@ -64,12 +65,13 @@ def say(text: object) -> None:
 
 
 def say_done(text: object) -> None:
-    """Print on standard output what a command did whose result is a file: not where only errors are to be said.
+    """Print on standard output what a command did whose result is a file: not where only errors are to be said, nor
+    where standard output is closed.
 
     Raises:
         As :func:`say`.
     """
-    if not is_quiet():
+    if not is_quiet() and 1 not in closed:
         say(text)
 
 
@@ -94,6 +96,8 @@ def note(text: object, kind: Kind = "news") -> None:
 
 
 def _say(text: str) -> None:
+    if 1 in closed:
+        raise PotrError("standard output is closed: redirect it to see the result")
     try:
         _print(sys.stdout, text)
     except BrokenPipeError:

@@ -32,6 +32,8 @@ _MOST_PIXELS = 1 << 27
 _COMMON: dict[str, Colour] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 #: More than 8 bits in one channel: Pillow would clip them on the way to R, G, B.
 _DEEP_MODES = ("I", "F", "I;16", "I;16B", "I;16L", "I;16N")
+#: Numbers that are rounded to 8 bits at a time.
+_SLICE = 1 << 20
 
 
 def parse_colour(text: str) -> Colour:
@@ -157,7 +159,11 @@ def read_ground_truth(path: Path, background: Colour = (0.0, 0.0, 0.0)) -> Float
 
 def to_8_bits(image: NDArray[Any]) -> NDArray[np.uint8]:
     """Colours of any shape, clamped to [0, 1] and rounded to 0 … 255, uint8 of the same shape."""
-    pixels: NDArray[np.uint8] = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
+    pixels = np.empty(image.shape, np.uint8)
+    # In slices: each step makes a copy, of a picture of gigabytes too.
+    rows = max(_SLICE * len(image) // max(image.size, 1), 1)
+    for first in range(0, len(image), rows):
+        pixels[first : first + rows] = np.rint(np.clip(image[first : first + rows], 0, 1) * 255)
     return pixels
 
 

@@ -93,7 +93,8 @@ class Ladder:
 
     def encoded(self) -> bytes:
         """The content of the description's file."""
-        return (json.dumps(self.document(), indent=1, ensure_ascii=False) + "\n").encode()
+        # In ASCII, as names of files need not be UTF-8.
+        return (json.dumps(self.document(), indent=1) + "\n").encode()
 
     def save(self) -> None:
         """Write the description; it appears only when it is whole.

@@ -14,8 +14,12 @@ if TYPE_CHECKING:
     from typing import BinaryIO
 
 
+#: Descriptors that were closed when the process began: what is to go there or come from there is refused.
+closed: set[int] = set()
+
+
 def open_standard_files() -> None:
-    """Have all three lead somewhere, if only to nowhere.
+    """Have all three lead somewhere, if only to nowhere, and note those that were :data:`closed`.
 
     Otherwise the next file that is opened takes the number of the one that is missing, and what libraries print ends up
     in it.
@@ -24,6 +28,7 @@ def open_standard_files() -> None:
         try:
             os.fstat(descriptor)
         except OSError:
+            closed.add(descriptor)
             os.open(os.devnull, os.O_RDWR)  # takes the lowest free number, which is this one
     if sys.stdout is None:
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115 (as long as the process)

@@ -48,8 +48,9 @@ class Box:
     def holds(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
         """(N,) which of (N, 3) points lie in it."""
         inside = np.ones(len(points), bool)
-        for axis in range(3):
-            inside &= (points[:, axis] >= self.low[axis]) & (points[:, axis] <= self.high[axis])
+        with np.errstate(over="ignore"):  # beyond single precision a corner is at infinity
+            for axis in range(3):
+                inside &= (points[:, axis] >= self.low[axis]) & (points[:, axis] <= self.high[axis])
         return inside
 
     def meets(self, other: Box) -> bool:

@@ -13,7 +13,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,8 @@ _RADII = 4097
 #: Newton's steps, the difference of its derivative, and the error with which it is content, as parts of a focal length.
 _STEPS, _DIFFERENCE, _CONTENT = 12, 1e-6, 1e-7
 _LARGEST_COEFFICIENT = 1e3
+#: Focal length in sides of the picture; and of the points on a side, every so many are tried for folds.
+_SHORTEST, _TRIED = 1e-3, 4
 
 
 class Pinhole(NamedTuple):
@@ -86,19 +89,19 @@ class Lens:
         if not all(abs(value) <= _LARGEST_COEFFICIENT for value in coefficients):
             raise DataError(f"lens distortion with a coefficient beyond {_LARGEST_COEFFICIENT:g} is no lens's")
         intrinsics = (self.fx, self.fy, self.cx, self.cy)
-        if not np.isfinite(intrinsics).all() or self.fx <= 0 or self.fy <= 0:
+        if not np.isfinite(intrinsics).all() or min(self.fx / self.width, self.fy / self.height) < _SHORTEST:
             raise DataError(f"intrinsics (fx, fy, cx, cy) = {intrinsics} are not a camera's")
         if not (0 < self.cx < self.width and 0 < self.cy < self.height):
             raise DataError("the principal point of a distorted camera lies outside its picture")
         with np.errstate(all="ignore"):
             # Halfway from the principal point to the border; what lies beyond the widest field need not be found.
-            middle = self._sides(0.5).reshape(2, -1)
+            middle = self._sides(0.5)[:, :, ::_TRIED].reshape(2, -1)
             points, found = self.undistorted(*middle)
             # On the whole way there the picture must not be turned inside out.
-            for part in np.linspace(0, 1, 17)[1:]:
-                (a, c), (b, d) = self._slopes(part * points)
-                found &= a * d > b * c
-        radii, bent = self._radii()
+            way = (points[:, None] * np.linspace(0, 1, 17)[1:, None]).reshape(2, -1)
+            (a, c), (b, d) = self._slopes(way, np.stack(self.distorted(*way)))
+            found &= (a * d > b * c).reshape(16, -1).all(axis=0)
+        radii, bent = self._radii
         if len(radii) == _RADII:
             found |= np.hypot(*middle) > bent[-1]
         if not found.all():
@@ -116,12 +119,16 @@ class Lens:
             turned = np.where(r > 1e-9, np.arctan(r) / np.maximum(r, 1e-9), 1.0)
             x, y = x * turned, y * turned
         square = x * x + y * y
-        d = _polynomial(self.radial, square) / _polynomial(self.quotient, square)
+        d = _polynomial(self.radial, square)
+        if self.quotient:
+            d = d / _polynomial(self.quotient, square)
         (p1, p2), (s1, s2) = self.tangential, self.prism
-        return (
-            d * x + 2 * p1 * x * y + p2 * (square + 2 * x * x) + s1 * square,
-            d * y + 2 * p2 * x * y + p1 * (square + 2 * y * y) + s2 * square,
-        )
+        u, v = d * x, d * y
+        # Most lenses have few of the terms, and files of views can have a lens for each.
+        if any(self.tangential):
+            u = u + 2 * p1 * x * y + p2 * (square + 2 * x * x)
+            v = v + 2 * p2 * x * y + p1 * (square + 2 * y * y)
+        return (u + s1 * square, v + s2 * square) if any(self.prism) else (u, v)
 
     def undistorted(self, u: F64, v: F64) -> tuple[F64, NDArray[np.bool_]]:
         """Points of the image plane of points of the photograph: the inverse of :meth:`distorted`.
@@ -132,16 +139,18 @@ class Lens:
         Returns:
             (2, N) x and y, and whether each was found; those beyond the widest field are not.
         """
-        radii, bent = self._radii()
+        radii, bent = self._radii
         far = np.hypot(u, v)
         guess = np.interp(far, bent, radii) / np.maximum(far, 1e-12)
         points = np.stack([u * guess, v * guess])
         wanted = np.stack([u, v])
         for _ in range(_STEPS):
-            missing = np.stack(self.distorted(points[0], points[1])) - wanted
-            (a, c), (b, d) = self._slopes(points)
+            here = np.stack(self.distorted(points[0], points[1]))
+            missing = here - wanted
+            (a, c), (b, d) = self._slopes(points, here)
             determinant = a * d - b * c
-            points -= np.stack([d * missing[0] - b * missing[1], a * missing[1] - c * missing[0]]) / determinant
+            points[0] -= (d * missing[0] - b * missing[1]) / determinant
+            points[1] -= (a * missing[1] - c * missing[0]) / determinant
         left = np.abs(np.stack(self.distorted(points[0], points[1])) - wanted).max(axis=0)
         found = (left < _CONTENT) & (np.hypot(points[0], points[1]) <= radii[-1] * 1.001)
         return points, found
@@ -179,16 +188,15 @@ class Lens:
         x = (np.linspace(0.5, view.width - 0.5, _SIDE_POINTS) - view.cx) / view.fx
         y = (np.linspace(0.5, view.height - 0.5, _SIDE_POINTS) - view.cy) / view.fy
         across, down = np.meshgrid(x, y)
-        radii, _ = self._radii()
+        radii, _ = self._radii
         u, v = self.distorted(across, down)
         columns, rows = u * self.fx + self.cx, v * self.fy + self.cy
         inside = (columns >= 0) & (columns <= self.width) & (rows >= 0) & (rows <= self.height)
         # Where the radius grows no more the picture is folded over.
         return bool((inside & (np.hypot(across, down) <= radii[-1] * 1.001)).all())
 
-    def _slopes(self, points: F64) -> tuple[F64, F64]:
-        """How the bent points, (2, N), move with x and with y."""
-        here = np.stack(self.distorted(points[0], points[1]))
+    def _slopes(self, points: F64, here: F64) -> tuple[F64, F64]:
+        """How the bent points, (2, N), which are ``here``, move with x and with y."""
         right = np.stack(self.distorted(points[0] + _DIFFERENCE, points[1]))
         down = np.stack(self.distorted(points[0], points[1] + _DIFFERENCE))
         return (right - here) / _DIFFERENCE, (down - here) / _DIFFERENCE
@@ -218,10 +226,11 @@ class Lens:
         with np.errstate(all="ignore"):
             points, found = self.undistorted(*sides.reshape(2, -1))
         far = np.hypot(*sides.reshape(2, -1))
-        edge = sides.reshape(2, -1) / far * self._radii()[0][-1]
+        edge = sides.reshape(2, -1) / far * self._radii[0][-1]
         points = np.where(found, points, edge)
         return points.reshape(sides.shape), found
 
+    @cached_property
     def _radii(self) -> tuple[F64, F64]:
         """Distances from the middle on the image plane and in the photograph, as far as both grow."""
         radii = np.linspace(0, math.tan(MOST_HALF_FIELD), _RADII)
@@ -235,7 +244,7 @@ class Lens:
 
 def _polynomial(coefficients: tuple[float, ...], square: F64) -> F64:
     """1 + c1 s + c2 s² + …"""
-    value = np.zeros_like(square)
+    value: Any = 0.0
     for coefficient in reversed(coefficients):
         value = (value + coefficient) * square
-    return value + 1
+    return np.asarray(value + 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
 import threading
@@ -155,10 +156,10 @@ class Device:
             Done when all are loaded. Nobody need wait for it, and it raises nothing.
         """
         folder = program_cache.folder()
-        if not isinstance(folder, str) or self._variants or self._macros or self._build_options:
+        if folder is None or self._variants or self._macros or self._build_options:
             return in_background(lambda: None)
         about = (purpose, self.info.name, self.info.platform, self.info.version, self.family)
-        self._foresight = Foresight(Path(folder), repr(about))
+        self._foresight = Foresight(folder, repr(about))
 
         def load(program: Wanted) -> None:
             with suppress(DeviceError, OSError, Warning):
@@ -177,12 +178,11 @@ class Device:
                 if wanted not in self._programs:
                     options = ["-cl-std=CL1.2", *self._build_options, *(f"-D{name}={value}" for name, value in macros)]
 
-                    def build() -> cl.Program:
-                        program = cl.Program(self.context, kernel_source(source, self._variants))
-                        return program.build(options, cache_dir=program_cache.folder(repr(wanted)))
-
+                    text = kernel_source(source, self._variants)
                     with self.errors(f"failed to build {source}"):
-                        self._programs[wanted] = whatever_warns(build)
+                        self._programs[wanted] = whatever_warns(
+                            lambda: program_cache.built(self.context, text, options)
+                        )
         return self._programs[wanted]
 
     def kernel(self, source: str, name: str, **defines: str | int | float) -> Kernel:
@@ -367,6 +367,16 @@ class Device:
         values = np.linspace(-8, 0, 4096, dtype=np.float32)
         exact = np.exp2(values.astype(np.float64))
         return bool(np.abs(self._probe("probe_native_exp2", values, LANES=1) / exact - 1).max() < 5e-7)
+
+    def digits(self) -> str:
+        """What tells this device from one that rounds differently: a hash of what some of the kernels' maths gives.
+
+        Devices of the same name can be of hosts whose processors have other instructions.
+        """
+        values = np.linspace(-7.9, -0.1, 1600, dtype=np.float32)
+        macros = {"LANES": self.vector_width, **({"NATIVE_EXP2": 1} if self.native_exp2 else {})}
+        found = self._probe("probe_digits", values, **macros).tobytes()
+        return hashlib.sha256(repr((self.family, self.vector_width)).encode() + found).hexdigest()[:16]
 
     def _probe(self, name: str, values: np.ndarray[Any, Any], **defines: int) -> np.ndarray[Any, Any]:
         kernel = self.kernel("opencl/probe.cl", name, **defines)

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import hashlib
 import importlib.metadata
 import logging
 import os
-from contextlib import suppress
+from collections.abc import Mapping
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
 import pyopencl as cl
 
-from potr_cl.host.leftovers import place_for_temporary_files, removed_at_end
+from potr_cl.errors import PotrError
+from potr_cl.host.atomic_write import replacing
+from potr_cl.host.leftovers import temporary_folder
+from potr_cl.opencl.cache_folder import cache_folder
 
 logger = logging.getLogger("potr_cl")
 
@@ -94,7 +99,7 @@ def _register_intel_runtime() -> None:
     """Make the loader see Intel's CPU runtime where pip installed it.
 
     Its wheel brings an ``.icd`` file that holds a placeholder path, so a folder is made with an ``.icd`` of the real
-    path beside links to all those that the loader would have read. Must run before the first platform query.
+    path beside copies of all those that the loader would have read. Must run before the first platform query.
     """
     library = _installed_by_pip(_INTEL_LIBRARY)
     if library is None:
@@ -112,17 +117,28 @@ def _register_intel_runtime() -> None:
     contents = {icd.name: icd.read_text(errors="replace") for icd in others}
     contents["potr_cl_intel_cpu.icd"] = f"{library}\n"
     digest = hashlib.sha256(repr(sorted(contents.items())).encode()).hexdigest()[:16]
-    try:
-        folder = Path(place_for_temporary_files()) / f"potr_cl_icd_{os.getuid()}_{digest}"
-        folder.mkdir(mode=0o700, exist_ok=True)
-        if folder.stat().st_uid != os.getuid():
-            return  # someone else's folder: do not load libraries that it names
-        for name, text in contents.items():
-            partial = folder / f".{name}.{os.getpid()}"
-            with removed_at_end(partial):
-                partial.write_text(text)
-                partial.replace(folder / name)
-    except OSError as error:
-        logger.warning("cannot register Intel's CPU runtime: %s", error)
-        return
-    os.environ[_ICD_VARIABLE] = str(folder)
+    # What is listed in a folder is loaded: one that others cannot have made.
+    for lasting in (True, False):
+        try:
+            folder = cache_folder(f"runtimes-{digest}") if lasting else _folder_of_this_process()
+            if folder is not None:
+                _keep(folder, contents)
+                os.environ[_ICD_VARIABLE] = str(folder)
+                return
+        except (OSError, PotrError) as error:  # a full disk
+            logger.debug("no list of OpenCL runtimes: %s", error)
+    logger.warning("cannot register Intel's CPU runtime: neither cache nor temporary folder can be written to")
+
+
+def _keep(folder: Path, contents: Mapping[str, str]) -> None:
+    for name, text in contents.items():
+        path = folder / name
+        if not path.exists() or path.read_text(errors="replace") != text:
+            with replacing(path) as file:
+                file.write(text.encode(errors="surrogateescape"))
+
+
+def _folder_of_this_process() -> Path:
+    stack = ExitStack()
+    atexit.register(stack.close)
+    return Path(stack.enter_context(temporary_folder()))

@@ -1,76 +1,99 @@
-"""Where pyopencl keeps built programs on the disk (:func:`folder`), such that nothing there can stop a build.
+"""Built programs that are kept on the disk: :func:`built`.
 
-pyopencl's cache has a lock, a file that a killed process leaves behind: every process after it would wait for a minute
-and then fail. And where its caches cannot be written, as in a container without a home, it ends with an exception.
+A cache is a help: what is damaged there is built again, and where nothing can be read or written programs are built
+anew. pyopencl's own caches are left out, because they can stop a build: that of programs believes its bytes and has a
+lock that a killed process leaves behind, that of the code that calls kernels is a database that can be locked or
+damaged, and saves less than it costs to check.
 """
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import os
-import sys
-import time
+import platform
+from collections.abc import Sequence
 from contextlib import suppress
+from pathlib import Path
 
-import platformdirs
 import pyopencl as cl
+from pyopencl.characterize import has_src_build_cache
 
-# pyopencl asks for it without a default, when it cannot write a program.
-os.environ.setdefault("PYOPENCL_CACHE_FAILURE_FATAL", "")
+from potr_cl.errors import PotrError
+from potr_cl.host.atomic_write import replacing
+from potr_cl.opencl.cache_folder import cache_folder
 
-#: Processes hold the lock while they read or write a program, which takes milliseconds. Seconds after which one that
-#: is still the same is nobody's; and the age at which nobody needs to wait for that.
-PATIENCE, OLD = 5.0, 60.0
+cl._PYOPENCL_NO_CACHE = True
+# For each kernel object pyopencl generates the code that calls it, and never forgets the source: once is enough for a
+# process, however many devices it opens.
+from pyopencl import invoker  # noqa: E402 (it opens its database where it may have one)
+
+invoker._generate_enqueue_and_set_args_module = functools.cache(invoker._generate_enqueue_and_set_args_module)
+
+#: Variables by which users have drivers compile something else, for one as the instructions of another processor.
+_OF_COMPILERS = ("CL_CONFIG_", "POCL_", "IGC_", "NEO", "AMD_", "GPU_", "LP_", "GALLIVM_", "RUSTICL_")
+_DIGEST = hashlib.sha256().digest_size
 
 
-def folder(program: str = "") -> str | bool:
-    """The folder to give to pyopencl, without a lock that was left; False, for none, where it cannot be written.
+def folder() -> Path | None:
+    """Where programs are kept; None where they cannot be."""
+    return cache_folder("programs")
+
+
+def built(context: cl.Context, source: str, options: Sequence[str]) -> cl.Program:
+    """A program, from the disk where it has been built before.
 
     Args:
-        program: what names one program: it has a folder of its own, so that nobody waits for who loads or builds
-            another one. None is named: the folder of all these.
+        context: of one device.
+        source: OpenCL C, without anything that it would include.
+        options: the compiler's.
+
+    Raises:
+        pyopencl.Error: the compiler refuses it.
     """
-    version = ".".join(map(str, sys.version_info[:2]))
-    name = os.path.join(platformdirs.user_cache_dir("potr_cl", "potr_cl"), f"programs-py{version}")
-    if program:
-        name = os.path.join(name, hashlib.sha256(program.encode()).hexdigest()[:16])
-    if not _can_be_written(name):
-        return False
-    _remove_left_lock(os.path.join(name, "lock"))
-    return name
+    device = context.devices[0]
+    place = None if has_src_build_cache(device) else folder()  # some drivers keep programs themselves
+    if place is None:
+        return cl.Program(context, source).build(list(options), cache_dir=False)
+    path = place / _key(device, source, options)
+    binary = _kept(path)
+    if binary is not None:
+        with suppress(cl.Error):  # the driver does not like it any more
+            return cl.Program(context, [device], [binary]).build(list(options), cache_dir=False)
+    program = cl.Program(context, source).build(list(options), cache_dir=False)
+    with suppress(OSError, PotrError, cl.Error):
+        binary = program.get_info(cl.program_info.BINARIES)[0]
+        with replacing(path) as file:
+            file.write(hashlib.sha256(binary).digest() + binary)
+    return program
 
 
-def _can_be_written(name: str) -> bool:
-    """Whether a folder can; it is made where it is missing."""
-    try:
-        os.makedirs(name, exist_ok=True)
-    except OSError:
-        return False
-    return os.access(name, os.W_OK | os.X_OK)
-
-
-if not _can_be_written(platformdirs.user_cache_dir("pytools", "pytools")):
-    # The code that calls a kernel is kept there. The environment variable for this is read before anyone can set it.
-    cl._PYOPENCL_NO_CACHE = True
-
-
-def _remove_left_lock(lock: str) -> None:
-    first = _identity(lock)
-    if first is None:
-        return
-    end = time.monotonic() + (0 if time.time() - first[1] > OLD else PATIENCE)
-    while time.monotonic() < end:
-        time.sleep(0.05)
-        if _identity(lock) != first:
-            return  # it is in use, by one process after another
+def _kept(path: Path) -> bytes | None:
+    """What a file holds, if that is what was once written there."""
     with suppress(OSError):
-        os.unlink(lock)
+        content = path.read_bytes()
+        if hashlib.sha256(content[_DIGEST:]).digest() == content[:_DIGEST]:
+            return content[_DIGEST:]
+    return None
 
 
-def _identity(lock: str) -> tuple[int, float] | None:
-    """Which lock it is and of when; None if there is none."""
-    try:
-        status = os.stat(lock)
-    except OSError:
-        return None
-    return status.st_ino, status.st_mtime
+def _key(device: cl.Device, source: str, options: Sequence[str]) -> str:
+    """The name of a program's file. Machines that share a home may call different processors by the same name."""
+    driver = device.platform
+    about = (
+        *(driver.vendor, driver.name, driver.version),
+        *(device.vendor, device.name, device.version, device.driver_version),
+        _processor() if device.type & cl.device_type.CPU else "",
+        *sorted(each for each in os.environ.items() if each[0].startswith(_OF_COMPILERS)),
+        *options,
+        source,
+    )
+    return hashlib.sha256(repr(about).encode(errors="surrogateescape")).hexdigest()[:32]
+
+
+@functools.cache
+def _processor() -> str:
+    """What tells processors apart that compute with other instructions."""
+    with suppress(OSError), open("/proc/cpuinfo", encoding="utf-8", errors="replace") as file:
+        return next((line for line in file if line.startswith(("flags", "Features"))), "")
+    return platform.processor()

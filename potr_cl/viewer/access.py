@@ -11,12 +11,14 @@ server in another way.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import functools
 import gzip
 import http
 import inspect
 import ipaddress
+import logging
 import socket
 import threading
 from collections.abc import Awaitable, Callable, Iterator, Mapping
@@ -25,6 +27,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from potr_cl.errors import PotrError
+from potr_cl.viewer.inbox import Sifted
 
 #: Names of this machine for itself.
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
@@ -39,7 +42,11 @@ _HEADERS = {
     # Else any page may read what a GET brings, where a browser lets it.
     "Cross-Origin-Resource-Policy": "same-origin",
 }
+#: Bytes of a message: parts of files have 1 MiB. Connections at a time: a page has two.
+_LARGEST_MESSAGE, _MOST_CONNECTIONS = 4 << 20, 64
 _starting = threading.Lock()
+
+logger = logging.getLogger("potr_cl")
 
 #: Takes a WebSocket connection of the page.
 Handler = Callable[[Any], Awaitable[None]]
@@ -75,6 +82,7 @@ class Door:
         self._head = head.encode()
         self._channels = dict(channels)
         self._in_use = False
+        self._connections = 0
 
     def refusal(self, host: str | None, origin: str | None) -> str | None:
         """Why a request is refused; None if it is let in.
@@ -121,6 +129,7 @@ class Door:
                 if not getattr(handler, "__module__", "").startswith("viser."):
                     return serve(handler, *args, process_request=process_request, **options)
                 self._in_use = True
+                options |= {"logger": _unheard(), "max_size": _LARGEST_MESSAGE}
                 return serve(self._handler(handler), *args, process_request=self._request(process_request), **options)
 
             library.serve = guarded
@@ -132,9 +141,25 @@ class Door:
             raise PotrError("this version of viser starts its server in an unknown way: install another one")
 
     def _handler(self, inner: Handler) -> Handler:
+        import viser
+
         async def handler(connection: Any) -> None:
+            asyncio.get_running_loop().set_exception_handler(_pass_over)
             path = urlsplit(connection.request.path).path
-            await self._channels.get(path, inner)(connection)
+            if self._connections >= _MOST_CONNECTIONS:
+                await connection.close(1013, "too many pages are open")
+                return
+            self._connections += 1
+            try:
+                if path in self._channels:
+                    await self._channels[path](connection)
+                elif connection.subprotocol != f"viser-v{viser.__version__}":
+                    # viser would print what the page calls itself.
+                    await connection.close(1002, "the page is another version's: load it again")
+                else:
+                    await inner(Sifted(connection))
+            finally:
+                self._connections -= 1
 
         return handler
 
@@ -169,6 +194,18 @@ class Door:
         page = gzip.decompress(response.body) if packed else response.body
         page = page.replace(b"</head>", self._head + b"</head>", 1)
         _fill(response, page, "text/html; charset=utf-8")
+
+
+def _unheard() -> logging.Logger:
+    """A log that nobody reads: websockets writes tracebacks of whatever else than a browser connects."""
+    log = logging.getLogger("potr_cl.viewer.connections")
+    log.setLevel(logging.CRITICAL + 1)
+    return log
+
+
+def _pass_over(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """In place of a traceback, where viser fails at a message."""
+    logger.debug("the page's server: %s", type(context.get("exception")).__name__)
 
 
 def _fill(response: Any, content: bytes, kind: str) -> None:

@@ -14,7 +14,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import math
 from collections.abc import Callable
 from concurrent.futures import Executor
 from typing import Any, Protocol
@@ -22,11 +21,14 @@ from urllib.parse import parse_qs, urlsplit
 
 from potr_cl.errors import PotrError
 from potr_cl.plain_text import plain
+from potr_cl.viewer.inbox import Inbox, said_by_page
 from potr_cl.viewer.session import Exhibit, Which
 from potr_cl.viewer.uploads import Upload
 
 #: Bytes after which the page is told how much has come.
 _TOLD_EVERY = 4 << 20
+#: Seconds without a part of a file after which it is given up: others wait for its place.
+_SILENCE = 60.0
 #: Files that may be on their way at a time, of all tabs.
 _MOST_UPLOADS = 2
 
@@ -91,16 +93,15 @@ class Channel:
             while True:
                 await connection.send(json.dumps(await mail.take()))
 
-        delivering = asyncio.ensure_future(deliver())
+        delivering, inbox = asyncio.ensure_future(deliver()), Inbox(connection, said_by_page)
         try:
             tab.connected(send)
-            async for message in connection:
-                if isinstance(message, str):
-                    content = _parsed(message)
-                    if isinstance(content.get("file"), dict):
-                        await self._receive(connection, tab, content["file"], mail.put)
-                    else:
-                        _obey(tab, content)
+            while True:
+                content = await inbox.next()
+                if "file" in content:
+                    await self._receive(inbox, tab, content["file"], mail.put)
+                else:
+                    _obey(tab, content)
         except Exception as error:
             if type(error).__module__.split(".")[0] != "websockets":  # it has been closed: nothing is wrong
                 raise
@@ -108,7 +109,7 @@ class Channel:
             delivering.cancel()
 
     async def _receive(
-        self, connection: Any, tab: Tab, announced: dict[str, Any], put: Callable[[dict[str, Any]], None]
+        self, inbox: Inbox, tab: Tab, announced: dict[str, Any], put: Callable[[dict[str, Any]], None]
     ) -> None:
         which: Which = "A" if announced.get("as") == "A" else "B"
         if self._uploads >= _MOST_UPLOADS:
@@ -120,12 +121,12 @@ class Channel:
                 put({"upload": {"ready": True}})
                 told = 0
                 while not upload.is_complete:
-                    part = await connection.recv()
-                    if isinstance(part, str):
-                        if "cancel" in _parsed(part):
+                    part = await asyncio.wait_for(inbox.next(part_of_file=True), _SILENCE)
+                    if isinstance(part, dict):
+                        if "cancel" in part:
                             put({"upload": {"error": f"'{upload.name}' was cancelled"}})
                             return
-                        _obey(tab, _parsed(part))
+                        _obey(tab, part)
                         continue
                     upload.take(part)
                     if upload.received - told >= _TOLD_EVERY:
@@ -140,6 +141,8 @@ class Channel:
             put({"upload": {"error": plain(error)}})
         except MemoryError:
             put({"upload": {"error": "not enough memory for this scene"}})
+        except (asyncio.TimeoutError, TimeoutError):
+            put({"upload": {"error": "the file has stopped coming: drop it again"}})
         finally:
             self._uploads -= 1
 
@@ -163,26 +166,11 @@ class _Mail:
         return taken
 
 
-def _parsed(message: str) -> dict[str, Any]:
-    """What a message says; nothing if it is none of ours."""
-    try:
-        content = json.loads(message) if len(message) < 1 << 16 else None
-    except (ValueError, RecursionError):
-        content = None
-    return content if isinstance(content, dict) else {}
-
-
 def _obey(tab: Tab, content: dict[str, Any]) -> None:
-    divider, view = content.get("divider"), content.get("fly")
-    if isinstance(divider, (int, float)) and not isinstance(divider, bool) and math.isfinite(divider):
-        tab.divide(min(max(float(divider), 0.0), 1.0))
-    if isinstance(content.get("swap"), bool):
-        tab.swap(content["swap"])
-    if isinstance(content.get("mode"), str):
-        tab.choose_mode(content["mode"])
-    if isinstance(view, int) and not isinstance(view, bool):
-        tab.fly(view)
-    if content.get("cameras") is True:
+    if "divider" in content:
+        tab.divide(min(max(float(content["divider"]), 0.0), 1.0))
+    for name, act in (("swap", tab.swap), ("mode", tab.choose_mode), ("fly", tab.fly), ("rung", tab.climb)):
+        if name in content:
+            act(content[name])
+    if "cameras" in content:
         tab.toggle_cameras()
-    if isinstance(content.get("rung"), int) and not isinstance(content["rung"], bool):
-        tab.climb(content["rung"])

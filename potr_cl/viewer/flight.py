@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -75,7 +76,8 @@ def put(camera: Any, position: F64, rotation: F64, fov: float) -> None:
     """Set a browser's camera at once: (3,), (3, 3) camera to world, vertical angle in radians."""
     from viser import transforms
 
-    with camera.client.atomic():
+    # viser refuses to turn a camera that has no upwards or no distance to what it looks at, as a browser may say.
+    with camera.client.atomic(), suppress(ValueError):
         camera.fov = fov
         camera.position = position
         # The controls turn around an axis of their own; up in the view is up in the picture, whatever they thought.

@@ -7,6 +7,7 @@ import math
 import socket
 import threading
 import time
+import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -120,11 +121,11 @@ class Viewer:
         door = Door(host, page.assets(), page.head(), {page.CHANNEL: channel.serve})
         with door.guarding(), _silent():
             server = viser.ViserServer(host=host, port=port, label="potr_cl", verbose=False)
+        # It warns of whatever a tab that has just been closed is told.
+        warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
         if port not in (0, server.get_port()):
             server.stop()
             raise UsageError(_taken(port))
-        # A tunnel to the Internet, which any tab could ask viser for.
-        server.request_share_url = lambda verbose=True: None
         return server
 
     def _furnish(self, views: Sequence[Camera]) -> None:

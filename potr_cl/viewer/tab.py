@@ -198,10 +198,12 @@ class TabHandle:
         # Beside each other both pictures are half as wide, and what viser draws over them would fit neither.
         seen = self._shows_frusta.value and not (pair and self.visitor.mode == "side by side")
         gaze = self.visitor.gaze
+        far = np.full(len(self._centres), np.inf)
+        if gaze is not None:
+            far = np.linalg.norm(self._centres - gaze.position, axis=1)
         for number, frustum in self._frusta.items():
             # One that the camera stands in or beside is only a line across the picture.
-            near = gaze is not None and np.linalg.norm(self._centres[number] - gaze.position) < _NEAR * frustum.scale
-            visible = bool(seen and number != view and not near)
+            visible = bool(seen and number != view and far[number] >= _NEAR * frustum.scale)
             if frustum.visible != visible:
                 frustum.visible = visible
 
@@ -302,7 +304,7 @@ class TabHandle:
         if event.client is not None:  # the user, and not the program, has moved the slider
             with self._lock:
                 self._flights += 1
-            self._fade_to(float(self._photograph.value))
+            self._fade_to(min(max(float(self._photograph.value), 0.0), 1.0))
 
     def _fade_to(self, part: float, on_slider: bool = False) -> None:
         self.visitor.fade = part
@@ -312,7 +314,7 @@ class TabHandle:
 
     def _amplify(self) -> None:
         value = self._factor.value
-        self.visitor.factor = None if value == "auto" else int(value)
+        self.visitor.factor = int(value) if value in FACTORS and value != "auto" else None
         self._house.painter.wake(self.visitor)
 
 

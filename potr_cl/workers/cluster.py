@@ -20,8 +20,10 @@ from typing import TYPE_CHECKING, Any
 from potr_cl.errors import DeviceError, PotrError, UsageError
 from potr_cl.opencl.device import Device
 from potr_cl.workers.client import client_of, first_line
+from potr_cl.workers.host import DeviceThread
 from potr_cl.workers.pauses import Pauses
-from potr_cl.workers.pool import Held, Part, Pool, Shared, Traffic, Worker, WorkerLost
+from potr_cl.workers.pool import Held, Part, Pool, Shared, Traffic, Worker, WorkerLost, tell_of_kinds
+from potr_cl.workers.pulse import Pulse
 from potr_cl.workers.seat import Known, Seat
 
 if TYPE_CHECKING:
@@ -38,7 +40,7 @@ _NEW = 2.0
 #: Seconds in which the handle of a part arrives once it is made.
 _FETCH = 30.0
 #: Seconds in which the scheduler says who is alive: at once, unless it stands still, or the client is closed meanwhile.
-_WHO = 120.0
+_WHO = 15.0
 #: Threads that wait for workers.
 _MOST_WAITING = 256
 
@@ -66,10 +68,12 @@ class ClusterPool(Pool):
         self._closing = threading.Event()
         self._waiting = ThreadPoolExecutor(_MOST_WAITING, thread_name_prefix="potr_cl cluster")
         self._workers: list[_ClusterWorker] = []
+        self._here: DeviceThread | None = None
         self._refused: set[str] = set()
         self._meeting = threading.Lock()
         self._owned = ExitStack()
         self.client, is_own = client_of(cluster)
+        self._pulse = Pulse(self.client)
         if is_own:
             self._owned.callback(self._leave_cluster)
         try:
@@ -85,18 +89,26 @@ class ClusterPool(Pool):
             raise
 
     def workers(self) -> list[Worker]:
-        alive = self._alive()
+        try:
+            alive = self._alive()
+        except WorkerLost as error:
+            return [self._goes_on_here(str(error))]
         left: list[Worker] = [worker for worker in self._workers if worker.name in alive and not worker.lost]
         if not left:
-            raise WorkerLost(
-                "no worker of the cluster answers any more: start some, with --memory-limit 0 if Dask stopped them for "
-                "the memory that they took, and encode again"
-            )
+            return [self._goes_on_here("no worker of the cluster answers any more")]
         return [worker for worker in left if not worker.is_behind] or left
+
+    def _goes_on_here(self, why: str) -> Worker:
+        """The master's own device, where there is no cluster any more: results do not depend on who computes them."""
+        with self._meeting:
+            if self._here is None:
+                _log.warning("%s: continuing on %s of this computer alone; Ctrl-C to stop", why, self.first.info)
+                self._here = DeviceThread(self.first, 0)
+            return self._here
 
     @property
     def names(self) -> tuple[str, ...]:
-        return tuple(worker.name for worker in self._workers)
+        return tuple(worker.name for worker in [*self._workers, *([] if self._here is None else [self._here])])
 
     @contextmanager
     def shared(self, thing: Any) -> Iterator[Shared]:
@@ -112,6 +124,8 @@ class ClusterPool(Pool):
         self._waiting.shutdown(wait=False, cancel_futures=True)
         for worker in self._workers:
             worker.leave()
+        if self._here is not None:
+            self._here.close()
         self._owned.close()
 
     def _leave_cluster(self) -> None:
@@ -122,13 +136,11 @@ class ClusterPool(Pool):
 
     def _alive(self) -> set[str]:
         """Addresses of the workers that the scheduler knows."""
-        try:
-            return set(self.client.sync(self.client.scheduler.ncores, callback_timeout=_WHO))
-        except Exception as error:
-            raise WorkerLost(
-                f"the cluster's scheduler does not answer any more ({first_line(error)}): start it and its workers, "
-                "and encode again"
-            ) from None
+        # With the connection Dask gives up all that it has on workers, also if it can be made again.
+        if self.client.status == "running":
+            with suppress(Exception):
+                return set(self.client.sync(self.client.scheduler.ncores, callback_timeout=_WHO))
+        raise WorkerLost("the cluster's scheduler does not answer any more")
 
     def wait_for(self, answer: Any, address: str, most: float = math.inf) -> Any:
         """What a worker answers.
@@ -149,10 +161,14 @@ class ClusterPool(Pool):
                 raise WorkerLost(f"{address} does not answer")
             if self._closing.is_set():
                 raise WorkerLost(f"{address} is not waited for any more")
-            if time.monotonic() - looked > _ALIVE:
+            if self.client.status != "running" or time.monotonic() - looked > _ALIVE:
                 looked = time.monotonic()
                 if address not in self._alive():
                     raise WorkerLost(f"{address} is gone")
+                if self._pulse.is_still(address):
+                    for worker in self._workers:
+                        worker.lost |= worker.name == address
+                    raise WorkerLost("it does not answer")
         try:
             return answer.result(timeout=_FETCH)
         except PotrError:
@@ -257,13 +273,8 @@ class ClusterPool(Pool):
                 for worker in workers:
                     worker.leave()
                 return
-        devices = sorted({str(self.first.info), *(worker.device for worker in self._workers)})
         if any(worker.device != str(self.first.info) for worker in workers):
-            _log.warning(
-                "the cluster has devices of several kinds (%s), which round differently: the file can depend on who "
-                "gets which views",
-                ", ".join(devices),
-            )
+            tell_of_kinds(str(self.first.info), (worker.device for worker in self._workers))
 
 
 def _host(address: str) -> str:
@@ -305,7 +316,7 @@ class _ClusterWorker(Worker):
         """
         try:
             self._seat = self._pool.wait_for(self._future, self.name, _HELLO)
-            version, name, family = self.ask("hello")
+            version, name, family, digits = self.ask("hello")
         except WorkerLost:
             # As those do that have no potr_cl.
             raise WorkerLost(
@@ -324,7 +335,9 @@ class _ClusterWorker(Worker):
                 "here"
             ) from None
         _check(self.name, version, name, family, self._pool.first)
-        self.device = name
+        # Hosts of two generations can call other processors by the same name.
+        others = name == str(self._pool.first.info) and digits != self._pool.first.digits()
+        self.device = f"{name} with other instructions" if others else name
 
     def ask(self, method: str, *args: Any) -> Any:
         """What a method of the seat returns."""

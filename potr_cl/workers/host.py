@@ -13,7 +13,7 @@ from typing import Any
 
 from potr_cl.errors import UsageError
 from potr_cl.opencl.device import Device
-from potr_cl.workers.pool import Held, Part, Pool, Shared, Traffic, Worker
+from potr_cl.workers.pool import Held, Part, Pool, Shared, Traffic, Worker, tell_of_kinds
 
 
 class HostPool(Pool):
@@ -40,11 +40,12 @@ class HostPool(Pool):
                     "choose devices of one kind"
                 )
         self.first = devices[0]
+        tell_of_kinds(str(self.first.info), (str(device.info) for device in devices))
         self.traffic = Traffic()
         self._devices = tuple(devices[1:])
-        self._workers = [_Thread(device, number) for number, device in enumerate(devices[1:], 1)]
+        self._workers = [DeviceThread(device, number) for number, device in enumerate(devices[1:], 1)]
         # The first device may have room where another one has not.
-        self._reserve = _Thread(devices[0], 0)
+        self._reserve = DeviceThread(devices[0], 0)
 
     def workers(self) -> list[Worker]:
         return list(self._workers)
@@ -68,7 +69,7 @@ class HostPool(Pool):
             worker.close()
 
 
-class _Thread(Worker):
+class DeviceThread(Worker):
     """A thread that computes on a device."""
 
     def __init__(self, device: Device, number: int) -> None:

@@ -6,9 +6,10 @@ Whoever asks a pool for work (the *master*) has a device too, the pool's ``first
 
 from __future__ import annotations
 
+import logging
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Future
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -21,6 +22,21 @@ from potr_cl.opencl.memory import Owner
 
 class WorkerLost(DeviceError):
     """A worker does not answer any more; others can do its work."""
+
+
+def tell_of_kinds(first: str, others: Iterable[str]) -> None:
+    """Say that the file can depend on who computes what, if there are devices of several kinds.
+
+    Args:
+        first: the master's device; others: those of workers.
+    """
+    kinds = sorted({first, *others})
+    if len(kinds) > 1:
+        logging.getLogger("potr_cl").warning(
+            "there are devices of several kinds (%s), which round differently: the file can depend on who gets which "
+            "views",
+            ", ".join(kinds),
+        )
 
 
 class Part(Owner):

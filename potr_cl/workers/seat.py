@@ -24,12 +24,12 @@ class Seat:
         self._known: dict[int, Any] = {}
         self._parts: dict[int, Part] = {}
 
-    def hello(self) -> tuple[str, str, str]:
-        """The version here, the device, and the family of its kernels."""
+    def hello(self) -> tuple[str, str, str, str]:
+        """The version here, the device, the family of its kernels, and its digits."""
         from potr_cl import __version__
 
         device = _device(self._place)
-        return __version__, str(device.info), device.family
+        return __version__, str(device.info), device.family, device.digits()
 
     def keep(self, number: int, thing: Any, others: Sequence[int]) -> None:
         """Keep a thing for parts, and of those that are known only the ones of these numbers."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -45,6 +46,15 @@ def test_without_views_nothing_is_judged(files, tmp_path):  # noqa: F811
     ladder = potr_cl.encode_ladder(scene, tmp_path, [0.5], prune=False, refit=False, compact=False)
     assert (ladder.rungs[0].psnr, ladder.rungs[0].ssim, ladder.judged_by) == (None, None, "")
     assert np.isfinite(potr_cl.decode(ladder.file(ladder.rungs[0])).means).all()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="names are text there")
+def test_a_scene_whose_name_is_not_utf8(files, tmp_path):  # noqa: F811
+    scene = tmp_path / "odd\udcff.ply"
+    scene.write_bytes(files["scene"].read_bytes())
+    ladder = potr_cl.encode_ladder(scene, tmp_path / "ladder", [0.5], prune=False, refit=False, compact=False)
+    assert read_ladder(ladder.path).file(ladder.rungs[0]).name == "odd__q0.5.potr"
+    assert ladder.file(ladder.rungs[0]).exists()
 
 
 @pytest.mark.parametrize(

@@ -463,9 +463,26 @@ def test_standard_error_is_not_needed(tmp_path: Path, scene_path: Path, closed: 
 
 
 @needs_posix
-def test_standard_output_is_closed(potr_path: Path) -> None:
-    result = run('"$@" >&-', "info", potr_path)
+@pytest.mark.parametrize("command", ["info {}", "info {} --json", "decode {} -o -", "encode {} -o -", "--version"])
+def test_no_result_is_thrown_away(potr_path: Path, command: str) -> None:
+    result = run('"$@" >&-', *command.format(potr_path).split())
+    assert result.returncode in (1, 2)
+    assert result.stderr.startswith("potr-cl: standard output is closed: redirect it")
+    assert result.stderr.count("\n") == 1
+
+
+@needs_posix
+def test_a_file_needs_no_standard_output(potr_path: Path, tmp_path: Path) -> None:
+    """As under a supervisor that closes it: what is only told beside the result is not."""
+    result = run('"$@" >&-', "decode", potr_path, "-o", tmp_path / "b.ply")
     assert (result.returncode, result.stderr) == (0, "")
+
+
+@needs_posix
+def test_standard_input_is_closed(tmp_path: Path) -> None:
+    result = run('"$@" <&-', "encode", "-", "-o", tmp_path / "a.potr")
+    assert result.returncode == 2
+    assert result.stderr == "potr-cl: standard input is closed: pipe a scene into it, or give a name\n"
 
 
 @needs_posix
@@ -474,6 +491,22 @@ def test_whoever_reads_has_gone(potr_path: Path, arguments: list[str]) -> None:
     shell = '{ sleep 0; "$@"; echo "exit code $?" >&2; } | true'
     result = run(shell, *(word.format(potr_path) for word in arguments))
     assert result.stderr == "exit code 0\n"
+
+
+def test_numbers_beyond_single_precision_are_no_news(tmp_path: Path, potr_path: Path) -> None:
+    """Neither of a box nor of a scene, whose centres are far and whose colours are absurd."""
+    scene = random_scene(20, 1)
+    scene.means[:] *= np.float32(1e30)
+    scene.sh[:, 1] = np.float32(3e38)
+    ply.save(tmp_path / "a.ply", scene)
+    box = [*["-1e39"] * 3, *["1e39"] * 3]
+    for words in (
+        ["decode", potr_path, "-o", tmp_path / "b.ply", "--box", *box],
+        ["info", tmp_path / "a.ply"],
+        ["convert", tmp_path / "a.ply", tmp_path / "b.compressed.ply"],
+    ):
+        result = run('"$@"', *words)
+        assert (result.returncode, result.stderr) == (0, ""), words
 
 
 def test_a_terminal_of_another_alphabet(tmp_path: Path, potr_path: Path) -> None:

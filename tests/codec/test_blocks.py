@@ -336,6 +336,21 @@ def open_size(data: bytes) -> int:
     return min(int.from_bytes(data[12:16], "little"), len(data))
 
 
+def test_more_blocks_than_there_are_splats_for_are_refused(scene):
+    """Each takes milliseconds to open, whatever it holds."""
+    with pytest.raises(DataError, match="makes no sense: 1000 blocks of 3000 splats"):
+        open_file(b"".join(in_blocks(scene, 3, effects_of(scene)).pieces))
+
+
+def test_metadata_that_is_no_json_is_refused_by_every_reader(data):
+    size, told = open_size(data), b'{"q":0.5}'
+    assert data[size - 4 - len(told) : size - 4] == told
+    broken = relabelled(data[: size - 4 - len(told)] + b'{"q":NaN}' + data[size - 4 :])
+    for read in (open_file, decode, potr_cl.decode_to_device):
+        with pytest.raises(DataError, match="section 'metadata' is not a JSON object"):
+            read(broken)
+
+
 LIES = {
     "no block": ((None, {"count": 0}), "its size does not fit"),
     "countless blocks": ((None, {"count": 2**32 - 1}), "its size does not fit"),

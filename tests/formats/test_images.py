@@ -175,3 +175,15 @@ def test_colours(text, colour):
 def test_no_colours(text):
     with pytest.raises(UsageError, match="is no colour"):
         parse_colour(text)
+
+
+def test_rounding_to_8_bits_takes_little_memory() -> None:
+    """One view of 16384 x 16384 pixels took three times its 3 GB."""
+    image = np.random.default_rng(0).normal(0.5, 1, (2000, 900, 3)).astype(np.float32)
+    tracemalloc.start()
+    found = to_8_bits(image)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < found.nbytes + (1 << 24)
+    assert np.array_equal(found, np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8))
+    assert to_8_bits(image[:0]).shape == (0, 900, 3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from typing import Any
 
@@ -25,6 +26,9 @@ def test_what_is_written_is_read(tmp_path):
     ladder.save()
     assert read_ladder(ladder.path) == ladder
     assert ladder.file(RUNGS[0]) == tmp_path / "a_q0.1.potr"
+    odd = dataclasses.replace(ladder, scene="\udcff.ply")
+    odd.save()
+    assert read_ladder(odd.path).scene == "\\udcff.ply"
     Ladder(tmp_path / DESCRIPTION, "", None, "", RUNGS[:1]).save()
     assert read_ladder(ladder.path).scene_bytes is None
 

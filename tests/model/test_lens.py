@@ -126,6 +126,8 @@ def test_a_field_of_more_than_half_the_world_is_cut_off() -> None:
         ({"radial": (-5.0, 1.0), "fisheye": True}, "folds the picture over"),
         ({"quotient": (30.0,)}, "folds the picture over"),
         ({"fx": 0.0}, "are not a camera's"),
+        ({"fx": 5e-324, "radial": (0.1,)}, "are not a camera's"),
+        ({"fy": 1e-300, "fisheye": True}, "are not a camera's"),
         ({"cy": math.inf}, "are not a camera's"),
         ({"cx": -3.0}, "principal point"),
         ({"tangential": (500.0, 0.0)}, "folds the picture over"),

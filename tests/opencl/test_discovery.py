@@ -296,17 +296,39 @@ def test_registering_a_runtime_keeps_the_others(tmp_path: Path, monkeypatch: pyt
             return library
 
     monkeypatch.setattr(loader.importlib.metadata, "files", lambda package: [Installed()])
-    monkeypatch.setattr(loader, "place_for_temporary_files", lambda: str(tmp_path))
+    monkeypatch.setattr("platformdirs.user_cache_dir", lambda *_: str(tmp_path / "cache"))
     monkeypatch.setenv("OCL_ICD_VENDORS", str(vendors))
     loader.register_runtimes()
     made = Path(os.environ["OCL_ICD_VENDORS"])
-    assert made.parent == tmp_path
+    assert made.parent == tmp_path / "cache"
     assert {p.name: p.read_text() for p in made.iterdir()} == {
         "other.icd": "libother.so\n",
         "potr_cl_intel_cpu.icd": f"{library}\n",
     }
     loader.register_runtimes()  # what is there already is left alone
     assert os.environ["OCL_ICD_VENDORS"] == str(made)
+
+    # Somebody else has put a folder with their library there: it is neither used nor written to.
+    hostile = tmp_path / "hostile"
+    hostile.mkdir()
+    (hostile / "theirs.icd").write_text("libtheirs.so\n")
+    for path in made.iterdir():
+        path.unlink()
+    made.rmdir()
+    made.symlink_to(hostile)
+    monkeypatch.setenv("OCL_ICD_VENDORS", str(vendors))
+    loader.register_runtimes()
+    private = Path(os.environ["OCL_ICD_VENDORS"])
+    assert sorted(p.name for p in private.iterdir()) == ["other.icd", "potr_cl_intel_cpu.icd"]
+    assert private.stat().st_mode & 0o077 == 0
+    assert [p.name for p in hostile.iterdir()] == ["theirs.icd"]
+
+    made.unlink()
+    monkeypatch.setenv("OCL_ICD_VENDORS", str(vendors))
+    with monkeypatch.context() as full:
+        full.setattr(loader, "cache_folder", lambda name: Path("/dev/full/no folder"))
+        loader.register_runtimes()
+    assert (Path(os.environ["OCL_ICD_VENDORS"]) / "other.icd").exists()
 
     library.unlink()
     monkeypatch.setenv("OCL_ICD_VENDORS", str(vendors))

@@ -16,6 +16,8 @@ from potr_cl.viewer import uploads
 from potr_cl.viewer.channel import Channel
 from potr_cl.viewer.uploads import MOST_BYTES, Upload
 
+ConnectionClosedOK = pytest.importorskip("websockets.exceptions").ConnectionClosedOK
+
 pytestmark = pytest.mark.one_runtime
 
 
@@ -53,16 +55,9 @@ class Connection:
         self.closed = code
 
     async def recv(self) -> str | bytes:
-        await asyncio.sleep(0)
-        return self.messages.pop(0)
-
-    def __aiter__(self) -> Connection:
-        return self
-
-    async def __anext__(self) -> str | bytes:
         await asyncio.sleep(0.05)
-        if not self.messages:
-            raise StopAsyncIteration
+        if not self.messages or self.closed is not None:
+            raise ConnectionClosedOK(None, None)
         return self.messages.pop(0)
 
 
@@ -92,7 +87,8 @@ def test_what_the_page_says_is_obeyed() -> None:
     "nonsense",
     [
         {"divider": "x"}, {"divider": True}, {"divider": float("nan")}, {"swap": 1}, {"fly": True}, {"fly": 1.5}, [], 7,
-        None, {"mode": 3}, {"rung": "1"}, b"bytes that nobody waits for", {"unknown": {}}, {"file": "name"},
+        None, {"mode": 3}, {"mode": []}, {"divider": 10**400}, {"fly": -(10**400)}, {"divider": 1e999},
+        {"rung": "1"}, b"bytes that nobody waits for", {"unknown": {}}, {"file": "name"},
     ],
 )  # fmt: skip
 def test_nonsense_is_passed_over(nonsense) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import threading
 from contextlib import ExitStack
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -227,6 +228,12 @@ def test_no_device_has_enough_memory(plush_excerpt, plush_excerpt_cameras):
 def test_devices_of_two_kinds_are_refused(plush_excerpt):
     with pytest.raises(UsageError, match="run different kernels"):
         HostPool([open_device("cpu"), open_device("gpu")])
+
+
+def test_devices_that_round_differently_are_told(caplog):
+    with HostPool([SimpleNamespace(family="cpu", info=name) for name in ("one", "another")]):
+        pass
+    assert "devices of several kinds (another, one), which round differently" in caplog.text
 
 
 def test_devices_by_name():

@@ -51,16 +51,11 @@ _COLUMNS = (
 
 @dataclasses.dataclass
 class Usual:
-    """An undisturbed run: seconds, those of the processor in it, the hashes of what it wrote, and what it keeps in the
-    temporary folder on purpose.
-
-    That is the list of OpenCL drivers that :mod:`potr_cl.opencl.loader` makes once for a user.
-    """
+    """An undisturbed run: seconds, those of the processor in it, and the hashes of what it wrote."""
 
     seconds: float
     processor_seconds: float
     outputs: dict[str, str]
-    kept: set[str]
 
 
 def main() -> None:
@@ -108,11 +103,10 @@ def run_usually(folder: Path, command: Command) -> Usual:
         )
         seconds, processor_seconds = time.monotonic() - began, _of_children() - used
         written = hashes(folder / "out")
-        kept = _temporary(folder)
-        unknown = [name for name in kept if not name.startswith("potr_cl_icd_")]
-        if done.returncode != 0 or set(written) != set(command.outputs) or unknown:
-            raise RuntimeError(f"{command.name} fails, or leaves files: {sorted(written)} {unknown}\n{done.stderr}")
-    return Usual(seconds, processor_seconds, written, kept)
+        left = sorted(_temporary(folder))
+        if done.returncode != 0 or set(written) != set(command.outputs) or left:
+            raise RuntimeError(f"{command.name} fails, or leaves files: {sorted(written)} {left}\n{done.stderr}")
+    return Usual(seconds, processor_seconds, written)
 
 
 def try_moment(
@@ -205,7 +199,7 @@ def _disk(
     counts["new"] += fresh == len(command.outputs)
     if code == 0 and fresh != len(command.outputs):
         found.append("it says that all went well, and did not write all")
-    left = [*(set(there) - set(command.outputs)), *(_temporary(folder) - usual.kept)]
+    left = [*(set(there) - set(command.outputs)), *_temporary(folder)]
     if left and number == signal.SIGKILL:
         counts["left"] += 1
     elif left:

@@ -10,6 +10,18 @@ kernel void probe_rows(global const float *values, global float *result)
     VSTORE(exp2_polynomial(VLOAD(i, values)), i, result);
 }
 
+/* Digits by which devices can be told apart that round differently: of what the kernels compute, all bits are mixed. */
+kernel void probe_digits(global const float *values, global int *result)
+{
+    const size_t i = get_global_id(0);
+    const vfloat v = VLOAD(i, values), power = EXP2(v);
+    vfloat sum = power;
+    for (int k = 0; k < 8; ++k)
+        sum = MAD(sum, v, power);
+    const vint bits = AS_VINT(sum) * 31 ^ AS_VINT(sqrt(power) / (1.0f - v));
+    VSTORE(bits * 31 ^ AS_VINT((vfloat)(sum_lanes(power))) ^ AS_VINT(log2(1.0f - v)), i, result);
+}
+
 #if LANES == 1
 kernel void probe_native_exp2(global const float *values, global float *result)
 {

@@ -152,7 +152,6 @@ class BlockedFile(Generic[B]):
             DataError: damaged.
         """
         most_coefficients(self.table.sh_degree, sh_degree)
-        _ = self.metadata  # it takes no part in the scene, but damage anywhere is damage
         numbers = self.numbers(box)
         threads = threads or os.cpu_count() or 1
         at_once = max(min(_SIDE_BY_SIDE, threads, len(numbers)), 1)

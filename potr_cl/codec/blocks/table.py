@@ -11,6 +11,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from potr_cl.codec import metadata
 from potr_cl.codec.container import FLAGS, MAGIC, MAX_METADATA, MOST_A_BYTE, OF_FLAGS, VERSION_OF_BLOCKS
 from potr_cl.codec.sound_header import CRC, require_sound_header
 from potr_cl.errors import DataError
@@ -20,6 +21,8 @@ from potr_cl.model.scene import LOW_PASS, SH_COEFFICIENTS
 
 _FIXED = struct.Struct("<8sHHIQQB3sIII")
 _ENTRY = struct.Struct("<6fQQII")
+#: Each block takes time to open, whatever it holds: there are so many at most, and one more for so many splats.
+_BLOCKS, _LEAST_A_BLOCK = 32, 1024
 #: Bytes that tell how long the header is.
 FIXED_BYTES = _FIXED.size
 
@@ -130,6 +133,8 @@ def read_table(data: bytes | memoryview, file_bytes: int, trust: bool = False) -
         raise DataError(f"format version {version} with flags {flags} is unknown: update potr_cl")
     if degree >= len(SH_COEFFICIENTS) or count < 1 or metadata_bytes > MAX_METADATA:
         raise DataError(f"the header makes no sense: {count} blocks, SH degree {degree}")
+    if count > _BLOCKS + splats // _LEAST_A_BLOCK:
+        raise DataError(f"the header makes no sense: {count} blocks of {splats} splats")
     blocks, first, offset = [], 0, header_bytes
     for number in range(count):
         *corners, own, nbytes, crc, zero = _ENTRY.unpack_from(data, _FIXED.size + number * _ENTRY.size)
@@ -145,5 +150,6 @@ def read_table(data: bytes | memoryview, file_bytes: int, trust: bool = False) -
         raise DataError("the blocks do not fill the file, or are not all of its splats")
     check_claim(splats, file_bytes, MOST_A_BYTE, trust)
     start = _FIXED.size + count * _ENTRY.size
-    metadata = bytes(data[start : start + metadata_bytes])
-    return BlockTable(splats, degree, *OF_FLAGS[flags], metadata, tuple(blocks), file_bytes)
+    noted = bytes(data[start : start + metadata_bytes])
+    metadata.parse(noted)  # it takes no part in the scene, but damage anywhere is damage
+    return BlockTable(splats, degree, *OF_FLAGS[flags], noted, tuple(blocks), file_bytes)
