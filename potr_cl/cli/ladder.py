@@ -33,6 +33,7 @@ def encode_ladder(args: argparse.Namespace, options: EncodeOptions) -> None:
     if len(args.scenes) > 1:
         raise UsageError("--ladder is of one scene: encode one at a time")
     (source,) = args.scenes
+    args.scene = source
     folder = _folder(args.output)
     name = Path("scene") if isinstance(source, StandardInput) else Path(source)
     check_files(args, ladder_files(folder, name, steps, options.output.suffix))

@@ -83,6 +83,22 @@ def say_line(document: Any) -> None:
     _say(json.dumps(plain_document(document), allow_nan=False))  # escapes all that is not ASCII
 
 
+def duration(seconds: float) -> str:
+    """A time that is known roughly: "98 s", "4.2 min"."""
+    for unit, name in ((3600, "h"), (60, "min")):
+        if seconds >= 2 * unit:
+            return f"{seconds / unit:.1f} {name}" if seconds < 10 * unit else f"{seconds / unit:.0f} {name}"
+    return f"{max(seconds, 1):.0f} s"
+
+
+def megabytes(nbytes: float) -> str:
+    """A size: "1.60 MB", "196 kB"."""
+    for unit, name in ((1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
+        if nbytes >= unit:
+            return f"{nbytes / unit:.3g} {name}"
+    return f"{nbytes:.0f} bytes"
+
+
 def note(text: object, kind: Kind = "news") -> None:
     """Print lines on standard error, if lines of this kind are shown."""
     if kind not in _shown:
