@@ -166,6 +166,7 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Row
     target, opened, cameras = shared.target, shared.opened, shared.cameras
     with contextlib.ExitStack() as stack:
         stack.enter_context(bounded(options.memory))
+        progress = stack.enter_context(Progress())
         scene = read_scene(args, args.scene)
         with frame_checked_beside(scene, cameras, options.cameras_anyway):
             workers = opened.result() if opened is not None and options.look_at_views(scene) else None
@@ -176,7 +177,6 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Row
                 if device is None or target is not None
                 else stack.enter_context(KeptScene(device, scene, options.memory, () if pool is None else pool.devices))
             )
-        progress = stack.enter_context(contextlib.closing(Progress()))
         page = stack.enter_context(replacing(args.report)) if args.report is not None else None
         placing = Stopwatch(progress)
         search: dict[str, Any] | None = None

@@ -39,7 +39,7 @@ def encode_ladder(args: argparse.Namespace, options: EncodeOptions) -> None:
     check_files(args, ladder_files(folder, name, steps, options.output.suffix))
     options = options.changed(source_bytes=size_of_file(source))
     cameras = given_cameras(args)
-    with contextlib.closing(Progress()) as progress, contextlib.ExitStack() as stack:
+    with Progress() as progress, contextlib.ExitStack() as stack:
         scene = read_scene(args, source)
         looks = options.look_at_views(scene)
         workers = None

@@ -162,6 +162,15 @@ def _print(stream: TextIO | None, text: str, colour: str | None = None) -> None:
     if colour is not None and _takes_colours(stream):
         head, colon, rest = line.partition(":")
         line = f"{colour}{head}{colon}{_PLAIN_AGAIN}{rest}" if colon else f"{colour}{line}{_PLAIN_AGAIN}"
-    with contextlib.suppress(ValueError):  # closed meanwhile
+    with contextlib.suppress(ValueError), _without_bars(stream):  # closed meanwhile
         stream.write(f"{line}\n")
         stream.flush()
+
+
+def _without_bars(stream: TextIO) -> contextlib.AbstractContextManager[None]:
+    """Of a block in which no bar of tqdm stands on the terminal that a stream writes to."""
+    library = sys.modules.get("tqdm")  # where nothing has imported it, there is no bar
+    if library is None or not is_terminal(stream):
+        return contextlib.nullcontext()
+    cleared: contextlib.AbstractContextManager[None] = library.tqdm.external_write_mode(file=stream)
+    return cleared
