@@ -194,7 +194,8 @@ def test_what_is_interrupted_is_not_shown_as_done():
             raise KeyboardInterrupt
 
     with contextlib.redirect_stderr(Terminal()) as terminal:
-        pytest.raises(KeyboardInterrupt, interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            interrupted()
         assert " 25%" in terminal.getvalue()
         assert "refit: 0.0 s" not in terminal.getvalue()
         with Progress() as progress:
