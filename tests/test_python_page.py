@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+import potr_cl
 from potr_cl import Scene
 
 ROOT = Path(__file__).parents[1]
@@ -128,6 +129,14 @@ def test_there_are_examples():
     listed = (EXAMPLES / "README.md").read_text("utf-8")
     for file in EXAMPLES.iterdir():
         assert file.name == "README.md" or f"({file.name})" in listed, f"examples/README.md does not list {file.name}"
+
+
+def test_the_bundled_scene_shows_something():
+    scene = potr_cl.read_scene(EXAMPLES / "playbot.sog")
+    assert (len(scene), scene.sh_degree) == (31_000, 2)
+    (picture,) = potr_cl.render(scene, turntable=1, size=128)
+    assert picture.pixels.std() > 20
+    assert "CC BY 4.0" in (EXAMPLES / "README.md").read_text("utf-8")
 
 
 @pytest.mark.slow
