@@ -112,19 +112,20 @@ def for_each_scene(works: Sequence[argparse.Namespace], work: Work, tells_json: 
     code = 0
     rows: list[tuple[str, ...]] = []
     sizes = [bytes_of_scene(one.scene) or 0 for one in works]
-    began = time.perf_counter()
+    took, behind = 0.0, 0  # of what did not fail
     for number, one in enumerate(works):
-        started = time.perf_counter()
-        left = _time_left(started - began, sizes, number)
+        left = f", about {duration(took * sum(sizes[number:]) / behind)} left for all" if behind else ""
         note(f"{number + 1} of {len(works)}: {one.scene}{left}")
+        began = time.perf_counter()
         try:
             row = work(one)
+            seconds = time.perf_counter() - began
+            took, behind = took + seconds, behind + sizes[number]
             if row is not None:
                 sizes_and_ratio = megabytes(row.before), megabytes(row.after), f"{row.before / row.after:.1f} x smaller"
-                seconds = duration(time.perf_counter() - started)
-                rows.append((one.output.name, *sizes_and_ratio, row.psnr, seconds))
+                rows.append((one.output.name, *sizes_and_ratio, row.psnr, duration(seconds)))
         except KeyboardInterrupt:
-            note(f"{number} of {len(works)} scenes are done: --skip-existing goes on behind them")
+            note(f"{number - len(failed)} of {len(works)} scenes are done: --skip-existing goes on behind them")
             raise
         except BrokenPipeError:
             raise
@@ -143,12 +144,6 @@ def for_each_scene(works: Sequence[argparse.Namespace], work: Work, tells_json: 
         problem = SomeFailedError(f"{len(failed)} of {len(works)} scenes failed: {names}")
         problem.exit_code = code
         raise problem
-
-
-def _time_left(seconds: float, sizes: Sequence[int], done: int) -> str:
-    """What the scenes that are left will take if a byte of theirs takes as long as one of those before."""
-    behind = sum(sizes[:done])
-    return f", about {duration(seconds * sum(sizes[done:]) / behind)} left for all" if behind else ""
 
 
 def _table(rows: Sequence[tuple[str, ...]]) -> str:
