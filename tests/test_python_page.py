@@ -8,13 +8,13 @@ import json
 import os
 import re
 import runpy
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+import potr_cl
 from potr_cl import Scene
 
 ROOT = Path(__file__).parents[1]
@@ -131,6 +131,14 @@ def test_there_are_examples():
         assert file.name == "README.md" or f"({file.name})" in listed, f"examples/README.md does not list {file.name}"
 
 
+def test_the_bundled_scene_shows_something():
+    scene = potr_cl.read_scene(EXAMPLES / "playbot.sog")
+    assert (len(scene), scene.sh_degree) == (31_000, 2)
+    (picture,) = potr_cl.render(scene, turntable=1, size=128)
+    assert picture.pixels.std() > 20
+    assert "CC BY 4.0" in (EXAMPLES / "README.md").read_text("utf-8")
+
+
 @pytest.mark.slow
 def test_quality_ladder(clone, monkeypatch, capsys):
     scene, cameras = "tests/data/plush_excerpt.ply", "tests/data/plush_excerpt_cameras.json"
@@ -144,32 +152,3 @@ def test_quality_ladder(clone, monkeypatch, capsys):
         values = [row[column] for row in rows]
         assert values == sorted(values), "better is larger"
     assert len(set(row[1] for row in rows)) == 3
-
-
-@pytest.mark.slow
-def test_compress_folder(clone):
-    folder = clone / "scenes"
-    (folder / "inner").mkdir(parents=True)
-    for name in ("a.ply", "inner/b.ply"):
-        (folder / name).symlink_to(clone / "tests" / "data" / "plush_excerpt.ply")
-        # Without cameras beside it, over a hundred views are placed.
-        cameras = clone / "tests" / "data" / "plush_excerpt_cameras.json"
-        (folder / name).with_name("cameras.json").symlink_to(cameras)
-    (folder / "broken.ply").write_bytes(b"ply\nnot one\n")
-    done = subprocess.run(
-        [sys.executable, "examples/compress_folder.py", "scenes", "out", "--max-size", "30kB", "--preset", "fast"],
-        capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )  # fmt: skip
-    assert done.returncode == 1, "one scene was damaged"
-    assert sorted(str(path.relative_to(clone / "out")) for path in (clone / "out").rglob("*.potr")) == [
-        "a.potr",
-        "inner/b.potr",
-    ]
-    assert all(path.stat().st_size <= 30_000 for path in (clone / "out").rglob("*.potr"))
-    assert "broken.ply" in done.stderr
-    assert "Traceback" not in done.stderr
-    again = subprocess.run(
-        [sys.executable, "examples/compress_folder.py", "scenes", "out", "--max-size", "30kB"],
-        capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )  # fmt: skip
-    assert again.stdout.count("is there already") == 2

@@ -28,10 +28,12 @@ class PrintCompletion(argparse.Action):
             import shtab
         except ImportError as error:
             raise UsageError(f"--print-completion needs the library shtab: {install_command('completion')}") from error
+        from potr_cl.cli.views import cameras_to_read  # on use: every command imports this module
+
         for action in _all_actions(parser):
             if action.type in (ReadPhotographs, WrittenFolder):
                 action.complete = shtab.DIRECTORY  # type: ignore[attr-defined]
-            elif action.type in (read_file, scene_output, place) or (
+            elif action.type in (read_file, scene_output, place, cameras_to_read) or (
                 isinstance(action.type, type) and issubclass(action.type, (ReadFile, ReadCameras, WrittenFile))
             ):
                 action.complete = shtab.FILE  # type: ignore[attr-defined]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from potr_cl.cli.batch import add_to_option, for_each_scene, jobs
+from potr_cl.cli.batch import add_batch_options, for_each_scene, jobs
 from potr_cl.cli.guard import StandardOutput, read_file
 from potr_cl.cli.options import Commands
 from potr_cl.cli.outputs import WrittenScene, place
@@ -65,7 +65,7 @@ def add_convert(commands: Commands) -> None:
         help='scenes, or "-" for standard input; without -o the last name is the one to write, "-" for standard output',
     )
     p.add_argument("-o", "--output", type=place, metavar="OUT", help='a file, a folder, or "-" for standard output')
-    add_to_option(p)
+    add_batch_options(p)
     add_from_option(p)
     add_spz_version_option(p)
     add_trust_option(p)

@@ -43,7 +43,7 @@ def _prune(args: argparse.Namespace) -> None:
     scene, cameras, device = _inputs(args)
     with contextlib.ExitStack() as stack:
         order = stack.enter_context(replacing(args.order)) if args.order is not None else None
-        progress = stack.enter_context(contextlib.closing(Progress()))
+        progress = stack.enter_context(Progress())
         cameras = cameras or virtual_cameras(args, scene, progress, device)
         tell_what_is_ahead(device, scene, cameras, options)
         result = prune(
@@ -112,7 +112,7 @@ def _compact(args: argparse.Namespace) -> None:
     choices: dict[str, Any] = {**stage_choices(args)}
     options = stage_options(Compact, args.quality, args.background, args.memory, choices, args.sf_sh)
     scene, cameras, device = _inputs(args)
-    with contextlib.closing(Progress()) as progress:
+    with Progress() as progress:
         cameras = cameras or virtual_cameras(args, scene, progress, device)
         tell_what_is_ahead(device, scene, cameras, options)
         result = compact(
@@ -149,7 +149,7 @@ def _refit(args: argparse.Namespace) -> None:
     scene, reference = read_scene(args, args.scene), read_scene(args, args.reference)
     check_rendered_alike((str(args.scene), scene), (str(args.reference), reference))
     device = Device(args.device)
-    with contextlib.closing(Progress()) as progress:
+    with Progress() as progress:
         cameras = cameras or virtual_cameras(args, reference, progress, device)
         # An encode that does nothing else which takes long.
         alone = EncodeOptions(memory=as_bytes(args.memory)).changed(prune=False, refit={"steps": args.steps})

@@ -16,9 +16,9 @@ from potr_cl.api.encoding import (
     encode_options,
     encode_target,
 )
-from potr_cl.cli.batch import add_to_option, for_each_scene, jobs
+from potr_cl.cli.batch import Row, add_batch_options, for_each_scene, jobs
 from potr_cl.cli.forecasts import tell_what_is_ahead
-from potr_cl.cli.guard import StandardOutput, read_file
+from potr_cl.cli.guard import CamerasBeside, StandardOutput, read_file
 from potr_cl.cli.ladder import encode_ladder
 from potr_cl.cli.options import SEVERAL, Commands, add_cluster_option, add_device_options, add_memory_option
 from potr_cl.cli.outputs import WrittenEncoded, WrittenPage, place, writing
@@ -60,7 +60,7 @@ from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.report.html import PicturePair, html_report
-from potr_cl.report.summary import encode_report, format_encode_report, search_report
+from potr_cl.report.summary import decibels, encode_report, format_encode_report, search_report
 from potr_cl.stages.refit import Refit
 from potr_cl.workers.opening import Workers, open_workers
 from potr_cl.workers.pool import Pool, Traffic
@@ -100,7 +100,7 @@ class _Shared:
     Attributes:
         target: a size or a PSNR to reach, if one is asked for.
         opened: what computes, which is opened while the first scene is read; None where none is needed.
-        cameras: of the file that ``--cameras`` names.
+        cameras: of the file that ``--cameras`` names; those beside a scene are its own.
         ground_truth: the photographs that ``--photos`` names.
     """
 
@@ -115,8 +115,9 @@ def _encode(args: argparse.Namespace) -> None:
         encode_ladder(args, _options(args, output=_output_of_ladder(args)))
         return
     works = jobs(args, WrittenEncoded, OUTPUTS[0].suffixes()[0])
+    if not works:
+        return
     options, target = _options(works[0]), encode_target(None, args.max_size, args.min_psnr)
-    refit = options.stage(Refit)
     check_photographs_have_cameras(options, args.cameras is not None)
     if args.report is None and args.report_view is not None:
         raise UsageError("--report-view needs --report, the page that shows it")
@@ -126,15 +127,22 @@ def _encode(args: argparse.Namespace) -> None:
         opened = stack.enter_context(thread_pool(1)).submit(_opened, args) if _looks(args, options) else None
         if opened is not None:
             stack.callback(_leave, opened)
-        cameras = given_cameras(args)
-        ground_truth = None
-        if refit.ground_truth is not None and cameras is not None:
-            cameras = within_photographs(cameras)
-            ground_truth = GroundTruth(refit.ground_truth, cameras, options.background)
-        shared = _Shared(target, opened, cameras, ground_truth)
+        shared = _Shared(target, opened, None, None)
+        if not isinstance(args.cameras, CamerasBeside):
+            shared = _with_cameras(args, shared, options)
         if opened is not None and len(works) > 1:
             opened.result()  # no scene can do without it
         for_each_scene(works, lambda one: _encode_one(one, shared, several=len(works) > 1), args.json)
+
+
+def _with_cameras(args: argparse.Namespace, shared: _Shared, options: EncodeOptions) -> _Shared:
+    cameras, photographs = given_cameras(args), options.stage(Refit).ground_truth
+    if photographs is None:
+        return replace(shared, cameras=cameras)
+    check_photographs_have_cameras(options, cameras is not None)
+    assert cameras is not None
+    cameras = within_photographs(cameras)
+    return replace(shared, cameras=cameras, ground_truth=GroundTruth(photographs, cameras, options.background))
 
 
 def _opened(args: argparse.Namespace) -> Workers:
@@ -150,12 +158,15 @@ def _leave(opened: Future[Workers]) -> None:
         opened.result().close()
 
 
-def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> None:
+def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Row:
     began = time.perf_counter()
     options = _options(args, size_of_file(args.scene))
+    if isinstance(args.cameras, CamerasBeside):
+        shared = _with_cameras(args, shared, options)
     target, opened, cameras = shared.target, shared.opened, shared.cameras
     with contextlib.ExitStack() as stack:
         stack.enter_context(bounded(options.memory))
+        progress = stack.enter_context(Progress())
         scene = read_scene(args, args.scene)
         with frame_checked_beside(scene, cameras, options.cameras_anyway):
             workers = opened.result() if opened is not None and options.look_at_views(scene) else None
@@ -166,7 +177,6 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Non
                 if device is None or target is not None
                 else stack.enter_context(KeptScene(device, scene, options.memory, () if pool is None else pool.devices))
             )
-        progress = stack.enter_context(contextlib.closing(Progress()))
         page = stack.enter_context(replacing(args.report)) if args.report is not None else None
         placing = Stopwatch(progress)
         search: dict[str, Any] | None = None
@@ -216,8 +226,13 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Non
             page.write(html_report(report, pictures).encode())
     if args.json:
         (say_line if several else say_document)(report)
+    elif several:
+        note(format_encode_report(report), "detail")
     else:
         say_done(format_encode_report(report))
+    judged = report["quality"]
+    psnr = "not judged" if isinstance(judged, str) else f"PSNR {decibels(judged['psnr'])}"
+    return Row(report["source"]["bytes"], report["bytes"], psnr)
 
 
 def _evaluate(
@@ -300,7 +315,7 @@ def add_encode(commands: Commands) -> None:
         help=f'{suffixes_encoded()}, a folder, or "-" for standard output; all are made by the same stages; .potr is '
         "the smallest",
     )
-    add_to_option(p)
+    add_batch_options(p)
     add_spz_version_option(p)
     goal = p.add_mutually_exclusive_group()
     goal.add_argument(

@@ -7,7 +7,7 @@ import time
 from typing import TYPE_CHECKING
 
 from potr_cl.api.files import decode_block_by_block
-from potr_cl.cli.batch import add_to_option, for_each_scene, jobs
+from potr_cl.cli.batch import add_batch_options, for_each_scene, jobs
 from potr_cl.cli.guard import StandardOutput, read_file
 from potr_cl.cli.outputs import WrittenScene, place
 from potr_cl.cli.scenes import add_from_option, add_trust_option, as_file, trust, write_scene
@@ -57,7 +57,7 @@ def add_decode(commands: Commands) -> None:
         metavar="OUT.ply",
         help=f'{suffixes_written()}, a folder, or "-" for standard output',
     )
-    add_to_option(p)
+    add_batch_options(p)
     p.add_argument(
         "--sh-degree", type=int, choices=range(len(SH_COEFFICIENTS)), metavar="N",
         help="leave out SH coefficients of degrees above N, 0 to 3, without decoding them; default: none",

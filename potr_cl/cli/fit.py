@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 
 from potr_cl.api.editing import check_rendered_alike
 from potr_cl.api.fitting import check_fit, fit
@@ -27,7 +26,7 @@ def _fit(args: argparse.Namespace) -> None:
     scene, reference = read_scene(args, args.scene), read_scene(args, args.reference)
     check_rendered_alike((str(args.scene), scene), (str(args.reference), reference))
     device = Device(args.device)
-    with contextlib.closing(Progress()) as progress:
+    with Progress() as progress:
         cameras = cameras or virtual_cameras(args, reference, progress, device)
         # An encode that does nothing else which takes long.
         alone = EncodeOptions(memory=as_bytes(args.memory)).changed(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from potr_cl.cli.terminal import is_quiet, note
+from potr_cl.cli.terminal import duration, is_quiet, note
 from potr_cl.errors import DeviceError
 from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
@@ -50,15 +50,7 @@ def tell_what_is_ahead(
         else:
             note(f"one view takes {1000 * ahead.sampled:.1f} ms", "detail")
             where = "" if device.info.kind == "cpu" else " of the device"
-            note(f"about {_duration(ahead.seconds)} and {_size(ahead.memory)} of memory{where}")
-
-
-def _duration(seconds: float) -> str:
-    """As roughly as it is known."""
-    for unit, name in ((3600, "h"), (60, "min")):
-        if seconds >= 2 * unit:
-            return f"{seconds / unit:.1f} {name}" if seconds < 10 * unit else f"{seconds / unit:.0f} {name}"
-    return f"{max(seconds, 1):.0f} s"
+            note(f"about {duration(ahead.seconds)} and {_size(ahead.memory)} of memory{where}")
 
 
 def _size(nbytes: float) -> str:

@@ -66,6 +66,10 @@ class ReadCameras(_SystemPath):
     """A file of cameras that the command reads, with those of its folder; or a folder that holds them."""
 
 
+class CamerasBeside(_SystemPath):
+    """Whatever cameras lie beside the scene, given as "beside"; a file of that name is given by its folder too."""
+
+
 class ReadPhotographs(_SystemPath):
     """A folder with images that the command reads."""
 
@@ -80,7 +84,8 @@ class WrittenFolder(_SystemPath):
 
 _READ = (ReadFile, ReadCameras, ReadPhotographs)
 _WRITTEN = (WrittenFile, WrittenFolder)
-_STREAMS = (StandardInput, StandardOutput)
+#: What names no file.
+_WORDS = (StandardInput, StandardOutput, CamerasBeside)
 
 
 def read_file(text: str) -> Path:
@@ -102,7 +107,7 @@ def check(args: argparse.Namespace) -> None:
     """
     for name, value in vars(args).items():
         for path in value if isinstance(value, (list, tuple)) else [value]:
-            if isinstance(path, Path) and not isinstance(path, (*_READ, *_WRITTEN, *_STREAMS)):
+            if isinstance(path, Path) and not isinstance(path, (*_READ, *_WRITTEN, *_WORDS)):
                 raise TypeError(f"argument '{name}' is a path: give it one of the types of {__name__}")
             if isinstance(path, (*_READ, *_WRITTEN)) and os.fspath(path) == "-":
                 stream = "output" if isinstance(path, _WRITTEN) else "input"

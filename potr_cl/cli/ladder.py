@@ -33,12 +33,13 @@ def encode_ladder(args: argparse.Namespace, options: EncodeOptions) -> None:
     if len(args.scenes) > 1:
         raise UsageError("--ladder is of one scene: encode one at a time")
     (source,) = args.scenes
+    args.scene = source
     folder = _folder(args.output)
     name = Path("scene") if isinstance(source, StandardInput) else Path(source)
     check_files(args, ladder_files(folder, name, steps, options.output.suffix))
     options = options.changed(source_bytes=size_of_file(source))
     cameras = given_cameras(args)
-    with contextlib.closing(Progress()) as progress, contextlib.ExitStack() as stack:
+    with Progress() as progress, contextlib.ExitStack() as stack:
         scene = read_scene(args, source)
         looks = options.look_at_views(scene)
         workers = None

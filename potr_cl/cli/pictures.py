@@ -101,7 +101,7 @@ def _render(args: argparse.Namespace) -> None:
             warn_of_frame(args.scene, judged, views)
         rasterizer = rasterizer_for(device, drawable, views, RULES[args.rules], background)
         stack.callback(rasterizer.close)
-        progress = stack.enter_context(contextlib.closing(Progress()))
+        progress = stack.enter_context(Progress())
         progress(stage, 0.0)
         for done, _ in enumerate(written_pictures(rasterizer, views, written), 1):
             progress(stage, done / len(views))
@@ -160,7 +160,7 @@ def _compare(args: argparse.Namespace) -> None:
                     drawables.append(drawable)
             a, b = drawables
             picture = stack.enter_context(replacing(args.output)) if args.output is not None else None
-            progress = stack.enter_context(contextlib.closing(Progress()))
+            progress = stack.enter_context(Progress())
             comparison = compare_scenes(
                 (named(args.a, a), a), (named(args.b, b), b), views,
                 workers=workers, rules=RULES[args.rules], background=background, truth=args.truth, progress=progress,

@@ -85,6 +85,22 @@ def say_line(document: Any) -> None:
     _say(json.dumps(plain_document(document), allow_nan=False))  # escapes all that is not ASCII
 
 
+def duration(seconds: float) -> str:
+    """A time that is known roughly: "98 s", "4.2 min"."""
+    for unit, name in ((3600, "h"), (60, "min")):
+        if seconds >= 2 * unit:
+            return f"{seconds / unit:.1f} {name}" if seconds < 10 * unit else f"{seconds / unit:.0f} {name}"
+    return f"{max(seconds, 1):.0f} s"
+
+
+def megabytes(nbytes: float) -> str:
+    """A size: "1.60 MB", "196 kB"."""
+    for unit, name in ((1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
+        if nbytes >= unit:
+            return f"{nbytes / unit:.3g} {name}"
+    return f"{nbytes:.0f} bytes"
+
+
 def note(text: object, kind: Kind = "news") -> None:
     """Print lines on standard error, if lines of this kind are shown."""
     if kind not in _shown:
@@ -150,6 +166,15 @@ def _print(stream: TextIO | None, text: str, colour: str | None = None) -> None:
     if colour is not None and _takes_colours(stream):
         head, colon, rest = line.partition(":")
         line = f"{colour}{head}{colon}{_PLAIN_AGAIN}{rest}" if colon else f"{colour}{line}{_PLAIN_AGAIN}"
-    with contextlib.suppress(ValueError):  # closed meanwhile
+    with contextlib.suppress(ValueError), _without_bars(stream):  # closed meanwhile
         stream.write(f"{line}\n")
         stream.flush()
+
+
+def _without_bars(stream: TextIO) -> contextlib.AbstractContextManager[None]:
+    """Of a block in which no bar of tqdm stands on the terminal that a stream writes to."""
+    library = sys.modules.get("tqdm")  # where nothing has imported it, there is no bar
+    if library is None or not is_terminal(stream):
+        return contextlib.nullcontext()
+    cleared: contextlib.AbstractContextManager[None] = library.tqdm.external_write_mode(file=stream)
+    return cleared

@@ -7,11 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from potr_cl.api.inputs import placed_beside_cameras
-from potr_cl.cli.guard import ReadCameras, check_photographs
+from potr_cl.cli.guard import CamerasBeside, ReadCameras, StandardInput, check_photographs
 from potr_cl.cli.options import CAMERAS_HELP
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.terminal import note
 from potr_cl.formats import load_cameras
+from potr_cl.formats.registry import cameras_beside
 from potr_cl.model.agreement import judge_cameras
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
@@ -20,11 +21,18 @@ from potr_cl.opencl.device import Device
 from potr_cl.placement.virtual import place_cameras
 from potr_cl.stages.stage import Progress
 
+#: What ``--cameras`` takes in the place of a path.
+BESIDE = "beside"
+
 
 def add_cameras_options(p: argparse.ArgumentParser) -> None:
     """``--cameras``, and what to do without."""
     p.add_argument(
-        "--cameras", type=ReadCameras, metavar="PATH", help=f"{CAMERAS_HELP}; without, virtual cameras are placed"
+        "--cameras",
+        type=cameras_to_read,
+        metavar="PATH",
+        help=f'{CAMERAS_HELP}; "beside": those in the folder of each scene, or of its training; without, virtual '
+        "cameras are placed",
     )
     p.add_argument(
         "--virtual-views",
@@ -39,8 +47,13 @@ def add_cameras_options(p: argparse.ArgumentParser) -> None:
     )
 
 
+def cameras_to_read(text: str) -> Path:
+    """A type of arguments: cameras that the command reads."""
+    return CamerasBeside(text) if text == BESIDE else ReadCameras(text)
+
+
 def given_cameras(args: argparse.Namespace) -> list[Camera] | None:
-    """The cameras of the file that ``--cameras`` names, if it names one.
+    """The cameras of the file that ``--cameras`` names, or those beside the scene; None where there are none.
 
     Raises:
         UsageError: virtual ones are asked for besides; and as :func:`read_cameras`.
@@ -49,7 +62,15 @@ def given_cameras(args: argparse.Namespace) -> list[Camera] | None:
         return None
     if args.virtual_views is not None:
         raise placed_beside_cameras("--virtual-views")
-    return read_cameras(args)
+    if not isinstance(args.cameras, CamerasBeside):
+        return read_cameras(args)
+    folder = None if isinstance(args.scene, StandardInput) else cameras_beside(args.scene)
+    if folder is None:
+        return None
+    found = argparse.Namespace(**{**vars(args), "cameras": ReadCameras(folder)})
+    cameras = read_cameras(found)
+    note(f"{len(cameras)} views of '{folder}'")
+    return cameras
 
 
 def read_cameras(args: argparse.Namespace) -> list[Camera]:
@@ -76,5 +97,8 @@ def virtual_cameras(args: argparse.Namespace, scene: Scene, progress: Progress, 
     progress("place cameras", 0.0)
     cameras = place_cameras(scene, args.virtual_views, device=device)
     progress("place cameras", 1.0)
-    note(f"no --cameras given: {describe(cameras)}. With the real cameras the file would be smaller.")
+    scene_file = getattr(args, "scene", None)
+    folder = None if scene_file is None or isinstance(scene_file, StandardInput) else cameras_beside(scene_file)
+    better = f"--cameras beside takes those in '{folder}'" if folder else "with the real cameras the file would be smaller"
+    note(f"no --cameras given: {describe(cameras)}; {better}")
     return cameras

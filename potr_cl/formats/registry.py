@@ -39,6 +39,7 @@ START_BYTES = 1024
 #: files are looked at.
 _PLACES_OF_TRAININGS = ("point_cloud/iteration_*/*", "iteration_*/*", "ply/*", "*")
 _MOST_FILES = 1000
+_FOLDERS_OF_TRAININGS = re.compile(r"point_cloud|iteration_\d+|ply")
 _GZIP = b"\x1f\x8b"
 
 #: In the order in which a folder is searched for them. cameras.json stands before transforms.json, for it lists just
@@ -102,6 +103,16 @@ def _iteration(file: Path) -> tuple[int, str]:
     """By which number of a file's name and its folder's it is the last: "iteration_30000", "point_cloud_29999.ply"."""
     digits = re.findall(r"\d+", f"{file.parent.name} {file.stem}")
     return max((int(each[:18]) for each in digits), default=0), os.fspath(file)
+
+
+def cameras_beside(scene: Path) -> Path | None:
+    """The folder with cameras that a scene lies in, or that of the training which has left it there; None: neither."""
+    folder = without_level(scene).absolute().parent
+    while not any(entry.is_in(folder / sub) for entry in CAMERA_FORMATS for sub in ("", *entry.subfolders)):
+        if not _FOLDERS_OF_TRAININGS.fullmatch(folder.name):
+            return None
+        folder = folder.parent
+    return folder
 
 
 def suffix_of_content(start: bytes, name: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 #: Seconds that a picture may take while the camera moves: ten pictures a second, and some time for the browser.
 TARGET = 0.085
 #: Part of the full width and height; from one to the next the pixels change by a factor of √2.
-_STEPS = tuple(2.0 ** (-k / 4) for k in range(12))
+_STEPS = tuple(2.0 ** (-k / 4) for k in range(16))
 #: Pixels along the shorter side that are rendered at least.
 _LEAST = 96
 
@@ -28,6 +28,11 @@ class Pace:
     def is_full(self) -> bool:
         """Whether pictures of full size come fast enough."""
         return self._step == 0
+
+    @property
+    def is_slow(self) -> bool:
+        """Whether a picture of full size takes so long that one of a quarter of its pixels should come first."""
+        return self._step > 4
 
     def size(self, width: int, height: int) -> tuple[int, int]:
         """Width and height of the next picture, which has the full picture's shape as well as whole pixels can."""

@@ -170,9 +170,12 @@ class Painter:
         try:
             if visitor.stale_look or not visitor.is_still:
                 visitor.stale_look = visitor.stale_picture = False
-                self._render(visitor, moving)
+                draft = not moving and visitor.drafted is not gaze and self._pace(visitor).is_slow
+                if draft:
+                    visitor.drafted = gaze
+                self._render(visitor, moving, draft)
                 # A still picture of where the camera was is none of where it is.
-                visitor.is_still = not moving and visitor.gaze is gaze
+                visitor.is_still = not (moving or draft) and visitor.gaze is gaze
             visitor.stale_picture = False
             self._compose(visitor)
             visitor.tell("")
@@ -186,7 +189,7 @@ class Painter:
         if moving and visitor.look is not None:
             self._pace(visitor).took(visitor.painted - began)
 
-    def _render(self, visitor: Visitor, moving: bool) -> None:
+    def _render(self, visitor: Visitor, moving: bool, draft: bool) -> None:
         gaze, is_pair = visitor.gaze, self._session.is_pair
         assert gaze is not None
         pace = self._pace(visitor)
@@ -195,7 +198,9 @@ class Painter:
             width = max(width // 2, 1)
         if moving:
             width, height = pace.size(width, height)
-        figures = is_pair and (not moving or pace.is_full)
+        elif draft:
+            width, height = (width + 1) // 2, (height + 1) // 2
+        figures = is_pair and not draft and (not moving or pace.is_full)
         scenes = ("A", "B") if figures else visitor.needs(is_pair)
         visitor.look = self._session.look(camera_of(gaze, width, height), scenes, figures)
 

@@ -12,7 +12,7 @@ from potr_cl.viewer.pose import Gaze
 from potr_cl.viewer.session import Look, Which
 
 #: Pixels along the longer side that are rendered at most.
-MOST_PIXELS = 2048
+MOST_PIXELS = 3840
 #: Seconds without a movement after which the camera stands still.
 PAUSE = 0.2
 
@@ -74,6 +74,7 @@ class Visitor:
     paces: dict[str, Pace] = field(default_factory=dict)
     painted: float = 0.0
     photograph: tuple[int, U8] | None = None
+    drafted: Gaze | None = None
 
     def size(self) -> tuple[int, int]:
         """Width and height of a picture of full size."""

@@ -34,6 +34,7 @@ COMMAND_LINE_ONLY = {
     "--verbose": "as --quiet",
     "--from": "for standard input",
     "--to": "for standard output and folders of scenes",
+    "--skip-existing": "for folders of scenes",
     "--ladder": "encode_ladder makes several files, encode one",
     "--cluster": "a keyword too; tests/workers/test_cluster.py compares them, with a cluster",
     "--no-quality": "nothing is judged unless a report is asked for: compare() judges",

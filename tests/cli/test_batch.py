@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from potr_cl import cli
@@ -91,14 +92,98 @@ def test_one_device_is_opened_once(
     call = ["encode", "a.ply", "b.ply", "c.ply", "-o", "small", "--preset", "fast", "--virtual-views", "8"]
     assert cli.main(call) == 0
     assert len(opened) == 1
-    assert capsys.readouterr().out.count("PSNR") == 6
+    rows = capsys.readouterr().out.splitlines()
+    assert [row.split()[0] for row in rows] == ["a.potr", "b.potr", "c.potr"]
+    assert all(" kB  " in row and "PSNR" in row for row in rows)
+
+
+@pytest.fixture
+def trainings(folder: Path) -> list[str]:
+    """As the original implementation leaves them: cameras beside two of three scenes."""
+    for seed, name in enumerate(("bicycle", "garden", "room")):
+        place = folder / name / "point_cloud" / "iteration_30000"
+        place.mkdir(parents=True)
+        ply.save(place / "point_cloud.ply", random_scene(80 + seed, 0, seed))
+        if name != "garden":
+            view = {"id": 0, "img_name": f"{name}.png", "width": 64, "height": 48, "fx": 50, "fy": 50}
+            views = [
+                view | {"img_name": f"{name}_{k}.png", "position": [0, 0, -5 - k], "rotation": np.eye(3).tolist()}
+                for k in range(3)
+            ]
+            (folder / name / "cameras.json").write_text(json.dumps(views))
+    return ["encode", "*/point_cloud/iteration_30000/point_cloud.ply", "-o", "small", *KEEP]
+
+
+def test_scenes_of_one_name_are_told_apart_by_their_folders(trainings: list[str], folder: Path) -> None:
+    assert cli.main(trainings) == 0
+    assert sorted(path.name for path in Path("small").iterdir()) == ["bicycle.potr", "garden.potr", "room.potr"]
+    (folder / "room" / "point_cloud.ply").write_bytes((folder / "a.ply").read_bytes())
+    assert cli.main(["encode", "a.ply", "**/point_cloud.ply", "-o", "deep", *KEEP]) == 0
+    assert sorted(path.name for path in Path("deep").iterdir()) == [
+        "a.potr",
+        "bicycle_point_cloud_iteration_30000_point_cloud.potr",
+        "garden_point_cloud_iteration_30000_point_cloud.potr",
+        "room_point_cloud.potr",
+        "room_point_cloud_iteration_30000_point_cloud.potr",
+    ]
+
+
+def test_cameras_beside_each_scene(trainings: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([*trainings, "--cameras", "beside", "--cameras-anyway", "--json"]) == 0
+    told = capsys.readouterr()
+    quality = {line["file"]: line["quality"] for line in map(json.loads, told.out.splitlines())}
+    judged = {
+        Path(name).stem: found if isinstance(found, str) else {view["name"] for view in found["views"]}
+        for name, found in quality.items()
+    }
+    assert judged["bicycle"] <= {"bicycle_0", "bicycle_1", "bicycle_2"}
+    assert judged["room"] <= {"room_0", "room_1", "room_2"}
+    assert judged["garden"] == "not judged: there are no cameras to look from"
+    assert "3 views of" in told.err
+
+
+def test_a_batch_goes_on_where_it_was_stopped(trainings: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    scene = Path("garden/point_cloud/iteration_30000/point_cloud.ply")
+    whole = scene.read_bytes()
+    scene.write_bytes(whole[:-50])
+    assert cli.main([*trainings, "--skip-existing"]) == 1
+    told = capsys.readouterr()
+    assert [line.split()[0] for line in told.err.splitlines() if " of 3: " in line] == ["1", "2", "3"]
+    assert "s left for all" in told.err
+    bicycle, garden, room = told.out.splitlines()
+    assert [row.split()[0] for row in (bicycle, room)] == ["bicycle.potr", "room.potr"]
+    assert garden.startswith("garden.potr   failed: ")
+    assert "is truncated" in garden
+    before = Path("small/room.potr").stat().st_mtime_ns
+    scene.write_bytes(whole)
+    assert cli.main([*trainings, "--skip-existing"]) == 0
+    assert "skipping 2 of 3 scenes: their output exists" in capsys.readouterr().err
+    assert Path("small/garden.potr").exists()
+    assert Path("small/room.potr").stat().st_mtime_ns == before
+    assert cli.main([*trainings, "--skip-existing"]) == 0
+
+
+def test_an_interrupted_batch_says_how_to_go_on(
+    trainings: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read = load_scene
+
+    def interrupted(path: Path, **more: Any) -> Any:
+        if "room" in str(path):
+            raise KeyboardInterrupt
+        return read(path, **more)
+
+    monkeypatch.setattr("potr_cl.cli.scenes.load_scene", interrupted)
+    assert cli.main(trainings) == 130
+    assert "2 of 3 scenes are done: --skip-existing goes on behind them" in capsys.readouterr().err
+    assert sorted(path.name for path in Path("small").iterdir()) == ["bicycle.potr", "garden.potr"]
 
 
 @pytest.mark.parametrize(
     ("call", "said"),
     [
-        ("encode a.ply sub/a.ply -o small", "'a.ply' and 'sub/a.ply' would both become 'small/a.potr'"),
-        ("encode a.ply sub/A.PLY -o small", "would both become"),
+        ("encode a.ply ./a.ply -o small", "'a.ply' and 'a.ply' would both become 'small/a.potr'"),
+        ("encode a.ply A.PLY -o small", "would both become"),
         ("encode a.ply b.ply -o c.ply", "need a folder, and 'c.ply' is a file"),
         ("encode a.ply b.ply -o new.potr", "need a folder, and 'new.potr' would be a file"),
         ("encode a.ply b.ply -o -", "standard output takes one scene"),

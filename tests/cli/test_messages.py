@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
 import os
 import re
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -149,14 +152,58 @@ def test_a_stage_is_told_once_in_a_log(encode, capsys):
 
 
 def test_a_stage_that_goes_on_is_told_once(capsys):
-    progress = Progress()
-    for stage, done in (
-        ("a", 0), ("a", 0.5), ("b", 0), ("b", 1), ("a", 0.7), ("a", 1), ("a", 0.2), ("a", 1), ("c", 0), ("c", 0.5)
-    ):  # fmt: skip
-        progress(stage, done)
-    progress.close()
+    with Progress() as progress:
+        for stage, done in (
+            ("a", 0), ("a", 0.5), ("b", 0), ("b", 1), ("a", 0.7), ("a", 1), ("a", 0.2), ("a", 1), ("c", 0), ("c", 0.5)
+        ):  # fmt: skip
+            progress(stage, done)
     lines = [re.sub(r"\d+\.\d", "T", line) for line in capsys.readouterr().err.splitlines()]
     assert lines == ["a …", "b …", "b: T s", "a: T s", "c …"]
+
+
+class Terminal(io.StringIO):
+    """Keeps what a terminal would show."""
+
+    def isatty(self) -> bool:
+        return True
+
+    def shows(self, text: str) -> None:
+        """Wait until something is shown."""
+        end = time.monotonic() + 60
+        while text not in self.getvalue():
+            assert time.monotonic() < end, f"not shown: {text}, but {self.getvalue()}"
+            time.sleep(0.02)
+
+
+def test_the_clock_ticks_whatever_the_work_does():
+    with contextlib.redirect_stderr(Terminal()) as terminal, Progress() as progress:
+        terminal.shows("preparing: 00:01 elapsed")
+        progress("fit", 0.0)
+        terminal.shows("fit:   0%")
+        terminal.shows("00:02 elapsed, ? left")
+        progress("fit", 1.0)
+        note("a line")
+        terminal.shows("a line\n")
+
+
+def test_what_is_interrupted_is_not_shown_as_done():
+    def interrupted() -> None:
+        with Progress() as progress:
+            progress("refit", 0.25)
+            progress("refit", 1.0)  # what frees what a stage holds says so, whatever has ended it
+            raise KeyboardInterrupt
+
+    with contextlib.redirect_stderr(Terminal()) as terminal:
+        with pytest.raises(KeyboardInterrupt):
+            interrupted()
+        assert " 25%" in terminal.getvalue()
+        assert "refit: 0.0 s" not in terminal.getvalue()
+        with Progress() as progress:
+            progress("fit", 0.25)
+            progress("fit", 1.0)
+            progress("fit", 0.99)  # a fit that was interrupted is tried against none
+        assert "fit: 00:00 elapsed" in terminal.getvalue()
+        assert not re.search(r" 99%|100%", terminal.getvalue())
 
 
 # Terminals

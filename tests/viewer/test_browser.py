@@ -336,16 +336,41 @@ def test_the_camera_is_told_as_often_as_screens_show_pictures(viewer, browser):
         until(lambda: len(viewer.painter.visitors) < 2)
 
 
-def test_on_a_phone_nothing_hides_the_divider(viewer, browser):
-    context = browser.new_context(viewport={"width": 390, "height": 844}, is_mobile=True, has_touch=True)
+def test_arrow_keys_move_the_slider_from_file_to_file(viewer, page):
+    visitor = still(viewer, page)
+    assert page.title().startswith("plush_excerpt.ply – plush_excerpt_q0.5.potr – ")
+    page.locator("[role=slider]:not(.potr-grip)").first.focus()
+    page.keyboard.press("ArrowLeft")
+    until(lambda: "_q0." in viewer.session.exhibit("B").name and "_q0.5" not in viewer.session.exhibit("B").name)
+    page.keyboard.press("ArrowLeft")  # there is none below
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("ArrowRight")
+    until(lambda: "_q1." in viewer.session.exhibit("B").name)
+    until(lambda: page.title().startswith("plush_excerpt.ply – plush_excerpt_q1.potr – "))
+    still(viewer, page)
+    assert visitor.view == 0, "viser turns the camera by these keys where no slider has them"
+
+
+def test_on_a_phone(viewer, browser):
+    context = browser.new_context(
+        viewport={"width": 390, "height": 844}, is_mobile=True, has_touch=True, device_scale_factor=2
+    )
     phone = context.new_page()
     try:
         phone.goto(viewer.url)
         until(lambda: phone.locator(".potr-figures b").count() > 0)
+        visitor = still(viewer, phone)
+        assert (visitor.width, visitor.height) == (780, 1688), "pictures have the pixels of the screen"
+        phone.locator("[data-potr=figures]", has_text="780 × 1688").wait_for()
         assert phone.evaluate("document.documentElement.scrollWidth") <= 390
+        panel = phone.locator(".potr-sheet").bounding_box()
+        assert (panel["x"], panel["width"]) == (0, 390)
+        assert panel["y"] > 0.6 * 844, "the picture is above the panel"
         handle = phone.evaluate("parseFloat(getComputedStyle(document.querySelector('.potr-grip'), '::after').top)")
-        panel = phone.locator("[data-potr='scenes']").bounding_box()["y"] - 60  # with its head
-        assert 40 < handle + 17 < panel
+        assert 40 < handle + 17 < panel["y"]
+        note = phone.locator(".mantine-Notification-root").first  # that WebGL is computed on the CPU
+        label = phone.locator(".potr-label.left").bounding_box()
+        assert note.bounding_box()["y"] >= label["y"] + label["height"], "notes leave the labels free"
     finally:
         context.close()
         until(lambda: len(viewer.painter.visitors) < 2)

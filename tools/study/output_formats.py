@@ -39,10 +39,9 @@ from tools.results import Column, Results, circumstances, write_json
 from tools.study.evaluation import EvaluatedScene
 from tools.study.rate_distortion import size_at
 
-#: The outputs of each quality, the most interesting first: a suffix, and a version behind a colon. Those of float32 are
-#: large, and of one quality only.
+#: The outputs of each quality, the most interesting first: a suffix, and a version behind a colon.
 PLAN: dict[float, tuple[str, ...]] = {
-    0.5: (".spz:2", ".sog", ".compressed.ply", ".spz:4", ".glb"),
+    0.5: (".spz:2", ".sog", ".compressed.ply", ".spz:4"),
     0.3: (".spz:2", ".sog", ".compressed.ply"),
     0.8: (".compressed.ply", ".spz:2", ".sog"),
     0.1: (".spz:2", ".sog"),

@@ -10,6 +10,7 @@ Specification: github.com/KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian
 from __future__ import annotations
 
 import dataclasses
+import io
 import logging
 import os
 from pathlib import Path
@@ -21,9 +22,10 @@ from numpy.typing import NDArray
 from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
+from potr_cl.formats.scenes import gltf_writer, spz
 from potr_cl.formats.scenes.gltf_file import Asset
 from potr_cl.formats.scenes.gltf_writer import EXTENSION as _EXTENSION
-from potr_cl.formats.scenes.gltf_writer import pieces
+from potr_cl.formats.scenes.gltf_writer import SPZ_EXTENSION
 from potr_cl.formats.scenes.scene_files import MOST_A_BYTE, cleaned, joined, log_of_scales, reading, shown
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.claims import check_claim
@@ -36,7 +38,7 @@ _log = logging.getLogger("potr_cl")
 _POINTS = 0
 _SRGB, _LINEAR = "srgb_rec709_display", "lin_rec709_display"
 #: Extensions of the asset that change nothing of what is read here, or are read.
-_HARMLESS = {_EXTENSION, "KHR_mesh_quantization", "KHR_materials_unlit", "KHR_texture_transform"}
+_HARMLESS = {_EXTENSION, SPZ_EXTENSION, "KHR_mesh_quantization", "KHR_materials_unlit", "KHR_texture_transform"}
 #: Every scene may have so many meshes with splats, each of which takes time.
 _MOST_PARTS = 4096
 #: Largest difference from a rotation that a node's matrix may have by rounding.
@@ -74,22 +76,31 @@ def files(path: Path) -> list[Path]:
 def save(path: str | os.PathLike[str], scene: Scene) -> None:
     """Write a scene as glTF in one file; the file appears under its name only when it is whole.
 
+    Args:
+        path: of a .glb file, whose splats are packed as SPZ, or of a .gltf file, which has them in float32.
+        scene: to write.
+
     Raises:
         UsageError: ``path`` cannot be written to.
+        DataError: a position is too large for SPZ.
         PotrError: the system failed to write.
     """
-    if scene.antialiased:
-        _log.warning("'%s': glTF cannot say that the scene is antialiased: it will be drawn as the others", path)
+    if Path(path).suffix.lower() != ".gltf":
+        content = gltf_writer.binary(scene, spz.content_of(path, scene))
+    else:
+        content = [gltf_writer.text(scene)]
+        if scene.antialiased:
+            _log.warning("'%s': glTF cannot say that the scene is antialiased: it will be drawn as the others", path)
     with replacing(path) as file:
-        for piece in pieces(scene, binary=Path(path).suffix.lower() != ".gltf"):
+        for piece in content:
             file.write(piece)
 
 
 FORMAT = SceneFormat(
     name="glTF",
     suffixes=(".glb", ".gltf"),
-    note="with the Khronos Group's KHR_gaussian_splatting, uncompressed, floats or integers; nodes' transforms are "
-    "applied, axes kept; written in float32",
+    note="with the Khronos Group's KHR_gaussian_splatting, in floats, integers or packed as SPZ; nodes' transforms are "
+    "applied, axes kept; `.glb` is written with SPZ, `.gltf` in float32",
     load=load,
     save=save,
     starts=(b"glTF",),
@@ -126,7 +137,7 @@ def _scene(path: str | os.PathLike[str], asset: Asset, trust: bool) -> Scene:
         raise DataError(f"'{path}': {error}") from None
     if left_out:
         _log.warning("'%s': left out %d parts of the scene that are no splats", path, left_out)
-    scenes = {number: _splats(path, asset, primitive) for number, primitive in primitives.items()}
+    scenes = {number: _splats(path, asset, primitive, trust) for number, primitive in primitives.items()}
     return joined([_placed(path, scenes[id(primitive)], node.matrix(asset)) for primitive, node in found])
 
 
@@ -204,12 +215,10 @@ def _check_kind(path: str | os.PathLike[str], asset: Asset, primitive: dict[str,
     kind = primitive["extensions"][_EXTENSION]
     if not isinstance(kind, dict):
         raise asset.damaged(f"its {_EXTENSION} is no object")
-    packed = kind.get("extensions", {})
-    if packed:
-        name = next(iter(packed))
-        why = "whose text is a draft still, and " if "spz" in str(name) else ""
+    unknown = [name for name in kind.get("extensions", {}) if name != SPZ_EXTENSION]
+    if unknown:
         raise DataError(
-            f"'{path}' has its splats in the extension {shown(name)}, {why}which cannot be read: export it without "
+            f"'{path}' has its splats in the extension {shown(unknown[0])}, which cannot be read: export it without "
             "compression, or as .spz"
         )
     for key, default, known in (
@@ -231,8 +240,17 @@ def _count(asset: Asset, primitive: dict[str, Any]) -> int:
     return asset.count(primitive["attributes"].get("POSITION"))
 
 
-def _splats(path: str | os.PathLike[str], asset: Asset, primitive: dict[str, Any]) -> Scene:
+def _splats(path: str | os.PathLike[str], asset: Asset, primitive: dict[str, Any], trust: bool) -> Scene:
     """The splats of a primitive, in the axes of its node."""
+    packed = primitive["extensions"][_EXTENSION].get("extensions", {}).get(SPZ_EXTENSION)
+    if packed is not None:
+        if not isinstance(packed, dict):
+            raise asset.damaged(f"its {SPZ_EXTENSION} is no object")
+        content = asset.content(packed.get("bufferView"))
+        scene = spz.read(path, io.BytesIO(content), len(content), trust)
+        if len(scene) != _count(asset, primitive):
+            raise asset.damaged("its SPZ does not hold as many splats as POSITION")
+        return scene
     attributes: dict[str, Any] = primitive["attributes"]
     count = _count(asset, primitive)
 

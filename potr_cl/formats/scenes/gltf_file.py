@@ -144,6 +144,14 @@ class Asset:
             values = np.maximum(values / np.float32(divisor), np.float32(-1))
         return values
 
+    def content(self, view: Any) -> memoryview:
+        """The bytes of a view.
+
+        Raises:
+            DataError: there is no such view, or it does not lie within the file.
+        """
+        return self._view(self.entry("bufferViews", view))
+
     def whole(self, entry: dict[str, Any], key: str, default: int | None = None, least: int = 0) -> int:
         """A whole number of the description.
 

@@ -104,22 +104,33 @@ def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
         DataError: it is damaged, no SPZ file, or holds too many splats for its size.
     """
     with opened(path) as (file, size):
-        start = file.read(_HEADER_4_BYTES)
-        file.seek(0)
-        if start[:2] == b"\x1f\x8b":
-            header, properties = _read_gzip(path, gzip.GzipFile(fileobj=file), size, trust)
-        elif int.from_bytes(start[4:8], "little") in _LEGACY:
-            header, properties = _read_gzip(path, file, size, trust)
-        else:
-            header, properties = _read_streams(path, file.read(), trust)
-        coefficients = SH_COEFFICIENTS[min(header.degree, len(SH_COEFFICIENTS) - 1)]
-        scene = unpacked(properties, header.splats, coefficients, header.version, header.fractional_bits)
-        scene = scene.rendered(bool(header.flags & _ANTIALIASED))
+        return cleaned(path, read(path, file, size, trust))
+
+
+def read(path: str | os.PathLike[str], file: BinaryIO, size: int, trust: bool) -> Scene:
+    """The same from an open file of so many bytes, as the file has it: values need not be finite.
+
+    Args:
+        path: for messages.
+        file: that begins with SPZ, and ends behind it.
+        size: of the file, bytes.
+        trust: as of :func:`load`.
+    """
+    start = file.read(_HEADER_4_BYTES)
+    file.seek(0)
+    if start[:2] == b"\x1f\x8b":
+        header, properties = _read_gzip(path, gzip.GzipFile(fileobj=file), size, trust)
+    elif int.from_bytes(start[4:8], "little") in _LEGACY:
+        header, properties = _read_gzip(path, file, size, trust)
+    else:
+        header, properties = _read_streams(path, file.read(), trust)
+    coefficients = SH_COEFFICIENTS[min(header.degree, len(SH_COEFFICIENTS) - 1)]
+    scene = unpacked(properties, header.splats, coefficients, header.version, header.fractional_bits)
     if header.degree >= len(SH_COEFFICIENTS):
         _log.warning("'%s': SH degree 4 is left out: only degrees 0 to 3 are kept", path)
     if header.flags & _EXTENSIONS:
         _log.warning("'%s' has extensions: they are left out, and axes are kept as they are", path)
-    return cleaned(path, scene)
+    return scene.rendered(bool(header.flags & _ANTIALIASED))
 
 
 def save(path: str | os.PathLike[str], scene: Scene, version: int = _VERSIONS[0]) -> None:
@@ -138,6 +149,18 @@ def save(path: str | os.PathLike[str], scene: Scene, version: int = _VERSIONS[0]
         DataError: a position is too large for SPZ.
         PotrError: the system failed to write.
     """
+    content = content_of(path, scene, version)
+    with replacing(path) as file:
+        for piece in content:
+            file.write(piece)
+
+
+def content_of(path: str | os.PathLike[str], scene: Scene, version: int = _VERSIONS[0]) -> list[bytes]:
+    """What :func:`save` writes, in pieces; ``path`` is for messages.
+
+    Raises:
+        DataError: a position is too large for SPZ.
+    """
     largest = float(np.abs(scene.means).max())
     bits = _FRACTIONAL_BITS
     while bits > 1 and largest * 2**bits > POSITION_LIMIT:
@@ -147,9 +170,7 @@ def save(path: str | os.PathLike[str], scene: Scene, version: int = _VERSIONS[0]
     if bits < _FRACTIONAL_BITS:
         _log.warning("'%s': the scene is large for SPZ: positions are stored in steps of 1/%d unit", path, 2**bits)
     tell_of_low_pass(path, scene)
-    with replacing(path) as file:
-        for piece in pieces(packed(arranged(scene), bits, version), scene, bits, version):
-            file.write(piece)
+    return pieces(packed(arranged(scene), bits, version), scene, bits, version)
 
 
 def pieces(properties: list[bytes], scene: Scene, fractional_bits: int, version: int) -> list[bytes]:

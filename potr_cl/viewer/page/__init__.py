@@ -17,11 +17,10 @@ def head() -> str:
     """HTML that makes a page of viser's load what is ours.
 
     Where WebGL is slow, viser lowers its resolution in steps, and asks for as much smaller pictures. Ours are rendered
-    elsewhere and cost the browser little: they keep the resolution of the page.
+    elsewhere and cost the browser little: they keep the resolution of the screen.
     """
     return (
-        "<title>potr_cl</title>"
-        '<script>{ const here = new URL(location); here.searchParams.set("fixedDpr", "1");'
+        '<script>{ const here = new URL(location); here.searchParams.set("fixedDpr", window.devicePixelRatio || 1);'
         ' history.replaceState(null, "", here); }</script>'
         f'<link rel="stylesheet" href="{_FOLDER}/page.css"><script src="{_FOLDER}/page.js" defer></script>'
     )

@@ -111,7 +111,7 @@
       if (state.figures.note) box.append(made("div", "potr-note", state.figures.note));
     },
     curve(box) {
-      if (state.ladder) box.append(curve(state.ladder));
+      if (state.ladder && state.ladder.rungs.some(rung => rung.psnr !== null)) box.append(curve(state.ladder));
     },
     views(box) {
       if (!state.views.length) return;
@@ -212,6 +212,7 @@
           name => JSON.stringify(message.state[name]) !== JSON.stringify(state[name]));
         Object.assign(state, message.state);
         place();
+        document.title = [...state.scenes.map(scene => scene.name), "potr_cl"].join(" – ");
         refresh([...new Set(changed.flatMap(name => PARTS[name] || []))]);
         if (window.parent !== window) window.parent.postMessage("potr_cl viewer", "*");
       }
@@ -231,6 +232,10 @@
       if (socket) socket.close();
       connect();
     }
+    // What holds the panel on a phone.
+    let sheet = document.querySelector("[data-potr=scenes]");
+    while (sheet && sheet.style.maxHeight !== "60%") sheet = sheet.parentElement;
+    if (sheet) sheet.classList.add("potr-sheet");
     refresh([]);
   }
   let settling = false;
@@ -251,6 +256,21 @@
     else if ((event.key === "c" || event.key === "C") && !event.repeat) say({ cameras: true });
     else if (modes[event.key] && !event.repeat) say({ mode: modes[event.key] });
   });
+  // Sliders: viser would turn the camera by the same keys, and the one of qualities has steps that are no files.
+  const sliderOf = event => event.target instanceof Element && event.target.closest("[role=slider]:not(.potr-grip)");
+  addEventListener("keydown", event => {
+    const slider = sliderOf(event), after = document.querySelector("[data-potr=curve]");
+    if (!slider || !state.ladder || !after || !(slider.compareDocumentPosition(after) & Node.DOCUMENT_POSITION_FOLLOWING))
+      return;
+    const last = state.ladder.rungs.length - 1, at = state.ladder.at;
+    const rung = { ArrowLeft: at - 1, ArrowDown: at - 1, ArrowRight: at + 1, ArrowUp: at + 1, Home: 0, End: last }[event.key];
+    if (rung === undefined) return;
+    event.preventDefault();
+    event.stopPropagation();
+    state.ladder.at = Math.min(Math.max(rung, 0), last);
+    say({ rung: state.ladder.at });
+  }, true);
+  const quiet = event => { if (sliderOf(event) && event.key.startsWith("Arrow")) event.stopPropagation(); };
   addEventListener("keyup", event => { if (event.key === "f" || event.key === "F") flick(false); });
   addEventListener("blur", () => flick(false));
 
@@ -321,6 +341,10 @@
     if (!stays) hiding = setTimeout(() => toast.classList.remove("open"), bad ? 12000 : 4000);
   }
 
-  const begin = () => { document.body.append(zones, toast); settle(); };
+  const begin = () => {
+    document.body.append(zones, toast);
+    document.body.addEventListener("keydown", quiet);  // behind the slider, before the camera
+    settle();
+  };
   if (document.body) begin(); else addEventListener("DOMContentLoaded", begin);
 })();

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import struct
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from potr_cl import DataError, Scene, UsageError
-from potr_cl.formats import load_scene
+from potr_cl.formats import load_scene, save_scene
 from potr_cl.model.claims import FREE_SPLATS
 from potr_cl.reference.raster import rotation_matrices, sh_basis
 from potr_cl.reference.scenes import random_scene
@@ -140,6 +141,17 @@ def test_nodes_below_nodes_and_several_meshes(tmp_path: Path) -> None:
     assert len(load_scene(tmp_path / "a.glb")) == 30
 
 
+SPZ = "KHR_gaussian_splatting_compression_spz_2"
+
+
+def opened(path: Path) -> tuple[dict[str, Any], bytes]:
+    """The description and the buffer of a .glb file."""
+    data = path.read_bytes()
+    size = int.from_bytes(data[12:16], "little")
+    assert int.from_bytes(data[8:12], "little") == len(data)
+    return json.loads(data[20 : 20 + size]), data[28 + size :]
+
+
 def kind_of(description: dict[str, Any]) -> dict[str, Any]:
     found: dict[str, Any] = description["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]
     return found
@@ -158,8 +170,8 @@ def names_of(description: dict[str, Any]) -> dict[str, int]:
         (lambda d: d["meshes"][0]["primitives"][0].pop("extensions"), "no Gaussian splats.* mesh or a point cloud"),
         (lambda d: d["nodes"][0].pop("mesh"), "no Gaussian splats"),
         (
-            lambda d: kind_of(d).update(extensions={"KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0}}),
-            "spz_2', whose text is a draft still.*export it without compression, or as .spz",
+            lambda d: kind_of(d).update(extensions={"KHR_gaussian_splatting_compression_spz": {"bufferView": 0}}),
+            "spz', which cannot be read: export it without compression, or as .spz",
         ),
         (lambda d: kind_of(d).update(kernel="gabor"), "kernel is 'gabor': only ellipse"),
         (lambda d: kind_of(d).update(projection="orthographic"), "projection is 'orthographic'"),
@@ -204,6 +216,49 @@ def test_what_is_refused(change: Any, message: str, tmp_path: Path) -> None:
         load_scene(tmp_path / "a.glb")
     assert "\n" not in str(caught.value)
     assert str(tmp_path / "a.glb") in str(caught.value)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_splats_packed_as_spz(degree: int, tmp_path: Path) -> None:
+    scene = random_scene(300, degree)
+    for suffix in ("glb", "spz"):
+        save_scene(tmp_path / f"a.{suffix}", scene)
+    back, expected = (load_scene(tmp_path / f"a.{suffix}") for suffix in ("glb", "spz"))
+    for values, wanted in zip(dataclasses.astuple(back), dataclasses.astuple(expected), strict=True):
+        np.testing.assert_array_equal(values, wanted)
+    assert (tmp_path / "a.glb").stat().st_size < (tmp_path / "a.spz").stat().st_size + 6000
+    description, content = opened(tmp_path / "a.glb")
+    # The rules of glTF, and the names that CesiumJS asks its SPZ reader for.
+    assert content[: description["buffers"][0]["byteLength"]] == (tmp_path / "a.spz").read_bytes()
+    assert set(description["extensionsRequired"]) == {"KHR_gaussian_splatting", f"{PREFIX[:-1]}_compression_spz_2"}
+    assert sorted(names_of(description).values()) == list(range(len(description["accessors"])))
+    assert len(names_of(description)) == 4 + (degree + 1) ** 2 - 1
+    assert all(accessor["count"] == 300 for accessor in description["accessors"])
+    node: dict[str, Any] = NODES["any rotation"]
+    description["nodes"][0].update(node)
+    (tmp_path / "turned.glb").write_bytes(glb(description, content))
+    turned = load_scene(tmp_path / "turned.glb")
+    np.testing.assert_allclose(turned.means, expected.means @ matrix_of(node)[:3, :3].T + (5, 0, 0), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: kind_of(d)["extensions"].update({SPZ: 3}), "is no object"),
+        (lambda d: kind_of(d)["extensions"].update({SPZ: {"bufferView": 1}}), "no 1 among its bufferViews"),
+        (lambda d: kind_of(d)["extensions"].update({SPZ: {}}), "no None among its bufferViews"),
+        (lambda d: d["bufferViews"][0].update(byteLength=200), "damaged or truncated"),
+        (lambda d: d["bufferViews"][0].update(byteOffset=8), "a view does not lie within its buffer"),
+        (lambda d: d["accessors"][0].update(count=31), "not hold as many splats as POSITION"),
+    ],
+)
+def test_damaged_spz_in_it(change: Any, message: str, tmp_path: Path) -> None:
+    save_scene(tmp_path / "a.glb", random_scene(30, 1))
+    description, content = opened(tmp_path / "a.glb")
+    change(description)
+    (tmp_path / "a.glb").write_bytes(glb(description, content))
+    with pytest.raises(DataError, match=message):
+        load_scene(tmp_path / "a.glb")
 
 
 @pytest.mark.parametrize("size", [0, 3, 4, 11, 19, 20, 30, 500, -1])

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import base64
+import gzip
 import json
 import struct
 from random import Random
 from typing import Any
 
+from tools.stress.hostile import spz_files
 from tools.stress.hostile.changes import TEXTS, damaged, damaged_json, damaged_value, interesting, json_bytes
 
 #: A file or several that belong together, by their names; the first is what is read.
@@ -19,8 +21,11 @@ _KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
 def originals() -> list[Files]:
-    """Good .glb files of every SH degree, in floats and in integers."""
-    return [{"a.glb": glb(*asset(5, degree, degree % 2 == 1, Random(degree)))} for degree in range(4)]
+    """Good .glb files of every SH degree, in floats, in integers and as SPZ."""
+    return [
+        *({"a.glb": glb(*asset(5, degree, degree % 2 == 1, Random(degree)))} for degree in range(4)),
+        {"a.glb": glb(*packed_asset(5, 1, Random(0)))},
+    ]
 
 
 def gltf_originals() -> list[Files]:
@@ -95,6 +100,18 @@ def asset(count: int, degree: int, integers: bool, rng: Random) -> tuple[dict[st
     }, content
 
 
+def packed_asset(count: int, degree: int, rng: Random) -> tuple[dict[str, Any], bytes]:
+    """The same with its splats as SPZ."""
+    description, _ = asset(count, degree, False, rng)
+    raw = b"".join(spz_files.sections(2, count, degree, rng))
+    content = gzip.compress(spz_files.legacy(2, count, degree, raw))
+    kind = description["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]
+    kind["extensions"] = {"KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0}}
+    description["buffers"] = [{"byteLength": len(content)}]
+    description["bufferViews"] = [{"buffer": 0, "byteOffset": 0, "byteLength": len(content)}]
+    return description, content
+
+
 def glb(description: Any, content: bytes) -> bytes:
     """A .glb file."""
     text = description if isinstance(description, bytes) else json_bytes(description)
@@ -116,7 +133,11 @@ def _beside(description: Any, content: bytes) -> Files:
 
 
 def _changed_asset(rng: Random) -> tuple[Any, bytes]:
-    description, content = asset(rng.choice((1, 4, 30)), rng.choice((0, 1, 3)), rng.random() < 0.4, rng)
+    count, degree = rng.choice((1, 4, 30)), rng.choice((0, 1, 3))
+    if rng.random() < 0.2:
+        description, content = packed_asset(count, degree, rng)
+    else:
+        description, content = asset(count, degree, rng.random() < 0.4, rng)
     value: Any = description
     kind = rng.randrange(8)
     if kind == 0:
