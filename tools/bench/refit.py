@@ -1,7 +1,7 @@
 """What the joint re-fit of the colours brings and takes.
 
     python -m tools.bench.refit measure SCENE … --json OUT.json [--removed PART …] [--drops X …] [options]
-    python -m tools.bench.refit report OUT.json [--images DIR]
+    python -m tools.bench.refit report OUT.json
 
 A SCENE is a folder with point_cloud.ply, cameras.json with test views and, if it has any, photographs in images.
 ``measure`` looks at
@@ -12,8 +12,7 @@ steps    squared error on training views and PSNR on test views after 0 to 32 co
 cuts     the same number of steps, with a new look at which colours are cut at 0 more or less often
 times    a step's time against a removal sweep's over the same views
 
-``--every N`` looks at every N-th view only, for machines that are slow. ``report`` prints Markdown and draws
-DIR/refit_SCENE.png from such a file.
+``--every N`` looks at every N-th view only, for machines that are slow. ``report`` prints Markdown.
 """
 
 from __future__ import annotations
@@ -327,38 +326,10 @@ def _report(args: argparse.Namespace) -> None:
             f"\nA step {1e3 * t['step']:.1f} ms, a removal sweep {1e3 * t['sweep']:.1f} ms: {t['ratio']:.2f} times. "
             f"Views prepared in {t['prepare']:.2f} s, six steps with all before and after {t['solve_6']:.2f} s.\n"
         )
-        if args.images is not None:
-            _plot(name, entry, keys, args.images / f"refit_{name}.png")
-
-
-def _plot(name: str, entry: dict[str, Any], keys: list[str], path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, len(keys), figsize=(6.4 * len(keys), 4.8), squeeze=False)
-    titles = {"psnr": "PSNR against the uncompressed renders, dB", "truth_psnr": "PSNR against the photographs, dB"}
-    for axis, key in zip(axes[0], keys, strict=True):
-        for way, points in entry["curves"].items():
-            axis.plot([p["bytes"] / 1e6 for p in points], [p[key] for p in points], marker="o", ms=4, label=way)
-        if key in entry["uncompressed"]:
-            axis.axhline(entry["uncompressed"][key], color="0.6", lw=1, ls="--", label="uncompressed")
-        axis.set_xscale("log")
-        axis.set_xlabel("MB")
-        axis.set_ylabel(titles[key])
-        axis.grid(alpha=0.3)
-    axes[0][-1].legend(loc="lower right", fontsize="small")
-    parts = [p["removed"] for p in entry["curves"][PAPER]]
-    figure.suptitle(f"{name}: {min(parts):.0%} to {max(parts):.0%} of {entry['splats']:,} splats removed")
-    figure.tight_layout()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
 
 
 def main() -> None:
-    parser, measure, report = study_parser(__doc__, _measure, _report)
+    parser, measure, _ = study_parser(__doc__, _measure, _report)
     measure.add_argument("--removed", nargs="+", type=float, default=REMOVED, help="parts of the splats")
     measure.add_argument("--drops", nargs="*", type=float, default=DROPS, help="mean squared errors a coefficient")
     measure.add_argument("--quality", type=float, default=0.5)
@@ -368,7 +339,6 @@ def main() -> None:
     measure.add_argument("--prior", type=float, default=RefitOptions.prior)
     measure.add_argument("--most-steps", type=int, default=max(STEPS), help="of the parts steps and cuts")
     measure.add_argument("--every", type=int, default=1, help="look at every N-th view only")
-    report.add_argument("--images", type=Path)
     args = parser.parse_args()
     args.run(args)
 
