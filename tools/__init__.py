@@ -64,7 +64,7 @@ make.benchmarks       the tables and plots of docs/benchmarks, from the results 
 Shared: :mod:`tools.results` (tables that say what they are of), :mod:`tools.workloads` (scenes, views, repeated work),
 :mod:`tools.study.evaluation` (what a candidate loses to its scene), :mod:`tools.study.curves` (points of several runs
 as one curve), :mod:`tools.study.pruning_baselines` (the orders of other pruners), :mod:`tools.stress.cases` (inputs at
-their worst), :mod:`tools.stress.precise` (what they give in float64). Tools import the package and its float64
-definitions (:mod:`potr_cl.reference`), never the tests; kernels of their own are given to a
+their worst), :mod:`tools.stress.precise` (what they give in float64). Tools import the package and the float64
+definitions (:mod:`tests.reference`), no other tests; kernels of their own are given to a
 :class:`potr_cl.opencl.device.Device` as variants. Their own tests are in tools/tests.
 """

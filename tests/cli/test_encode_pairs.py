@@ -9,8 +9,8 @@ import pytest
 from potr_cl import cli
 from potr_cl.cli import COMMANDS
 from potr_cl.formats import save_scene
-from potr_cl.reference.scenes import random_scene
 from tests.cli.calls import cameras_json
+from tests.reference.scenes import random_scene
 
 #: What may be asked for, one at a time; {photos} is a folder of photographs.
 ASKED = {

@@ -14,8 +14,8 @@ from potr_cl import cli
 from potr_cl.cli import guard
 from potr_cl.errors import UsageError
 from potr_cl.formats.scenes import ply
-from potr_cl.reference.scenes import random_scene, ring_of_cameras
 from tests.cli.calls import cameras_json
+from tests.reference.scenes import random_scene, ring_of_cameras
 
 Link = Callable[[Path, Path], None]
 

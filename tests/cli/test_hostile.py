@@ -20,7 +20,7 @@ from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import DataError, PotrError
 from potr_cl.formats.scenes import ply
-from potr_cl.reference.scenes import random_scene
+from tests.reference.scenes import random_scene
 
 ROOT = Path(__file__).parents[2]
 KEEP = ["--no-prune", "--no-compact", "--refit", "off", "--no-quality"]

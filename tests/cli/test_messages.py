@@ -18,7 +18,7 @@ from potr_cl.cli.progress import Progress
 from potr_cl.cli.terminal import note, speak
 from potr_cl.errors import UsageError
 from potr_cl.formats.scenes import ply
-from potr_cl.reference.scenes import random_scene
+from tests.reference.scenes import random_scene
 
 ROOT = Path(__file__).parents[2]
 COMMANDS = next(

@@ -16,11 +16,11 @@ from potr_cl.errors import UsageError
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.presets import DEFAULT, PRESETS, stages_of
-from potr_cl.reference.scenes import random_scene
 from potr_cl.stages.code import Code
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.refit import Refit
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
+from tests.reference.scenes import random_scene
 
 
 def test_no_options_are_the_default_preset():

@@ -12,9 +12,9 @@ from potr_cl.quality.metrics import psnr, ssim
 from potr_cl.quality.metrics_device import Similarity, in_batches
 from potr_cl.quality.pictures import place_pictures, rendered
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.reference.scenes import random_splats
-from potr_cl.reference.scenes import straight_camera as camera
 from tests.devices import KERNELS, open_device
+from tests.reference.scenes import random_splats
+from tests.reference.scenes import straight_camera as camera
 
 
 @pytest.fixture(scope="module", params=KERNELS)

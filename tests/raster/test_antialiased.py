@@ -13,10 +13,10 @@ from potr_cl.model.scene import LOW_PASS, MIP_SPLATTING_LOW_PASS, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer, render
 from potr_cl.raster.rules import GSPLAT, INRIA, LEAST_COMPENSATION, RasterRules
-from potr_cl.reference import raster as reference
-from potr_cl.reference.scenes import plain_splats, random_splats, tilted_camera
-from potr_cl.reference.scenes import straight_camera as camera
 from tests.cases.scenes import antialiased
+from tests.reference import raster as reference
+from tests.reference.scenes import plain_splats, random_splats, tilted_camera
+from tests.reference.scenes import straight_camera as camera
 
 #: A pixel whose every alpha and transmittance stays this far, relatively, from 1/255 and 1e-4 cannot flip.
 CLEAR = 1e-4

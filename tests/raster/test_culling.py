@@ -14,9 +14,9 @@ from potr_cl.model.splat_groups import SplatGroups
 from potr_cl.raster.culling import part_seen, parts_of_views, parts_seen, work
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import GSPLAT, INRIA, RasterRules
-from potr_cl.reference.captures import looking
-from potr_cl.reference.scenes import random_scene
 from tests.devices import FAMILIES, open_device
+from tests.reference.captures import looking
+from tests.reference.scenes import random_scene
 
 
 @pytest.fixture(scope="module", params=FAMILIES)

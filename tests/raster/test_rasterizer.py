@@ -16,10 +16,10 @@ from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer, render
 from potr_cl.raster.rules import GSPLAT, INRIA, RasterRules
 from potr_cl.raster.view_set import TILE, View
-from potr_cl.reference import raster as reference
-from potr_cl.reference.scenes import plain_splats as splats
-from potr_cl.reference.scenes import random_splats, tilted_camera
-from potr_cl.reference.scenes import straight_camera as camera
+from tests.reference import raster as reference
+from tests.reference.scenes import plain_splats as splats
+from tests.reference.scenes import random_splats, tilted_camera
+from tests.reference.scenes import straight_camera as camera
 
 #: A pixel whose every alpha and transmittance stays this far, relatively, from 1/255 and 1e-4 cannot flip.
 CLEAR = 1e-4

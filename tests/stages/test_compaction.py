@@ -10,7 +10,11 @@ import pytest
 
 from potr_cl.errors import DeviceError, UsageError
 from potr_cl.opencl.device import Device
-from potr_cl.reference.ridge import (
+from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor
+from potr_cl.stages.compaction.view_weights import ViewWeights
+from tests.cases.ridges import channels, check_optimal, dense_weights, on_a_sphere, sparse_weights
+from tests.devices import KERNELS, open_device
+from tests.reference.ridge import (
     Ridges,
     compact_channel,
     objective,
@@ -20,11 +24,7 @@ from potr_cl.reference.ridge import (
     usable_columns_of,
     weighted_basis,
 )
-from potr_cl.reference.scenes import random_scene
-from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor
-from potr_cl.stages.compaction.view_weights import ViewWeights
-from tests.cases.ridges import channels, check_optimal, dense_weights, on_a_sphere, sparse_weights
-from tests.devices import KERNELS, open_device
+from tests.reference.scenes import random_scene
 
 
 @pytest.fixture(scope="module", params=KERNELS)

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.reference.ridge import (
-    weighted_basis,
-)
-from potr_cl.reference.scenes import random_scene
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor
 from tests.cases.ridges import channels, check_optimal, dense_weights, on_a_sphere, sparse_weights
 from tests.devices import KERNELS, open_device
+from tests.reference.ridge import (
+    weighted_basis,
+)
+from tests.reference.scenes import random_scene
 
 
 @pytest.fixture(scope="module", params=KERNELS)

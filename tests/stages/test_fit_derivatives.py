@@ -10,12 +10,12 @@ import pytest
 from potr_cl.model.scene import Scene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import GSPLAT, INRIA
-from potr_cl.reference.derivatives import gradient
-from potr_cl.reference.scenes import plain_splats, ring_of_cameras, straight_camera, tilted_camera, visible_scene
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from tests.cases.kinds_of_scenes import KINDS_OF_SCENES
 from tests.devices import KERNELS, open_device
+from tests.reference.derivatives import gradient
+from tests.reference.scenes import plain_splats, ring_of_cameras, straight_camera, tilted_camera, visible_scene
 
 BACKGROUND = (0.3, 0.6, 0.1)
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from potr_cl.raster.rules import GSPLAT, INRIA
-from potr_cl.reference.raster import render
-from potr_cl.reference.scenes import ring_of_cameras, tilted_camera, visible_scene
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from potr_cl.stages.fitting.tangents import PictureTangents
 from tests.cases.kinds_of_scenes import KINDS_OF_SCENES
 from tests.devices import KERNELS, open_device
+from tests.reference.raster import render
+from tests.reference.scenes import ring_of_cameras, tilted_camera, visible_scene
 
 BACKGROUND = (0.3, 0.6, 0.1)
 #: Parameters in the order of the columns, and the columns that end them.

@@ -9,12 +9,12 @@ import pytest
 
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.reference.scenes import ring_of_cameras, visible_scene
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions, SmoothedEffects, choose, prune
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from tests.devices import KERNELS, open_device
+from tests.reference.scenes import ring_of_cameras, visible_scene
 
 OPTIONS = PruningOptions(2e-6, 8)
 

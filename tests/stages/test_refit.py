@@ -12,9 +12,6 @@ from potr_cl.errors import DataError, UsageError
 from potr_cl.model.scene import Scene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
-from potr_cl.reference.refit import LENGTHS, selection, to_rgb, to_ycocg
-from potr_cl.reference.refit_cases import Case, Linearised, Pictures
-from potr_cl.reference.scenes import ring_of_cameras, tilted_camera, visible_scene
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.colour_map import ColourMap
@@ -25,6 +22,9 @@ from potr_cl.stages.refitting.refit import active_coefficients, refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.refitting.vector_space import Layout
 from tests.devices import KERNELS, open_device
+from tests.reference.refit import LENGTHS, selection, to_rgb, to_ycocg
+from tests.reference.refit_cases import Case, Linearised, Pictures
+from tests.reference.scenes import ring_of_cameras, tilted_camera, visible_scene
 
 
 @pytest.fixture(scope="module", params=KERNELS)

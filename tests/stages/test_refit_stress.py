@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from potr_cl.model.camera import Camera
-from potr_cl.reference.refit import to_ycocg
-from potr_cl.reference.refit_cases import Case, Linearised
-from potr_cl.reference.scenes import plain_splats, ring_of_cameras, straight_camera, visible_scene
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from tests.devices import KERNELS, open_device
+from tests.reference.refit import to_ycocg
+from tests.reference.refit_cases import Case, Linearised
+from tests.reference.scenes import plain_splats, ring_of_cameras, straight_camera, visible_scene
 
 
 @pytest.fixture(scope="module", params=KERNELS)

@@ -13,13 +13,13 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
-from potr_cl.reference import raster as reference
-from potr_cl.reference.removal import BruteForce
-from potr_cl.reference.scenes import ring_of_cameras, visible_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions, prune
 from potr_cl.stages.pruning.sweep_options import SweepOptions, default_memory
 from tests.devices import KERNELS, open_device
+from tests.reference import raster as reference
+from tests.reference.removal import BruteForce
+from tests.reference.scenes import ring_of_cameras, visible_scene
 
 
 @pytest.fixture(scope="module", params=KERNELS)

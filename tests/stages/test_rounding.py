@@ -9,16 +9,16 @@ import pyopencl as cl
 import pytest
 
 from potr_cl.outputs.colour_grid import ColourGrid
-from potr_cl.reference.refit import LENGTHS, to_rgb, to_ycocg
-from potr_cl.reference.refit_cases import Case
-from potr_cl.reference.rounding import rounded_in_turn
-from potr_cl.reference.scenes import ring_of_cameras, tilted_camera, visible_scene
 from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.colour_refit import ColourRefit
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.refitting.rounding import TURNS, Round, Rounding, Steps
 from tests.devices import KERNELS, open_device
+from tests.reference.refit import LENGTHS, to_rgb, to_ycocg
+from tests.reference.refit_cases import Case
+from tests.reference.rounding import rounded_in_turn
+from tests.reference.scenes import ring_of_cameras, tilted_camera, visible_scene
 
 
 @pytest.fixture(scope="module", params=KERNELS)

@@ -28,14 +28,14 @@ from potr_cl.opencl.memory import Memory
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
-from potr_cl.reference.derivatives import gradient
-from potr_cl.reference.scenes import ring_of_cameras, visible_scene
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.fitting.adam import Adam, Limits, Rates
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from potr_cl.stages.fitting.pictures import TargetPictures
 from potr_cl.stages.fitting.views import batches
 from potr_cl.stages.refitting.targets import RenderedTargets
+from tests.reference.derivatives import gradient
+from tests.reference.scenes import ring_of_cameras, visible_scene
 from tools.results import Column, Results
 from tools.workloads import read, reduced, scene_parser
 

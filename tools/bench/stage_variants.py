@@ -26,8 +26,6 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import GSPLAT, INRIA
-from potr_cl.reference import raster as reference
-from potr_cl.reference.removal import BruteForce
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, Precision
 from potr_cl.stages.compaction.view_weights import ViewWeights
 from potr_cl.stages.pruning.removal import RemovalSweep
@@ -35,6 +33,8 @@ from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.refitting.targets import RenderedTargets
+from tests.reference import raster as reference
+from tests.reference.removal import BruteForce
 from tools.bench.pruning import Bench, skips
 from tools.bench.tradeoffs import Row
 from tools.workloads import best_of, scaled
@@ -282,7 +282,7 @@ def ridge_errors(scene: Scene, compacted: Scene, centres: F64, weights: Any, opt
 
     Relative to the largest coefficient or 1.
     """
-    from potr_cl.reference.ridge import YCOCG, Ridges, triangles  # needs scipy
+    from tests.reference.ridge import YCOCG, Ridges, triangles  # needs scipy
 
     before, after = scene.sh @ YCOCG.T, compacted.sh @ YCOCG.T
     largest = np.maximum(np.abs(before).max(axis=1), 1)

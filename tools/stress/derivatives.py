@@ -16,10 +16,10 @@ from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory
 from potr_cl.raster.rules import RasterRules
-from potr_cl.reference.derivatives import gradient
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from potr_cl.stages.fitting.tangents import PictureTangents
+from tests.reference.derivatives import gradient
 from tools.stress.precise import F64, ULP
 
 #: Colours, and conditions of covariances, beyond which only finiteness is asked for: brighter ones are cut by design,

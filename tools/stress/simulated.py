@@ -55,8 +55,6 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import GSPLAT, INRIA
 from potr_cl.raster.scene_buffers import gathered, uploaded
 from potr_cl.raster.surely_seen import surely_seen
-from potr_cl.reference import raster as reference
-from potr_cl.reference.scenes import plain_splats, random_splats, straight_camera, tilted_camera
 from potr_cl.stages.compaction.ridge import Compactor
 from potr_cl.stages.compaction.view_weights import ViewWeights
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
@@ -79,6 +77,8 @@ from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.refitting.targets import RenderedTargets
 from potr_cl.stages.refitting.vector_space import Layout
+from tests.reference import raster as reference
+from tests.reference.scenes import plain_splats, random_splats, straight_camera, tilted_camera
 from tools.stress.platforms import check_similarity
 
 #: Kernel families and vector widths.

@@ -10,11 +10,11 @@ import pytest
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import GSPLAT, INRIA
-from potr_cl.reference import raster as reference
-from potr_cl.reference.scenes import random_scene, ring_of_cameras
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from tests.devices import FAMILIES, open_device
+from tests.reference import raster as reference
+from tests.reference.scenes import random_scene, ring_of_cameras
 from tools.study import pruning_baselines as baselines
 from tools.study.pruning_baselines import mesongs_power, removal_order, scores, transmittance_sums
 

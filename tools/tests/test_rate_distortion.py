@@ -12,7 +12,7 @@ import pytest
 
 from potr_cl.errors import UsageError
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.reference.scenes import random_scene
+from tests.reference.scenes import random_scene
 from tools.study import ablation, compare_formats, rate_distortion
 
 

@@ -8,7 +8,7 @@ is half the gradient of the squared error. A view takes three steps:
 2. ``derivatives`` goes back from the pixels to nine sums for each splat (cl/fit/derivatives_cpu.cl and its twin);
 3. ``chain`` goes back from those to the splat's parameters (cl/fit/chain.cl).
 
-What the rasterizer decides by comparing numbers is taken as constant (:mod:`potr_cl.reference.derivatives` lists it).
+What the rasterizer decides by comparing numbers is taken as constant (:mod:`tests.reference.derivatives` lists it).
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.model.spherical_harmonics import ac_basis
-from potr_cl.reference.surfaces import facing, points_on_box, together
+from tests.reference.surfaces import facing, points_on_box, together
 
 F64 = NDArray[np.float64]
 Capture = tuple[Scene, list[Camera]]

@@ -1,7 +1,7 @@
 """Float64 definition of a picture's derivatives with respect to the splats' parameters, in plain numpy.
 
 :func:`gradient` is the transposed product Jᵀ v: J has a row for each pixel and channel of
-:func:`potr_cl.reference.raster.render`, a column for each parameter, and v is a number for each pixel and channel. If v
+:func:`tests.reference.raster.render`, a column for each parameter, and v is a number for each pixel and channel. If v
 is the derivative of some loss by the pixels, Jᵀ v is that of the loss by the parameters.
 
 Whatever the rasterizer decides by comparing numbers is taken as constant: the depth order, which alphas are skipped or
@@ -17,7 +17,7 @@ import numpy as np
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.raster.rules import LEAST_COMPENSATION, RasterRules
-from potr_cl.reference.raster import Array, Projected, footprint, project, rotation_matrices, sh_basis
+from tests.reference.raster import Array, Projected, footprint, project, rotation_matrices, sh_basis
 
 #: Of a central difference of the SH basis by the direction: exact to 1e-10, as the basis is a cubic polynomial.
 _STEP = 1e-5

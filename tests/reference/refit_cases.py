@@ -13,13 +13,13 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.reference.refit import Array, Reference
 from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.colour_refit import ColourRefit
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
 from potr_cl.stages.refitting.targets import RenderedTargets, Targets
+from tests.reference.refit import Array, Reference
 
 
 class Case:

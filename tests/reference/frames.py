@@ -17,8 +17,8 @@ from potr_cl.model.quaternions import quaternions_of
 from potr_cl.model.scene import Scene
 from potr_cl.model.sh_rotation import rotated_sh
 from potr_cl.model.virtual_cameras import place_cameras
-from potr_cl.reference.captures import looking
-from potr_cl.reference.raster import rotation_matrices
+from tests.reference.captures import looking
+from tests.reference.raster import rotation_matrices
 
 F64 = NDArray[np.float64]
 

@@ -8,8 +8,8 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.reference.raster import sh_basis
 from potr_cl.stages.compaction.view_weights import ViewWeights
+from tests.reference.raster import sh_basis
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from potr_cl.model.camera import Camera
 from potr_cl.raster.rules import RasterRules
 from potr_cl.raster.view_set import TILE
-from potr_cl.reference.raster import Projected
+from tests.reference.raster import Projected
 
 F64 = NDArray[np.float64]
 

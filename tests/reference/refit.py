@@ -1,6 +1,6 @@
 """The joint re-fit of the colours in float64: the linear map written out, the objective, the least-squares solution.
 
-The map follows the picture of :mod:`potr_cl.reference.raster`: a pixel is the sum over the splats of T alpha times the
+The map follows the picture of :mod:`tests.reference.raster`: a pixel is the sum over the splats of T alpha times the
 splat's colour, a colour is 0.5 + the SH basis times the coefficients, R = Y + Co - Cg, G = Y + Cg, B = Y - Co - Cg.
 """
 
@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.raster.rules import INRIA
-from potr_cl.reference import raster as reference
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
+from tests.reference import raster as reference
 
 Array = NDArray[np.float64]
 
