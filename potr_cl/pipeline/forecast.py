@@ -27,7 +27,8 @@ from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.view_cache import GEOMETRY
 from potr_cl.stages.between.amount import most_needed, needed_of_virtual
 from potr_cl.stages.compact import Compact
-from potr_cl.stages.fit import Fit
+from potr_cl.stages.fit import ITERATIONS, Fit
+from potr_cl.stages.fitting.fit import FitOptions
 from potr_cl.stages.fitting.memory import fit_bytes
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.pruning.sweep_options import default_memory
@@ -194,8 +195,8 @@ def _work(
             steps += fit.photograph_steps_on(device.family, len(cameras))
         else:
             steps += fit.further_steps_on(device.family)
-        of_fit = steps * fit.batch * units.fit * (_NONE_LEFT + (1 - _NONE_LEFT) * options.q / 0.5)
-        of_fit += views * (fit.views_on(device.family) + units.prepare + units.iteration * fit.iterations)
+        of_fit = steps * FitOptions.batch * units.fit * (_NONE_LEFT + (1 - _NONE_LEFT) * options.q / 0.5)
+        of_fit += views * (fit.views_on(device.family) + units.prepare + units.iteration * ITERATIONS)
         pictures += of_fit
         splats += of_fit * left
     if Compact.name in parts:
@@ -263,7 +264,7 @@ def _memory(
     fit = next((stage for stage in options.stages if isinstance(stage, Fit) and stage.asked_for), None)
     if fit is not None and fit.looks_at(scene):
         pixels = float(np.mean([camera.width * camera.height for camera in cameras]))
-        together = fit.batch if device.family == "gpu" else 1
+        together = FitOptions.batch if device.family == "gpu" else 1
         view = sampled.nbytes - PIXEL * pixels
         needed = fit_bytes(len(scene), len(scene), 3 * scene.sh.shape[1], together, int(views), view, pixels, budget)
         memory = max(memory, needed)

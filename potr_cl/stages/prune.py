@@ -53,7 +53,7 @@ class Prune(Stage):
         iterations, decay, mapping_a: of the schedule (:class:`potr_cl.stages.pruning.schedule.PruningOptions`).
         unseen: "keep" or "drop": what becomes of splats that no training view's picture reaches
             (:mod:`potr_cl.model.unseen`). With ``keep`` or ``count`` they go first in any case.
-        tolerance, turns, tighten, transmittance_threshold, sample, sampled, seed: of the measurements
+        tolerance, turns, transmittance_threshold: of the measurements
             (:class:`potr_cl.stages.pruning.sweep_options.SweepOptions`).
 
     Raises:
@@ -120,11 +120,7 @@ class Prune(Stage):
             choices=CHOICES,
         ),
     )
-    tighten: bool = option(SweepOptions.tighten)
     transmittance_threshold: float | None = option(SweepOptions.transmittance_threshold)
-    sample: float = option(SweepOptions.sample)
-    sampled: int = option(SweepOptions.sampled)
-    seed: int = option(SweepOptions.seed)
 
     def __post_init__(self) -> None:
         if self.keep is not None and not 0 < self.keep <= 1:
@@ -144,11 +140,7 @@ class Prune(Stage):
             tolerance=self.tolerance,
             turns=self.turns,
             memory=memory,
-            tighten=self.tighten,
             transmittance_threshold=self.transmittance_threshold,
-            sample=self.sample,
-            sampled=self.sampled,
-            seed=self.seed,
         )
 
     def _schedule(self, delta_mse_max: float, splats: int) -> PruningOptions:

@@ -393,9 +393,7 @@ def test_what_does_not_pay_is_left_out(family_device, steps, further, price):
     assert after.survivors is before.survivors
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"further": -0.5}, {"cycles": 0}, {"iterations": 0}, {"finer": -1}, {"between": -1}], ids=str
-)
+@pytest.mark.parametrize("wrong", [{"further": -0.5}, {"cycles": 0}, {"finer": -1}, {"between": -1}], ids=str)
 def test_an_option_of_the_stage_that_is_out_of_range(wrong):
     with pytest.raises(UsageError, match="the fit"):
         Fit(**wrong)

@@ -316,10 +316,7 @@ def ridge_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]:
     weights = measured_weights(Device(info), scene, views)
     for family in families(info):
         device = profiled(info, family)
-        doubles = "cl_khr_fp64" in info.handle.extensions.split()
         for precision in get_args(Precision):
-            if precision == "fp64" and not doubles:
-                continue
             # λ 0.01 and no column dropped: as hard as it gets.
             options = CompactionOptions(lam=0.01, alpha=1, precision=precision)
             compactor = Compactor(device)

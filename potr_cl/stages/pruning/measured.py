@@ -56,8 +56,7 @@ def measurement(
 
     device, pool, views = bench.opened, bench.pool, state.views
     splats = len(state.scene) if seen is None else len(seen)
-    # A sample of the tiles is drawn from all of them in turn, so one device does it.
-    share = None if pool is None or options.sample < 1 else shares(pool, len(views))
+    share = None if pool is None else shares(pool, len(views))
     with ExitStack() as stack:
         if pool is None or share is None or not share.others:
             if sights is not None:
