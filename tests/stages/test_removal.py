@@ -238,9 +238,6 @@ def test_a_removal_lets_pixels_go_on(device):
         {"transmittance_threshold": 0.0},
         {"transmittance_threshold": 1.0},
         {"transmittance_threshold": np.nan},
-        {"sample": 0.0},
-        {"sample": 1.5},
-        {"sampled": -1},
     ],
 )
 def test_options_out_of_range(bad):
