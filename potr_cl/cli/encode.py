@@ -174,7 +174,7 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Non
             if cameras is None and device is not None:
                 cameras = virtual_cameras(args, scene, placing)
             if device is not None and cameras is not None:
-                tell_what_is_ahead(device, scene, cameras, options, target is not None, kept)
+                tell_what_is_ahead(device, scene, cameras, options, kept)
             views = EvaluationViews.of(cameras) if cameras is not None and not args.no_quality else None
             if args.report_view is not None:
                 _ = views and views.named(args.report_view)  # an unknown name is told before the work

@@ -10,6 +10,9 @@ from tqdm import tqdm
 
 from potr_cl.cli.terminal import is_quiet, is_terminal, note
 
+#: Part of a stage from which on its time tells that of the rest; and seconds of the rest that are worth a line.
+_ENOUGH, _LONG = 0.05, 20
+
 
 class Progress:
     """A bar with the time left on a terminal; elsewhere a line when a stage begins and one when it has ended.
@@ -24,6 +27,7 @@ class Progress:
         self._bar: Any = None
         self._began: dict[str, float] = {}
         self._told: set[str] = set()
+        self._foretold: set[str] = set()
         #: The stage that has come to its end, and its line, while it is not certain that it does not go on.
         self._ended: tuple[str, str] | None = None
 
@@ -36,6 +40,8 @@ class Progress:
             self._begin(stage, done)
         if self._bar is not None:
             self._bar.update(done - self._bar.n)
+        elif stage in self._began and stage not in self._foretold and done >= _ENOUGH:
+            self._foretell(stage, done)
         if done >= 1:
             self._end_bar()
             if stage in self._began:
@@ -62,6 +68,13 @@ class Progress:
         if stage not in self._told:
             self._began.setdefault(stage, time.perf_counter())
 
+    def _foretell(self, stage: str, done: float) -> None:
+        """In a log: how long a stage will go on, if it goes on for long, by what its first part took."""
+        left = (time.perf_counter() - self._began[stage]) * (1 - done) / done
+        self._foretold.add(stage)
+        if left >= _LONG:
+            note(f"{stage}: about {duration(left)} left")
+
     def _tell_end(self) -> None:
         if self._ended is not None:
             stage, line = self._ended
@@ -74,3 +87,11 @@ class Progress:
         if self._bar is not None:
             self._bar.close()
             self._bar = None
+
+
+def duration(seconds: float) -> str:
+    """As roughly as it is known: "40 s", "2.5 min", "3.1 h"."""
+    for unit, name in ((3600, "h"), (60, "min")):
+        if seconds >= 2 * unit:
+            return f"{seconds / unit:.1f} {name}" if seconds < 10 * unit else f"{seconds / unit:.0f} {name}"
+    return f"{max(seconds, 1):.0f} s"
