@@ -104,8 +104,10 @@ def refused(capsys: pytest.CaptureFixture[str], folder: Path, arguments: list[st
     assert contents(folder) == before
 
 
-@pytest.mark.parametrize("link", LINKS)
-@pytest.mark.parametrize(("call", "target"), CALLS)
+@pytest.mark.parametrize(
+    ("call", "target", "link"),
+    [*((*CALLS[0], link) for link in LINKS), *((*call, LINKS[n % 2]) for n, call in enumerate(CALLS[1:]))],
+)
 def test_an_output_that_is_an_input(
     folder: Path,
     capsys: pytest.CaptureFixture[str],
