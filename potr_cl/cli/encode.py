@@ -170,7 +170,7 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Non
         page = stack.enter_context(replacing(args.report)) if args.report is not None else None
         placing = Stopwatch(progress)
         search: dict[str, Any] | None = None
-        with writing(args.output, options.output.suffix) as file:
+        with writing(args.output) as file:
             if cameras is None and device is not None:
                 cameras = virtual_cameras(args, scene, placing)
             if device is not None and cameras is not None:
