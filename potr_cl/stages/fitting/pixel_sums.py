@@ -25,7 +25,6 @@ class PixelSums:
             the target, times ``unit``.
         unit: see there.
         scale: the views' fixed point.
-        errors: (tiles,) float32, becomes each tile's sum of v².
         totals: (views, stride, 9) int64, the sums are added to them.
     """
 
@@ -36,7 +35,6 @@ class PixelSums:
     given: bool
     unit: float
     scale: float
-    errors: cl.Buffer
     totals: cl.Buffer
 
     @property
@@ -57,7 +55,6 @@ class PixelSums:
             "given": self.given,
             "unit": self.unit,
             "scale": self.scale,
-            "errors": self.errors,
             "totals": self.totals,
         }
 
