@@ -32,7 +32,6 @@ from potr_cl.stages.pruning.unseen import (
 )
 from potr_cl.stages.pruning.visible_parts import LARGEST_LIMIT, LIKELY, groups_of_large, seen_part, sights_worth_it
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
-from potr_cl.workers.dealing import speeds_of
 from potr_cl.workers.pool import Pool
 
 #: Of the time of all iterations, what the first measurement takes, which looks at all of every view; the others look at
@@ -283,7 +282,7 @@ def _dealt(state: State, seen: NDArray[np.int64] | None, pool: Pool, sights: Sig
     source, numbers = (state.source, state.survivors) if state.is_cut else (state.scene, np.arange(len(state.scene)))
     names = [worker.name for worker in workers]
     splats = numbers if seen is None else numbers[seen]
-    return ViewShares.of(state.views, sights, speeds_of(workers), source, splats, names)
+    return ViewShares.of(state.views, sights, [1.0] * len(workers), source, splats, names)
 
 
 class _Course:

@@ -87,9 +87,7 @@ def measurement(
             sent = stack.enter_context(bench.shared(pool, state, seen))
             sights = sights if pool.in_process else None
             given = [(sent, views, options, bench.background, numbers, sights) for numbers in share.others]
-        others = stack.enter_context(
-            Parts(pool, RemovalPart, given, options.memory, [len(each) for each in share.others], share.names)
-        )
+        others = stack.enter_context(Parts(pool, RemovalPart, given, options.memory, share.names))
         own: RemovalSweep | ViewByView | None = None
         stride = splats
         if share.own:
