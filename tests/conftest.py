@@ -26,25 +26,18 @@ SCENES = Path(__file__).parents[2] / "shared" / "scenes"
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out, visibly, what a second OpenCL runtime would only repeat (tests/devices.py).
-
-    And mark as slow what the other kernel family would only repeat.
-    """
+    """Leave out, visibly, what a second OpenCL runtime or the other kernel family would only repeat."""
 
     def repeats(item: pytest.Item) -> bool:
         parameters = getattr(item, "callspec", None)
-        second = parameters is not None and any(str(value).endswith("-pocl") for value in parameters.params.values())
-        return second and item.get_closest_marker("one_runtime") is not None
+        values = [] if parameters is None else [str(value) for value in parameters.params.values()]
+        second = any(value.endswith("-pocl") for value in values) and item.get_closest_marker("one_runtime") is not None
+        return second or ("gpu" in values and item.get_closest_marker("one_family") is not None)
 
     repeated = [item for item in items if repeats(item)]
     if repeated:
         config.hook.pytest_deselected(items=repeated)
         items[:] = [item for item in items if item not in set(repeated)]
-    for item in items:
-        parameters = getattr(item, "callspec", None)
-        on_gpu_kernels = parameters is not None and any(str(value) == "gpu" for value in parameters.params.values())
-        if on_gpu_kernels and item.get_closest_marker("one_family") is not None:
-            item.add_marker(pytest.mark.slow)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -2,7 +2,7 @@
 
 A result is a title, the machine, the date, the commit and the command that made it, columns and rows of figures::
 
-    {"stages": {"title": …, "machine": …, "date": "2026-01-31", "commit": …, "command": ["python -m tools.bench.busy"],
+    {"stages": {"title": …, "machine": …, "date": "2026-01-31", "commit": …, "command": ["python -m tools.bench.fit"],
                 "columns": [{"name": "stage"}, {"name": "wall", "unit": "ms", "format": ".0f"}],
                 "rows": [["prune", 731.2], …]}}
 

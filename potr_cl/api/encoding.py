@@ -25,7 +25,6 @@ from potr_cl.errors import UsageError
 from potr_cl.formats.images import Colour
 from potr_cl.host.atomic_write import replacing
 from potr_cl.host.mapped import bounded
-from potr_cl.host.rescue import replacing_or_keeping
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
@@ -150,7 +149,7 @@ def encode(
         opened, pool = (None, None) if workers is None else (workers.device, workers.pool)
         before = Traffic() if pool is None else replace(pool.traffic)
         own = stack.enter_context(contextlib.ExitStack())
-        file = own.enter_context(replacing_or_keeping(output)) if output is not None else None
+        file = own.enter_context(replacing(output)) if output is not None else None
         page = stack.enter_context(replacing(report)) if report is not None else None
         found: Found | None = None
         kept: KeptScene | None = None

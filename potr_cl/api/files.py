@@ -24,7 +24,6 @@ from potr_cl.codec.decoder import decode as decode_file
 from potr_cl.codec.decoder import open_file
 from potr_cl.errors import DataError, UsageError
 from potr_cl.host.atomic_write import check_place, replacing
-from potr_cl.host.rescue import written_or_kept
 from potr_cl.model.box import Box
 from potr_cl.model.scene import Scene
 
@@ -58,13 +57,13 @@ def save(scene: SceneSource, path: str | os.PathLike[str]) -> None:
 
 
 def result_writer(output: str | os.PathLike[str] | None) -> Callable[[Scene], None] | None:
-    """What writes a scene that takes long to make: where the system fails to write it, it is kept elsewhere.
+    """What writes a scene that takes long to make.
 
     Args:
         output: the file; None: nothing is to be written.
 
     Returns:
-        Takes the scene, and raises as :func:`potr_cl.host.rescue.written_or_kept`; None if there is nothing to write.
+        Takes the scene, and raises as :func:`potr_cl.formats.save_scene`; None if there is nothing to write.
 
     Raises:
         UsageError: no scene can be written to a file of this name, or no file there.
@@ -73,9 +72,9 @@ def result_writer(output: str | os.PathLike[str] | None) -> Callable[[Scene], No
         return None
     from potr_cl.formats import scene_writer
 
-    _ = scene_writer(output)  # a wrong name is told before anything is made
+    write = scene_writer(output)  # a wrong name is told before anything is made
     check_place(output)
-    return lambda scene: written_or_kept(output, lambda path: scene_writer(path)(scene))
+    return write
 
 
 def convert(

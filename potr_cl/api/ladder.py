@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,6 @@ from potr_cl.formats.ladder import DESCRIPTION, Ladder, Rung, qualities
 from potr_cl.formats.registry import stem_of_scene
 from potr_cl.host.atomic_write import replacing
 from potr_cl.host.mapped import bounded
-from potr_cl.host.rescue import replacing_or_keeping, written_or_kept
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
@@ -161,7 +159,7 @@ def make_ladder(
     rungs = []
     # The uncompressed scene stays on the device from one quality to the next, where there is room.
     with (
-        replacing_or_keeping(files[-1]) as description,  # a folder that takes no file is told before the work
+        replacing(files[-1]) as description,  # a folder that takes no file is told before the work
         nullcontext() if device is None else KeptScene(device, scene, options.memory) as kept,
     ):
         for q, file in zip(steps, files[:-1], strict=True):
@@ -170,7 +168,8 @@ def make_ladder(
             judged_on = None if views is None else encoded.device or device
             with proved(encoded, trust, judged_on) as written:
                 nbytes, splats = len(written.data), len(written.scene)
-                written_or_kept(file, partial(_write, written.data))
+                with replacing(file) as target:
+                    target.write(written.data)
                 if views is not None and judged_on is not None:
                     judge = Judge(views, judged_on, options.background, kept=kept, pool=pool)
                     quality, _ = judge(scene, written, Stopwatch(progress))
@@ -183,8 +182,3 @@ def make_ladder(
         ladder = Ladder(files[-1], name.name, options.source_bytes, judged_by, tuple(rungs))
         description.write(ladder.encoded())
     return ladder
-
-
-def _write(data: bytes, path: Path) -> None:
-    with replacing(path) as file:
-        file.write(data)

@@ -180,11 +180,11 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Row
         page = stack.enter_context(replacing(args.report)) if args.report is not None else None
         placing = Stopwatch(progress)
         search: dict[str, Any] | None = None
-        with writing(args.output, options.output.suffix) as file:
+        with writing(args.output) as file:
             if cameras is None and device is not None:
                 cameras = virtual_cameras(args, scene, placing, device)
             if device is not None and cameras is not None:
-                tell_what_is_ahead(device, scene, cameras, options, target is not None, kept)
+                tell_what_is_ahead(device, scene, cameras, options, kept)
             views = EvaluationViews.of(cameras) if cameras is not None and not args.no_quality else None
             if args.report_view is not None:
                 _ = views and views.named(args.report_view)  # an unknown name is told before the work

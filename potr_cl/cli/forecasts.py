@@ -1,15 +1,15 @@
-"""What is said before long work: on which device it is done, and what it will take."""
+"""What is said before long work: on which device it is done, and the memory that it will take."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from potr_cl.cli.terminal import duration, is_quiet, note
+from potr_cl.cli.terminal import is_quiet, note
 from potr_cl.errors import DeviceError
 from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.forecast import forecast
+from potr_cl.pipeline.forecast import memory_needed
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.kept_scene import KeptScene
 
@@ -22,14 +22,12 @@ def tell_what_is_ahead(
     scene: Scene,
     cameras: Sequence[Camera],
     options: EncodeOptions,
-    search: bool = False,
     kept: KeptScene | None = None,
 ) -> None:
-    """A line with the device and its kernels; and where the work may take long, one with roughly its time and memory.
+    """A line with the device and its kernels; and where the work may take long, one with roughly its memory.
 
     Args:
         cameras: of which the training views are looked at.
-        search: whether the encode is repeated to meet a size or a PSNR.
         kept: the scene on the device, if it lies there already.
 
     Raises:
@@ -44,13 +42,11 @@ def tell_what_is_ahead(
     note(f"on {device.info}, kernels for {device.family.upper()}s: {work}")  # at once: to measure takes seconds
     if len(scene) * len(views) >= _LONG:
         try:
-            ahead = forecast(scene, views, options, device, search, kept)
+            memory = memory_needed(scene, views, options, device, kept)
         except DeviceError as error:
             note(f"no forecast: {error}", "detail")  # the encode goes on with less memory, or elsewhere
         else:
-            note(f"one view takes {1000 * ahead.sampled:.1f} ms", "detail")
-            where = "" if device.info.kind == "cpu" else " of the device"
-            note(f"about {duration(ahead.seconds)} and {_size(ahead.memory)} of memory{where}")
+            note(f"about {_size(memory)} of memory{'' if device.info.kind == 'cpu' else ' of the device'}")
 
 
 def _size(nbytes: float) -> str:

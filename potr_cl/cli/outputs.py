@@ -10,14 +10,13 @@ import argparse
 import contextlib
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Protocol
 
 from potr_cl.cli.guard import StandardOutput, WrittenFile, WrittenFolder, named
 from potr_cl.errors import UsageError, WriteError
-from potr_cl.host.atomic_write import check_place
-from potr_cl.host.rescue import kept_elsewhere, replacing_or_keeping
+from potr_cl.host.atomic_write import check_place, replacing
 from potr_cl.host.standard_files import closed, standard_output_for_data
 
 
@@ -148,18 +147,14 @@ class Result(Protocol):
 
 
 @contextlib.contextmanager
-def writing(path: Path, suffix: str) -> Iterator[Result]:
-    """A file or standard output, for what takes long to make: if it cannot go there, it is kept elsewhere.
-
-    Args:
-        path: of the file, or standard output.
-        suffix: of the file that is kept where standard output does not take it.
+def writing(path: Path) -> Iterator[Result]:
+    """A file or standard output, for a result that is handed over whole.
 
     Raises:
-        As :func:`potr_cl.host.rescue.replacing_or_keeping`.
+        As :func:`potr_cl.host.atomic_write.replacing`; also that standard output does not take it.
     """
     if not isinstance(path, StandardOutput):
-        with replacing_or_keeping(path) as file:
+        with replacing(path) as file:
             yield file
         return
     result = _Streamed()
@@ -168,21 +163,12 @@ def writing(path: Path, suffix: str) -> Iterator[Result]:
         path.stream.write(result.content)
         path.stream.flush()
     except OSError as error:
-        raise not_streamed(error, suffix, lambda where: where.write_bytes(result.content)) from error
+        raise not_streamed(error) from error
 
 
-def not_streamed(error: OSError | WriteError, suffix: str, write: Callable[[Path], object]) -> WriteError:
-    """What to raise where standard output does not take a result that took long to make, which is kept elsewhere.
-
-    Args:
-        error: what the system says; also that the reader has gone.
-        suffix: of the file that is kept.
-        write: as of :func:`potr_cl.host.rescue.written_or_kept`.
-    """
-    failure = error
-    if isinstance(failure, OSError):
-        failure = WriteError(f"cannot write to standard output: {failure.strerror or failure}")
-    return kept_elsewhere(failure, f"result{suffix}", write)
+def not_streamed(error: OSError) -> WriteError:
+    """What to raise where standard output does not take a result; also that the reader has gone."""
+    return WriteError(f"cannot write to standard output: {error.strerror or error}")
 
 
 class _Streamed:

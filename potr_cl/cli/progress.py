@@ -19,6 +19,8 @@ _BAR = "{desc}: {percentage:3.0f}% |{bar}| {elapsed} elapsed, {remaining} left"
 _CLOCK = "{desc}: {elapsed} elapsed"
 #: A stage that goes on from here has only something left to do that it cannot measure.
 _NEARLY = 0.99
+#: Part of a stage from which on its time tells that of the rest; and seconds of the rest that are worth a line.
+_ENOUGH, _LONG = 0.05, 20
 
 
 class Progress:
@@ -35,6 +37,7 @@ class Progress:
         self._bar: Any = None
         self._began: dict[str, float] = {}
         self._told: set[str] = set()
+        self._foretold: set[str] = set()
         #: The stage that has come to its end, and its line, while it is not certain that it does not go on.
         self._ended: tuple[str, str] | None = None
         self._lock = threading.RLock()
@@ -67,6 +70,8 @@ class Progress:
                 self._stage = ""
             elif self._bar is not None:
                 self._bar.update(done - self._bar.n)
+            elif stage in self._began and stage not in self._foretold and done >= _ENOUGH:
+                self._foretell(stage, done)
 
     def tell(self, line: str) -> None:
         """Print a line of its own."""
@@ -93,6 +98,13 @@ class Progress:
     def _show(self, what: str, form: str, done: float = 0.0) -> None:
         self._bar = tqdm(total=1.0, initial=done, desc=what, bar_format=form, leave=False, smoothing=0)
 
+    def _foretell(self, stage: str, done: float) -> None:
+        """In a log: how long a stage will go on, if it goes on for long, by what its first part took."""
+        left = (time.perf_counter() - self._began[stage]) * (1 - done) / done
+        self._foretold.add(stage)
+        if left >= _LONG:
+            note(f"{stage}: about {duration(left)} left")
+
     def _tell_end(self) -> None:
         if self._ended is not None:
             stage, line = self._ended
@@ -105,3 +117,11 @@ class Progress:
         if self._bar is not None:
             self._bar.close()
             self._bar = None
+
+
+def duration(seconds: float) -> str:
+    """As roughly as it is known: "40 s", "2.5 min", "3.1 h"."""
+    for unit, name in ((3600, "h"), (60, "min")):
+        if seconds >= 2 * unit:
+            return f"{seconds / unit:.1f} {name}" if seconds < 10 * unit else f"{seconds / unit:.0f} {name}"
+    return f"{max(seconds, 1):.0f} s"

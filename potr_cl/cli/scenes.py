@@ -14,12 +14,11 @@ from potr_cl.api.inputs import drawable_to_judge
 from potr_cl.cli.guard import StandardInput, StandardOutput
 from potr_cl.cli.outputs import not_streamed
 from potr_cl.cli.terminal import note
-from potr_cl.errors import UsageError, WriteError
+from potr_cl.errors import UsageError
 from potr_cl.formats import load_scene, scene_writer
 from potr_cl.formats.scene_size import bytes_of_scene
 from potr_cl.formats.scenes import spz
 from potr_cl.formats.streams import received, send
-from potr_cl.host.rescue import written_or_kept
 from potr_cl.host.standard_files import closed
 from potr_cl.model.scene import Scene
 
@@ -135,18 +134,15 @@ def write_scene(path: Path, scene: Scene, to: str | None = None, version: int | 
 
 
 def write_result(path: Path, scene: Scene, to: str | None = None) -> None:
-    """As :func:`write_scene`, for what takes long to make: if it cannot go there, it is kept elsewhere.
+    """As :func:`write_scene`, for what takes long to make: also a reader that has gone is an error.
 
     Raises:
-        As :func:`potr_cl.host.rescue.written_or_kept`.
+        WriteError: it cannot be written.
     """
-    if not isinstance(path, StandardOutput):
-        written_or_kept(path, lambda where: scene_writer(where)(scene))
-        return
     try:
         write_scene(path, scene, to)
-    except (OSError, WriteError) as error:
-        raise not_streamed(error, to or ".ply", lambda where: scene_writer(where)(scene)) from error
+    except OSError as error:
+        raise not_streamed(error) from error
 
 
 def size_of_file(path: Path) -> int | None:

@@ -99,6 +99,8 @@ def virtual_cameras(args: argparse.Namespace, scene: Scene, progress: Progress, 
     progress("place cameras", 1.0)
     scene_file = getattr(args, "scene", None)
     folder = None if scene_file is None or isinstance(scene_file, StandardInput) else cameras_beside(scene_file)
-    better = f"--cameras beside takes those in '{folder}'" if folder else "with the real cameras the file would be smaller"
+    better = (
+        f"--cameras beside takes those in '{folder}'" if folder else "with the real cameras the file would be smaller"
+    )
     note(f"no --cameras given: {describe(cameras)}; {better}")
     return cameras

@@ -349,7 +349,7 @@ def rotation_factors(scales: Sequence[NDArray[np.integer]], sf_rotation: float) 
     """(N,) a scale factor for each splat's rotation: SF times the root of the largest of its three scales' levels.
 
     Long splats need their direction more exactly; the root is the best power by measurement
-    (docs/benchmarks/quantisers.md).
+    (docs/benchmarks/findings.md).
     """
     largest = np.maximum(np.maximum(scales[0], scales[1]), scales[2])
     factors: F32 = np.sqrt(np.maximum(largest, 1).astype(np.float32)) * np.float32(sf_rotation)

@@ -249,26 +249,6 @@ def json_cameras() -> str:
     return listed([f"a {entry.name} ({entry.json_mark})" for entry in CAMERA_FORMATS if entry.json_mark], "nor")
 
 
-def formats_table() -> str:
-    """All formats as Markdown, for docs/formats.md: a table of scenes and one of cameras."""
-    scenes = [
-        [
-            f"{entry.name} ({', '.join(f'`{name}`' for name in (*entry.suffixes, *entry.names))})",
-            "yes",
-            "no" if entry.save is None else "yes",
-            _needs(entry.extra),
-            entry.note,
-        ]
-        for entry in SCENE_FORMATS
-    ]
-    cameras = [
-        [entry.name, "yes", "no", _needs(entry.extra), entry.note]
-        for entry in sorted(CAMERA_FORMATS, key=lambda entry: entry.extra is not None)
-    ]
-    columns = ["reads", "writes", "needs", "note"]
-    return "\n\n".join([_table(["scenes", *columns], scenes), _table(["cameras", *columns], cameras)])
-
-
 def listed(items: Sequence[str], word: str = "or") -> str:
     """Items as an English list: "a", "a or b", "a, b or c"."""
     return f" {word} ".join([", ".join(items[:-1]), items[-1]]) if len(items) > 1 else "".join(items)
@@ -276,11 +256,3 @@ def listed(items: Sequence[str], word: str = "or") -> str:
 
 def _scene_suffixes(formats: Iterable[SceneFormat]) -> list[str]:
     return [suffix for entry in formats for suffix in entry.suffixes]
-
-
-def _needs(extra: str | None) -> str:
-    return "nothing" if extra is None else f"the extra `{extra}`"
-
-
-def _table(head: list[str], rows: list[list[str]]) -> str:
-    return "\n".join(f"| {' | '.join(row)} |" for row in [head, ["---"] * len(head), *rows])

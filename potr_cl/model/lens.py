@@ -107,11 +107,6 @@ class Lens:
         if not found.all():
             raise DataError("its lens distortion folds the picture over: the coefficients do not fit the focal length")
 
-    @property
-    def bends(self) -> bool:
-        """Whether it is anything else than a pinhole."""
-        return self.fisheye or any((*self.radial, *self.quotient, *self.tangential, *self.prism))
-
     def distorted(self, x: F64, y: F64) -> tuple[F64, F64]:
         """Where points of the image plane, of any shape, are in the photograph, in focal lengths from its middle."""
         if self.fisheye:

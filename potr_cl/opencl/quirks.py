@@ -108,7 +108,7 @@ CALLED_BUILTINS = Quirk(
     vendor="PoCL",
     versions="3.0 and 3.1",
     reason="built-in functions such as mad and fma stay calls: they alone doubled a kernel's time",
-    still_needed="make MAD the function mad and run tools/bench/kernels.py",
+    still_needed="make MAD the function mad and run tools.bench.rasterizer",
     test=lambda platform, version: is_pocl(platform),
 )
 

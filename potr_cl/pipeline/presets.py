@@ -62,26 +62,3 @@ PURPOSE: dict[Preset, str] = {
 def stages_of(preset: Preset) -> tuple[type[Stage], ...]:
     """The stages of a preset as classes, in their order."""
     return tuple(type(stage) for stage in PRESETS[preset])
-
-
-def presets_table() -> str:
-    """The presets as a Markdown table, for the documentation."""
-    rows = [
-        "| preset | pruning iterations | colours | entropy coder | for |",
-        "|---|---|---|---|---|",
-    ]
-    for name, stages in PRESETS.items():
-        by_name = {stage.name: stage for stage in stages}
-        prune, compact, refit, code = (by_name[each] for each in ("prune", "compact", "refit", "code"))
-        assert isinstance(prune, Prune)
-        assert isinstance(refit, Refit)
-        assert isinstance(code, Code)
-        colours = f"re-fitted together in {refit.steps} steps" if refit.steps else "as they are"
-        if compact.on:
-            colours = "compacted splat by splat"
-        # The file's version that goes with the paper's steps has no context coder.
-        coder = "zstd" if name == "paper" else code.entropy
-        coder += f" {code.zstd_level}" if coder == "zstd" else ""
-        mark = " (default)" if name == DEFAULT else ""
-        rows.append(f"| `{name}`{mark} | {prune.iterations} | {colours} | {coder} | {PURPOSE[name]} |")
-    return "\n".join(rows)

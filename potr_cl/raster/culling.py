@@ -176,18 +176,6 @@ def part_seen(scene: Scene, cameras: Sequence[Camera], near: float) -> float:
     if not cameras:
         return 1.0
     some = [cameras[number] for number in range(0, len(cameras), -(-len(cameras) // _VIEWS))]
-    seen, splats = _seen_of_few(scene, some, near)
-    return float(seen.mean() / splats)
-
-
-def parts_seen(scene: Scene, cameras: Sequence[Camera], near: float) -> NDArray[np.float64]:
-    """(views,) which part of a scene each view may draw, told from few splats; arguments as of :func:`part_seen`."""
-    seen, splats = _seen_of_few(scene, cameras, near)
-    return seen / splats
-
-
-def _seen_of_few(scene: Scene, cameras: Sequence[Camera], near: float) -> tuple[NDArray[np.int64], int]:
-    """(views,) how many of few splats each view may draw, and how many these are."""
     few = scene.uncoloured().subset(np.arange(0, len(scene), _SAMPLED))
     groups = SplatGroups.of(few, max(splat_groups.LARGEST // _SAMPLED, 1))
-    return groups.visible_by(cameras, near) @ groups.counts, len(few)
+    return float((groups.visible_by(some, near) @ groups.counts).mean() / len(few))

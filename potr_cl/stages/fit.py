@@ -31,19 +31,19 @@ from potr_cl.stages.fitting.fit import (
     held_out_error,
     kept_pictures,
 )
-from potr_cl.stages.fitting.photographs import fit_to_photographs, longer, times
+from potr_cl.stages.fitting.photographs import fit_to_photographs, longer
 from potr_cl.stages.fitting.pictures import TargetPictures
 from potr_cl.stages.fitting.settling import Looking, Settling, settle
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.refitting.targets import RenderedTargets, Targets
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
 
-#: Times the threshold of pruning up to which a fit makes up for splats, about (docs/benchmarks/fit.md): for this
+#: Times the threshold of pruning up to which a fit makes up for splats, about (docs/benchmarks/findings.md): for this
 #: threshold, and for others as much more as its root is larger, because a fit brings the more, the fewer splats are
 #: left; but not more than the most.
 FURTHER, _AT_THRESHOLD, _MOST_FURTHER = 3.5, 10**-9.3, 20.0
 #: By how much of its way to 1 the q is higher whose steps suit a fit, from that q on; below it less, with the square:
-#: few splats are left there, and finer steps for these cost more than they bring (docs/benchmarks/fit.md).
+#: few splats are left there, and finer steps for these cost more than they bring (docs/benchmarks/findings.md).
 FINER, _FINER_FROM = 0.18, 0.5
 #: Steps that "auto" stands for.
 STEPS: dict[Family, int] = {"cpu": 800, "gpu": 1300}
@@ -53,6 +53,8 @@ BETWEEN: dict[Family, float] = {"cpu": 1.0, "gpu": 3.0}
 #: are followed too closely soon; and the most.
 _SQUARE = 10
 _MOST_STEPS: dict[Family, int] = {"cpu": 250, "gpu": 1000}
+#: Iterations of the pruning before a fit.
+ITERATIONS = 16
 #: Part of the steps in each cycle but the last.
 _FIRST = 0.25
 #: What a splat costs as a multiple of the error for which pruning would have let it go: what it adds to the error when
@@ -122,16 +124,14 @@ class Fit(Stage):
             is 0.5 or higher; below that less.
         cycles: how often splats are removed and a fit follows, each time up to a higher threshold; before the first of
             several, none are.
-        iterations: of the pruning in each of them.
         between: views between that the fit looks at, for each given view, unless there are more already. "auto": as
             many as pay on the device.
         photograph_steps: in which what came of it is fitted to photographs, where the re-fit has some; 0: it is not.
             "auto": as many as pay on the device.
-        photograph_rate: by what the rates are multiplied for photographs.
-        choosing, rounding, gentle, through: how far what is left is fitted once more after the choice of coefficients
-            and the rounding of geometry (:class:`potr_cl.stages.fitting.settling.Settling`).
+        choosing, rounding: how far what is left is fitted once more after the choice of coefficients and the rounding
+            of geometry (:class:`potr_cl.stages.fitting.settling.Settling`).
         compared: whether two files say if it pays, where its gain is small (potr_cl/pipeline/fit_trial.py).
-        batch, rounds, patience, rates, last, seed: see :class:`potr_cl.stages.fitting.fit.FitOptions`.
+        rounds: see :class:`potr_cl.stages.fitting.fit.FitOptions`.
 
     Raises:
         UsageError: a value is out of range.
@@ -155,21 +155,12 @@ class Fit(Stage):
     further: float = option(FURTHER)
     finer: float = option(FINER)
     cycles: int = option(2)
-    iterations: int = option(16)
     between: float | Literal["auto"] = option("auto")
     photograph_steps: int | Literal["auto"] = option("auto")
-    photograph_rate: float = option(1.0)
-    batch: int = option(FitOptions.batch)
     rounds: int = option(FitOptions.rounds)
-    patience: int = option(FitOptions.patience)
-    rates: Rates = option(FitOptions.rates)
-    last: float = option(FitOptions.last)
     choosing: float = option(0.3)
     rounding: float = option(0.15)
-    gentle: float = option(0.1)
-    through: float = option(0.3)
     compared: bool = option(True)
-    seed: int = option(FitOptions.seed)
 
     def __post_init__(self) -> None:
         _ = self._options("gpu", None), FitOptions(steps=self.photograph_steps_on("gpu", 1))
@@ -177,21 +168,13 @@ class Fit(Stage):
             raise UsageError(f"the fit's further pruning is {self.further:g}, it must be from 0 to 1,000,000")
         if self.between != "auto" and not 0 <= self.between <= 100:
             raise UsageError(f"the fit's views between are {self.between:g}, they must be from 0 to 100")
-        if not 0 < self.photograph_rate <= 100:
-            raise UsageError(f"the fit's photograph rate is {self.photograph_rate:g}, it must be above 0, at most 100")
         if not 0 <= self.finer <= 1:
             raise UsageError(f"the fit's finer quality is {self.finer:g}, it must be from 0 to 1")
-        for name, least, most in (
-            ("choosing", 0, 10),
-            ("rounding", 0, 10),
-            ("gentle", 1e-6, 1),
-            ("through", 1e-6, 1),
-        ):
-            if not least <= getattr(self, name) <= most:
-                raise UsageError(f"the fit's {name} is {getattr(self, name):g}, it must be from {least:g} to {most}")
-        for name in ("cycles", "iterations"):
-            if not 1 <= getattr(self, name) <= 1000:
-                raise UsageError(f"the fit's {name} are {getattr(self, name)}, they must be from 1 to 1000")
+        for name in ("choosing", "rounding"):
+            if not 0 <= getattr(self, name) <= 10:
+                raise UsageError(f"the fit's {name} is {getattr(self, name):g}, it must be from 0 to 10")
+        if not 1 <= self.cycles <= 1000:
+            raise UsageError(f"the fit's cycles are {self.cycles}, they must be from 1 to 1000")
 
     @property
     def asked_for(self) -> bool:
@@ -219,16 +202,7 @@ class Fit(Stage):
         return BETWEEN[family] if self.between == "auto" else self.between
 
     def _options(self, family: Family, memory: int | None) -> FitOptions:
-        return FitOptions(
-            steps=self.steps_on(family),
-            batch=self.batch,
-            rounds=self.rounds,
-            patience=self.patience,
-            rates=self.rates,
-            last=self.last,
-            seed=self.seed,
-            memory=memory,
-        )
+        return FitOptions(steps=self.steps_on(family), rounds=self.rounds, memory=memory)
 
     def limit(self, price: float) -> float:
         """The threshold up to which splats are removed for a fit to make up for, where pruning had this one."""
@@ -315,7 +289,7 @@ class Fit(Stage):
     def _settled(self, state: State, bench: Workbench, looking: Looking, asked: SupportsBool) -> State:
         """Choose coefficients and round geometry, with what is left fitted once more in between."""
         options = self._options(bench.opened.family, bench.memory)
-        settling = Settling(self.choosing, self.rounding, self.gentle, self.through)
+        settling = Settling(self.choosing, self.rounding)
         done, total = options.steps, options.steps + self.further_steps_on(bench.opened.family)
 
         def progress(steps: int) -> None:
@@ -343,7 +317,7 @@ class Fit(Stage):
         options = dataclasses.replace(
             self._options(family, bench.memory),
             steps=self.photograph_steps_on(family, len(views)),
-            rates=times(self._sparse(longer(self.rates), state), self.photograph_rate),
+            rates=self._sparse(longer(FitOptions.rates), state),
         )
         bench.progress("fit to photographs", 0.0)
         found = fit_to_photographs(
@@ -365,7 +339,7 @@ class Fit(Stage):
         """The state without the splats that a fit will make up for."""
         parameters = dataclasses.replace(bench.parameters, delta_mse_max=limit)
         alone = dataclasses.replace(bench, parameters=parameters, interludes=(), progress=lambda what, done: None)
-        left = Prune(iterations=self.iterations).run(state, alone)
+        left = Prune(iterations=ITERATIONS).run(state, alone)
         return dataclasses.replace(left, learnt=state.learnt)
 
     def _fitted(

@@ -33,7 +33,6 @@ from potr_cl.stages.pruning.unseen import (
 )
 from potr_cl.stages.pruning.visible_parts import LARGEST_LIMIT, LIKELY, groups_of_large, seen_part, sights_worth_it
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
-from potr_cl.workers.dealing import speeds_of
 from potr_cl.workers.pool import Pool
 
 #: Of the time of all iterations, what the first measurement takes, which looks at all of every view; the others look at
@@ -55,7 +54,7 @@ class Prune(Stage):
         unseen: "keep" or "drop": what becomes of splats that no training view's picture reaches
             (:mod:`potr_cl.model.unseen`). With ``keep`` or ``count`` they go first in any case. "protect", and "keep"
             where views were placed: what no view has resolved stays as it is (:mod:`potr_cl.placement.guard`).
-        tolerance, turns, tighten, transmittance_threshold, sample, sampled, seed: of the measurements
+        tolerance, turns, transmittance_threshold: of the measurements
             (:class:`potr_cl.stages.pruning.sweep_options.SweepOptions`).
 
     Raises:
@@ -122,11 +121,7 @@ class Prune(Stage):
             choices=CHOICES,
         ),
     )
-    tighten: bool = option(SweepOptions.tighten)
     transmittance_threshold: float | None = option(SweepOptions.transmittance_threshold)
-    sample: float = option(SweepOptions.sample)
-    sampled: int = option(SweepOptions.sampled)
-    seed: int = option(SweepOptions.seed)
 
     def __post_init__(self) -> None:
         if self.keep is not None and not 0 < self.keep <= 1:
@@ -146,11 +141,7 @@ class Prune(Stage):
             tolerance=self.tolerance,
             turns=self.turns,
             memory=memory,
-            tighten=self.tighten,
             transmittance_threshold=self.transmittance_threshold,
-            sample=self.sample,
-            sampled=self.sampled,
-            seed=self.seed,
         )
 
     def _schedule(self, delta_mse_max: float, splats: int) -> PruningOptions:
@@ -314,7 +305,7 @@ def _dealt(state: State, seen: NDArray[np.int64] | None, pool: Pool, sights: Sig
     source, numbers = (state.source, state.survivors) if state.is_cut else (state.scene, np.arange(len(state.scene)))
     names = [worker.name for worker in workers]
     splats = numbers if seen is None else numbers[seen]
-    return ViewShares.of(state.views, sights, speeds_of(workers), source, splats, names)
+    return ViewShares.of(state.views, sights, [1.0] * len(workers), source, splats, names)
 
 
 class _Course:

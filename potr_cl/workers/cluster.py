@@ -21,7 +21,6 @@ from potr_cl.errors import DeviceError, PotrError, UsageError
 from potr_cl.opencl.device import Device
 from potr_cl.workers.client import client_of, first_line
 from potr_cl.workers.host import DeviceThread
-from potr_cl.workers.pauses import Pauses
 from potr_cl.workers.pool import Held, Part, Pool, Shared, Traffic, Worker, WorkerLost, tell_of_kinds
 from potr_cl.workers.pulse import Pulse
 from potr_cl.workers.seat import Known, Seat
@@ -61,7 +60,6 @@ class ClusterPool(Pool):
 
     takes_part = False
     sparse = True
-    relieves = True
 
     def __init__(self, cluster: str | Client, first: Device, patience: float = 60.0) -> None:
         self.first, self.traffic, self.patience = first, Traffic(), patience
@@ -78,11 +76,6 @@ class ClusterPool(Pool):
             self._owned.callback(self._leave_cluster)
         try:
             self._meet_first()
-            from potr_cl.workers import seldom_looks  # Dask is not installed everywhere
-
-            seldom_looks.look_seldom_for(self.client)
-            if not is_own:
-                self._owned.callback(seldom_looks.look_as_before_for, self.client)
             threading.Thread(target=self._meet_others, name="potr_cl newcomers", daemon=True).start()
         except BaseException:
             self.close()
@@ -96,7 +89,7 @@ class ClusterPool(Pool):
         left: list[Worker] = [worker for worker in self._workers if worker.name in alive and not worker.lost]
         if not left:
             return [self._goes_on_here("no worker of the cluster answers any more")]
-        return [worker for worker in left if not worker.is_behind] or left
+        return left
 
     def _goes_on_here(self, why: str) -> Worker:
         """The master's own device, where there is no cluster any more: results do not depend on who computes them."""
@@ -233,29 +226,25 @@ class ClusterPool(Pool):
 
     def _meet_others(self) -> None:
         """Meet those that come, until the cluster is left."""
-        pauses = Pauses(_NEW)
+        # One that dies as it is asked would be started again and again by Dask.
+        lost: set[str] = set()
         while not self._closing.wait(_NEW):
             with suppress(WorkerLost):  # whoever waits for an answer says so
-                known, now = {worker.name for worker in self._workers}, time.monotonic()
+                known = {worker.name for worker in self._workers}
                 come = self._alive() - known - self._refused
-                lost: dict[str, WorkerLost] = {}
-                for worker in self._invited({each for each in come if pauses.may_ask(_host(each), now)}):
+                for worker in self._invited({address for address in come if _host(address) not in lost}):
                     try:
                         worker.meet()
-                    except UsageError as error:
+                    except (UsageError, WorkerLost) as error:
                         self._refused.add(worker.name)
+                        if isinstance(error, WorkerLost):
+                            lost.add(worker.host)
                         worker.leave()
-                        _log.warning("%s; it does no views", error)
-                    except WorkerLost as gone:
-                        worker.leave()
-                        lost.setdefault(worker.host, gone)
+                        if not self._closing.is_set():
+                            _log.warning("%s; it does no views", error)
                     else:
-                        pauses.note_met(worker.host)
                         _log.warning("worker %s has come: it gets views from the next stage on", worker.name)
                         self._take_in([worker])
-                for host, said in lost.items():
-                    if pauses.note_lost(host, time.monotonic()) and not self._closing.is_set():
-                        _log.warning("%s; it is asked again later", said)
 
     def _invited(self, addresses: set[str]) -> list[_ClusterWorker]:
         """Workers that have begun to say which device they take: those of one computer take its devices in turn."""

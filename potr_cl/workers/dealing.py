@@ -4,12 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from statistics import median
 
-from potr_cl.workers.pool import Pool, Worker
-
-#: A worker that is slower than this against another one gets fewer views.
-_MATTERS = 1.25
+from potr_cl.workers.pool import Pool
 
 
 @dataclass(frozen=True)
@@ -39,8 +35,7 @@ def shares(pool: Pool, views: int, parts: int = 1, own_speed: float = 1.0) -> Sh
         WorkerLost: no worker is left.
     """
     workers = pool.workers()
-    speeds = [1.0] * len(workers) if pool.takes_part else speeds_of(workers)
-    speeds = [own_speed, *speeds] if pool.takes_part else speeds
+    speeds = [*([own_speed] if pool.takes_part else []), *[1.0] * len(workers)]
     dealt: list[list[int]] = [[] for _ in speeds]
     for part in range(parts):
         numbers = range(part, views, parts)
@@ -49,19 +44,6 @@ def shares(pool: Pool, views: int, parts: int = 1, own_speed: float = 1.0) -> Sh
     own, others = (dealt[0], dealt[1:]) if pool.takes_part else ([], dealt)
     busy = [(worker, sorted(each)) for worker, each in zip(workers, others, strict=True) if each]
     return Shares(sorted(own), [each for _, each in busy], tuple(worker.name for worker, _ in busy))
-
-
-def speeds_of(workers: Sequence[Worker]) -> list[float]:
-    """How fast workers are in proportion to each other, as far as that is known and matters.
-
-    Small differences say more about what else a computer did just then than about its device.
-    """
-    known = [worker.rate for worker in workers if worker.rate is not None]
-    if not known or max(known) < _MATTERS * min(known):
-        return [1.0] * len(workers)
-    # One that has come since is counted on to be as fast as most.
-    rates = [median(known) if worker.rate is None else worker.rate for worker in workers]
-    return [rate / max(known) for rate in rates]
 
 
 def deal(views: int, speeds: Sequence[float], first: int = 0) -> list[list[int]]:
@@ -82,15 +64,3 @@ def deal(views: int, speeds: Sequence[float], first: int = 0) -> list[list[int]]
         best = min(asked, key=lambda place: (len(shares[place]) + 1) / speeds[place])
         shares[best].append(view)
     return shares
-
-
-def in_pieces(numbers: Sequence[int], pieces: int, parts: int = 1) -> list[list[int]]:
-    """The views of one worker for several others, each ascending and none empty.
-
-    Args:
-        numbers: of the views.
-        pieces: how many others there are.
-        parts: as of :func:`shares`.
-    """
-    in_turn = sorted(numbers, key=lambda number: (number % parts, number))
-    return [sorted(each) for each in (in_turn[first::pieces] for first in range(pieces)) if each]

@@ -2,14 +2,14 @@
 
 It keeps a log of the commands that change a part. A worker that dies, stalls or runs out of memory loses its parts;
 another one makes them again, and replays the log. As commands give the same results on every worker, nobody else
-notices. So do the parts of a worker that is much slower than the others (:mod:`.pace`), in pieces.
+notices.
 """
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures import TimeoutError as NotInTime
 from contextlib import suppress
@@ -20,7 +20,6 @@ from typing import Any, TypeAlias
 from potr_cl.errors import DeviceError, PotrError
 from potr_cl.host.threads import in_background
 from potr_cl.opencl.memory import Owner
-from potr_cl.workers.pace import Pace, Round
 from potr_cl.workers.pool import Held, Part, Pool, Worker, WorkerLost
 
 #: A worker may take so many times as long as the slowest of the others.
@@ -37,7 +36,6 @@ class Parts(Owner):
         kind: of all parts.
         given: what each part is made with, see :class:`potr_cl.workers.pool.Part`.
         memory: bytes of a device's memory that may be filled with views; None: the parts' own default.
-        views: how many views each part has: by these, workers' rates are noted in the end.
         names: of the workers that the parts are meant for; those that are lost are replaced by others.
 
     The workers begin at once; :meth:`ready` waits for them, and so does the first command.
@@ -49,32 +47,23 @@ class Parts(Owner):
         kind: type[Part],
         given: Sequence[Sequence[Any]],
         memory: int | None = None,
-        views: Sequence[int] = (),
         names: Sequence[str] = (),
     ) -> None:
-        self._views: list[float] = list(views)
         self._longest = 0.0  # seconds that anything has taken
-        self._pace = Pace()
         self._pool, self._kind, self._memory = pool, kind, memory
         self._given = [tuple(each) for each in given]
         self._log: list[tuple[str, tuple[Any, ...]]] = []
         self._unfit: set[str] = set()  # workers on which a part of this work has failed
-        self._may_relieve = pool.relieves
-        self._slow: set[str] = set()  # those whose parts others do
-        self._origins = list(range(len(given)))
         self._held: list[Held | None] = [None] * len(self._given)
         self._by: list[Worker | None] = [None] * len(self._given)
-        self._making: Round | None = None
+        self._making: dict[int, Future[Held]] = {}
         self._pending: Pending | None = None
         self._closing: list[Future[None]] = []
-        making: dict[int, Future[Held]] = {}
         try:
             for place, worker in enumerate(_meant(self._able(), names, len(self._given))):
                 self._by[place] = worker
-                making[place] = worker.make(kind, memory, self._given[place])
-            self._making = Round(making)
+                self._making[place] = worker.make(kind, memory, self._given[place])
         except BaseException:
-            self._making = Round(making)
             self.close()
             raise
 
@@ -84,20 +73,11 @@ class Parts(Owner):
         Raises:
             DeviceError: no worker can make them.
         """
-        making, self._making = self._making, None
-        if making is not None:
-            self._collect(making, self._take_made, None)
-            self._pace.note_made(making)
+        making, self._making = self._making, {}
+        self._collect(making, self._take_made, None)
 
     def __len__(self) -> int:
         return len(self._given)
-
-    def origin(self, place: int) -> int:
-        """The number of the part, of those that were given, whose views a part has: a slow worker's may be in pieces.
-
-        The first piece takes the place of the part, others follow behind all parts.
-        """
-        return self._origins[place]
 
     # ------------------------------------------------------------------------------------------------ commands
 
@@ -113,7 +93,6 @@ class Parts(Owner):
         self._settle()
         if anew:
             self._log.clear()
-            self._pace.forget_log()
         self._pending = Pending(self, command, args, logged)
         return self._pending
 
@@ -130,7 +109,7 @@ class Parts(Owner):
             self._pool.traffic.add(received=nbytes(result), what=command, answers=1)
             found[0] = result
 
-        self._collect(Round({place: self._begin(place, command, args)}), take, (command, args))
+        self._collect({place: self._begin(place, command, args)}, take, (command, args))
         return found[0]
 
     def _settle(self) -> None:
@@ -149,7 +128,7 @@ class Parts(Owner):
 
         Drivers take long to give much memory back.
         """
-        if self._pool.in_process and self._making is None:
+        if self._pool.in_process and not self._making:
             self._pending = None
             held, self._held = self._held, [None] * len(self._given)
             self._closing = [in_background(each.close) for each in held if each is not None]
@@ -160,10 +139,9 @@ class Parts(Owner):
 
     def _end(self, abandoned: bool) -> None:
         self._pending = None
-        self._pace.rate([worker for worker in self._by if worker is not None])
         held, self._held = self._held, [None] * len(self._given)
-        making, self._making = self._making, None
-        for place, each in making.futures.items() if making is not None else ():  # an error came between
+        making, self._making = self._making, {}
+        for place, each in making.items():  # an error came between
             if abandoned or _is_left(self._by[place]):
                 # Nobody waits for it, and nobody wants it: its memory is given back as soon as it is made.
                 each.add_done_callback(_abandon_made)
@@ -192,10 +170,7 @@ class Parts(Owner):
             gone: Future[Any] = Future()
             gone.set_exception(WorkerLost("it has been given up before"))
             return gone
-        return self._send(held, self._origins[place], command, args)
-
-    def _send(self, held: Held, origin: int, command: str, args: Sequence[Any]) -> Future[Any]:
-        args = [each.args[origin] if isinstance(each, Each) else each for each in args]
+        args = [each.args[place] if isinstance(each, Each) else each for each in args]
         self._pool.traffic.add(sent=nbytes(args), what=command)
         return held.begin(command, args)
 
@@ -203,39 +178,32 @@ class Parts(Owner):
         self._held[place] = held
 
     def _able(self) -> list[Worker]:
-        """Workers that have neither been lost nor failed with a part of this work; without any, the reserve.
-
-        Those that are slow are left in peace, unless there are no others.
-        """
+        """Workers that have neither been lost nor failed with a part of this work; without any, the reserve."""
         for workers in (self._pool.workers, self._pool.reserve):
             able = [worker for worker in workers() if worker.name not in self._unfit]
             if able:
-                return [worker for worker in able if worker.name not in self._slow] or able
+                return able
         return []
 
-    def _collect(self, at: Round, take: Callable[[int, Any], None], command: _Command | None) -> None:
-        """Wait for all; where a worker fails, or is slow, have another one do it.
+    def _collect(
+        self, at: Mapping[int, Future[Any]], take: Callable[[int, Any], None], command: _Command | None
+    ) -> None:
+        """Wait for all; where a worker fails, have another one do it.
 
         Args:
-            at: what they are at.
-            take: is given each place's result, and those of more places where a part is done in pieces.
+            at: what they will return, by place.
+            take: is given each place's result.
             command: what they are at; None: they are being made.
         """
-        waiting = {future: place for place, future in at.futures.items()}
+        waiting = {future: place for place, future in at.items()}
         failed: list[tuple[int, DeviceError]] = []
         patience, since = self._pool.patience, time.monotonic()
         while waiting:
-            slow = self._pace.slow_at(at, since) if self._may_relieve else None
-            limits = [] if slow is None else [slow]
+            limit = None
             # Nobody can tell how long something takes before one has done it.
             if patience is not None and self._longest > 0:
-                limits.append(since + max(patience, _SLOWER * self._longest))
-            limit = max(min(limits) - time.monotonic(), 0.0) if limits else None
+                limit = max(since + max(patience, _SLOWER * self._longest) - time.monotonic(), 0.0)
             done, _ = wait(waiting, limit, return_when=FIRST_COMPLETED)
-            if not done and slow is not None and slow <= time.monotonic():
-                # If they cannot, it is waited for after all.
-                self._may_relieve = self._relieve(waiting, at, take, command)
-                continue
             if not done:
                 failed += [(place, WorkerLost("it does not answer")) for place in waiting.values()]
                 break
@@ -248,71 +216,6 @@ class Parts(Owner):
                     failed.append((place, error))
         for place, fault in failed:
             take(place, self._elsewhere(place, fault, command))
-
-    def _relieve(
-        self, waiting: dict[Future[Any], int], at: Round, take: Callable[[int, Any], None], command: _Command | None
-    ) -> bool:
-        """Have others do what slow workers are at, in pieces; whether they could."""
-        for future, place in list(waiting.items()):
-            worker = self._by[place]
-            assert worker is not None
-            busy = [self._by[each] for each in waiting.values()]
-            others = [other for other in self._able() if other not in busy]
-            pieces = self._pieces(place, others, command)
-            if pieces is None:
-                return False
-            _log.warning(
-                "worker %s is slow: its views go to %s", worker.name, ", ".join(each.by.name for each in pieces)
-            )
-            left = self._held[place]
-            if left is not None:
-                left.abandon()
-            else:  # it is not made yet: whatever becomes of it, nobody wants it
-                future.add_done_callback(_abandon_made)
-            del waiting[future]
-            self._slow.add(worker.name)
-            self._pace.leave(worker, self._views[place] if place < len(self._views) else 0.0, at, place)
-            self._put(place, pieces, take, made=command is None)
-        return True
-
-    def _pieces(self, place: int, others: Sequence[Worker], command: _Command | None) -> list[_Piece] | None:
-        """A part in pieces on other workers, as far as the part itself is, and what they find; None if they cannot."""
-        given = self._kind.split(self._given[place], len(others)) if others else []
-        pieces: list[_Piece] = []
-        makings: list[Future[Held]] = []
-        try:
-            for each, worker in zip(given, others, strict=False):
-                makings.append(worker.make(self._kind, self._memory, each))
-            for each, worker, making in zip(given, others, makings, strict=False):
-                pieces.append(_Piece(each, worker, self._answer(making)))
-            for name, args in [*self._log, *([] if command is None else [command])]:
-                answers = [self._send(piece.held, self._origins[place], name, args) for piece in pieces]
-                for piece, answer in zip(pieces, answers, strict=True):
-                    piece.found = self._answer(answer)
-        except DeviceError as error:
-            _log.info("others cannot do the views of a slow worker (%s)", error)
-            for making in makings:
-                making.add_done_callback(_abandon_made)
-            return None
-        return pieces or None
-
-    def _put(self, place: int, pieces: Sequence[_Piece], take: Callable[[int, Any], None], made: bool) -> None:
-        """Have pieces in the place of a part, and behind all parts."""
-        views = self._views[place] / len(pieces) if place < len(self._views) else 0.0
-        for number, piece in enumerate(pieces):
-            at = place
-            if number:
-                at = len(self._given)
-                self._given.append(())
-                self._held.append(None)
-                self._by.append(None)
-                self._origins.append(self._origins[place])
-                if self._views:
-                    self._views.append(views)
-            elif self._views:
-                self._views[place] = views
-            self._given[at], self._held[at], self._by[at] = piece.given, piece.held, piece.by
-            take(at, piece.held if made else piece.found)
 
     def _elsewhere(self, place: int, error: DeviceError, command: _Command | None) -> Any:
         """Have another worker do what one could not.
@@ -373,19 +276,9 @@ class Parts(Owner):
 _Command: TypeAlias = "tuple[str, Sequence[Any]]"
 
 
-@dataclass
-class _Piece:
-    """Some views of a slow worker's part, with another worker; what it found last."""
-
-    given: tuple[Any, ...]
-    by: Worker
-    held: Held
-    found: Any = None
-
-
 def _is_left(worker: Worker | None) -> bool:
-    """Whether nobody waits for a worker any more: another work may have found that it stands still, or is slow."""
-    return worker is not None and (worker.lost or worker.is_behind)
+    """Whether nobody waits for a worker any more: another work may have found that it stands still."""
+    return worker is not None and worker.lost
 
 
 def _abandon_made(making: Future[Held]) -> None:
@@ -412,7 +305,7 @@ class Each:
     """An argument of a command that is another one for each part.
 
     Attributes:
-        args: the parts', in the order in which they were given (:meth:`Parts.origin`).
+        args: the parts', in the order in which they were given.
     """
 
     args: Sequence[Any]
@@ -423,18 +316,18 @@ class Pending:
 
     def __init__(self, parts: Parts, command: str, args: tuple[Any, ...], logged: bool) -> None:
         self._parts, self._command, self._args, self._logged = parts, command, args, logged
-        self._at = Round({place: parts._begin(place, command, args) for place in range(len(parts))})
+        self._at = {place: parts._begin(place, command, args) for place in range(len(parts))}
         self._found: list[Any] | None = None
 
     def results(self) -> list[Any]:
-        """What the parts return, in their order, those of pieces behind the others (:meth:`Parts.origin`).
+        """What the parts return, in their order.
 
         Raises:
             PotrError: a part refused, or no worker can do it.
         """
         if self._found is not None:
             return self._found
-        parts, found, since = self._parts, dict[int, Any](), time.monotonic()
+        parts, found = self._parts, dict[int, Any]()
 
         def take(place: int, result: Any) -> None:
             parts._pool.traffic.add(received=nbytes(result), what=self._command, answers=1)
@@ -445,7 +338,6 @@ class Pending:
         except BaseException:
             parts._pending = None  # it is over
             raise
-        parts._pace.note(self._at, since, self._logged, parts._by, parts._views)
         if self._logged:
             parts._note(self._command, self._args)
         self._found = [found[place] for place in range(len(found))]

@@ -50,16 +50,6 @@ class Part(Owner):
     @abstractmethod
     def __init__(self, device: Device, memory: int | None, *given: Any) -> None: ...
 
-    @classmethod
-    def split(cls, given: tuple[Any, ...], pieces: int) -> list[tuple[Any, ...]]:
-        """What several parts are made with that together do what one does, as the sum of what they return.
-
-        Args:
-            given: what the one is made with.
-            pieces: how many there may be at most; there may be fewer, and is one where nothing can be split.
-        """
-        return [given]
-
 
 class Held(ABC):
     """A part that a worker holds."""
@@ -85,20 +75,11 @@ class Worker(ABC):
 
     Attributes:
         name: for messages.
-        rate: views that it did in a second in the last work that it had a part of, each command counting; None before.
         lost: whether it has been given up: it may stand still, and to wait for it again would take as long again.
-        behind: what it was at last when it was too slow to be waited for, and others did it.
     """
 
     name: str
     lost: bool = False
-    rate: float | None = None
-    behind: Future[Any] | None = None
-
-    @property
-    def is_behind(self) -> bool:
-        """Whether it is still at something that others have done."""
-        return self.behind is not None and not self.behind.done()
 
     @abstractmethod
     def make(self, kind: type[Part], memory: int | None, given: Sequence[Any]) -> Future[Held]:
@@ -172,7 +153,6 @@ class Pool(ABC):
         in_process: whether workers are threads of this process: what lies on a device can then be lent
             (:mod:`potr_cl.opencl.relay`), and goes to another device without a stay on the host.
         traffic: so far.
-        relieves: whether other workers do what one is at that has become slow: computers whose work others share.
         patience: seconds, or ten times as long as the others took if that is longer, after which a worker that alone
             has not answered counts as lost; None: workers are waited for.
     """
@@ -181,13 +161,12 @@ class Pool(ABC):
     takes_part: bool
     sparse: bool
     in_process: bool = False
-    relieves: bool = False
     traffic: Traffic
     patience: float | None = None
 
     @abstractmethod
     def workers(self) -> list[Worker]:
-        """Those that have not been lost, nor are at something that nobody waits for; without the master.
+        """Those that have not been lost; without the master.
 
         Raises:
             WorkerLost: none is left.

@@ -15,7 +15,7 @@ from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.formats import save_scene
 from potr_cl.quality.compare import size_report
-from potr_cl.reference.scenes import random_scene
+from tests.reference.scenes import random_scene
 
 
 def test_a_scene_in_many_files_is_as_large_as_all_of_them(data: Path) -> None:

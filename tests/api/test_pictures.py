@@ -14,7 +14,7 @@ from potr_cl.api.pictures import Rendering, written_pictures
 from potr_cl.formats.images import to_8_bits
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.reference.scenes import random_scene, ring_of_cameras
+from tests.reference.scenes import random_scene, ring_of_cameras
 
 CAMERAS = ring_of_cameras(12)
 

@@ -13,7 +13,7 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.reference.scenes import random_scene
+from tests.reference.scenes import random_scene
 
 #: What becomes of a picture before it is written; the same generator is given for all pictures.
 Change = Callable[[FloatArray, np.random.Generator], FloatArray]

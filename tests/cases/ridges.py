@@ -6,14 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.model.scene import Scene
-from potr_cl.reference.ridge import (
+from potr_cl.stages.compaction.ridge import CompactionOptions
+from potr_cl.stages.compaction.view_weights import ViewWeights
+from tests.reference.ridge import (
     YCOCG,
     objective,
     ridge,
     weighted_basis,
 )
-from potr_cl.stages.compaction.ridge import CompactionOptions
-from potr_cl.stages.compaction.view_weights import ViewWeights
 
 #: Colour error, in colour units, that is a matter of rounding: 1/2000 of a step of 8 bits.
 ROUNDING = 2e-6

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.model.scene import LOW_PASS, Scene
-from potr_cl.reference.raster import rotation_matrices
+from tests.reference.raster import rotation_matrices
 
 
 def in_order_of(scene: Scene, back: Scene) -> Scene:

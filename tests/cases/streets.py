@@ -8,8 +8,8 @@ import numpy as np
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
-from potr_cl.reference.captures import looking
-from potr_cl.reference.scenes import random_scene
+from tests.reference.captures import looking
+from tests.reference.scenes import random_scene
 
 
 def street(houses: int = 5, splats: int = 300, across: bool = False) -> tuple[Scene, list[Camera]]:

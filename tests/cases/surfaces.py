@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from potr_cl.model.scene import Scene
-from potr_cl.reference.surfaces import facing, points_on_box
+from tests.reference.surfaces import facing, points_on_box
 
 
 def flat_splats(points, normals, size, opacity_logit=4.0, sh=None) -> Scene:

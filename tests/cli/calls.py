@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from potr_cl import cli
-from potr_cl.reference.scenes import ring_of_cameras
+from tests.reference.scenes import ring_of_cameras
 
 #: Options of an encode that keeps everything, and so looks at no views.
 KEEP = ["--no-prune", "--no-compact", "--refit", "off"]

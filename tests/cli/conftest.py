@@ -6,8 +6,8 @@ import pytest
 
 from potr_cl import cli
 from potr_cl.formats.scenes import ply
-from potr_cl.reference.scenes import random_scene
 from tests.cli.calls import KEEP, cameras_json
+from tests.reference.scenes import random_scene
 
 
 @pytest.fixture

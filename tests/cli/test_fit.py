@@ -19,7 +19,7 @@ from potr_cl import cli
 from potr_cl.formats import load_scene
 from potr_cl.formats.cameras import cameras_json
 from potr_cl.formats.scenes import ply
-from potr_cl.reference.scenes import ring_of_cameras, visible_scene
+from tests.reference.scenes import ring_of_cameras, visible_scene
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 
 from potr_cl.cli import main
 from potr_cl.formats.scenes import ply
-from potr_cl.reference.frames import MOTIONS, moved
+from tests.reference.frames import MOTIONS, moved
 
 
 @pytest.fixture(scope="module")

@@ -14,8 +14,8 @@ from potr_cl import cli
 from potr_cl.cli import guard
 from potr_cl.errors import UsageError
 from potr_cl.formats.scenes import ply
-from potr_cl.reference.scenes import random_scene, ring_of_cameras
 from tests.cli.calls import cameras_json
+from tests.reference.scenes import random_scene, ring_of_cameras
 
 Link = Callable[[Path, Path], None]
 
@@ -104,8 +104,10 @@ def refused(capsys: pytest.CaptureFixture[str], folder: Path, arguments: list[st
     assert contents(folder) == before
 
 
-@pytest.mark.parametrize("link", LINKS)
-@pytest.mark.parametrize(("call", "target"), CALLS)
+@pytest.mark.parametrize(
+    ("call", "target", "link"),
+    [*((*CALLS[0], link) for link in LINKS), *((*call, LINKS[n % 2]) for n, call in enumerate(CALLS[1:]))],
+)
 def test_an_output_that_is_an_input(
     folder: Path,
     capsys: pytest.CaptureFixture[str],

@@ -9,7 +9,7 @@ import pytest
 from potr_cl import UsageError, cli, encode
 from potr_cl.formats import load_scene
 from potr_cl.formats.scenes import ply
-from potr_cl.reference.scenes import random_scene
+from tests.reference.scenes import random_scene
 
 KEEP = ["--no-prune", "--no-compact", "--refit", "off"]
 

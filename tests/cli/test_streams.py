@@ -14,7 +14,7 @@ import pytest
 from potr_cl import cli
 from potr_cl.formats import load_scene
 from potr_cl.formats.scenes import ply, spz
-from potr_cl.reference.scenes import random_scene
+from tests.reference.scenes import random_scene
 
 KEEP = ["--no-prune", "--no-compact", "--refit", "off"]
 FEW = ["--virtual-views", "8"]

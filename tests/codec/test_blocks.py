@@ -34,8 +34,8 @@ from potr_cl.model.morton import morton_order
 from potr_cl.model.scene import Scene
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.reference.scenes import random_scene, ring_of_cameras
 from tests.oracles.decoder import decode as decode_independently
+from tests.reference.scenes import random_scene, ring_of_cameras
 
 ARRAYS = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
 BEST = HyperParameters.from_quality(0.5, "best")

@@ -21,9 +21,9 @@ from potr_cl.model.camera import camera_centres, train_views
 from potr_cl.model.scene import SH_COEFFICIENTS, Scene
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.reference.scenes import random_scene, ring_of_cameras
 from tests.cases.options import as_it_is
 from tests.oracles.decoder import decode as decode_independently
+from tests.reference.scenes import random_scene, ring_of_cameras
 
 FAST = EntropyCoder("zstd", 1)
 KEEP = as_it_is()

@@ -17,7 +17,7 @@ from potr_cl.errors import DataError
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import train_views
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.reference.scenes import random_scene, ring_of_cameras
+from tests.reference.scenes import random_scene, ring_of_cameras
 
 
 def some_scene(kind):

@@ -23,9 +23,9 @@ from potr_cl.codec.sections import Coder, Property
 from potr_cl.errors import DataError, UsageError
 from potr_cl.model.claims import FREE_SPLATS
 from potr_cl.model.scene import Scene
-from potr_cl.reference.scenes import random_scene
 from tests.cases.own_warnings import no_warnings
 from tests.oracles.decoder import decode as decode_independently
+from tests.reference.scenes import random_scene
 
 LONE = (Property.TAIL_LENGTH, 0, b"\0", 1)  # what the octree of a single splat consists of
 ZSTD = EntropyCoder("zstd", 19)

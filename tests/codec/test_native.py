@@ -24,7 +24,7 @@ from potr_cl.codec.sections import Property
 from potr_cl.errors import DataError, UsageError
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import Scene
-from potr_cl.reference.scenes import random_scene
+from tests.reference.scenes import random_scene
 
 GOLDEN = sorted((Path(__file__).parents[1] / "data").glob("golden_v[123]*.potr"))
 ATTRIBUTES = ("means", "log_scales", "quaternions", "opacity_logits", "sh")

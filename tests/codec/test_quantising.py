@@ -17,8 +17,8 @@ from potr_cl.codec.quantize import HyperParameters
 from potr_cl.codec.splat_levels import splat_levels
 from potr_cl.errors import DataError
 from potr_cl.raster.activation import unit_quaternions
-from potr_cl.reference.scenes import random_scene, tilted_camera
 from potr_cl.stages.refitting.refit import active_coefficients
+from tests.reference.scenes import random_scene, tilted_camera
 
 
 @pytest.fixture

@@ -19,8 +19,8 @@ from potr_cl.codec.context.tokens import SIZES
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.codec.quantize import HyperParameters
-from potr_cl.reference.scenes import random_scene
 from tests.cases.decoded_bits import decoded_bits
+from tests.reference.scenes import random_scene
 
 ROOT = Path(__file__).parents[2]
 GOLDEN = sorted((ROOT / "tests" / "data").glob("golden_v*.potr"))

@@ -16,7 +16,7 @@ from potr_cl.codec.sampled import Both, Sampled
 from potr_cl.model.agreement import judge_cameras
 from potr_cl.model.scene import Scene
 from potr_cl.model.sightings import looked_at
-from potr_cl.reference.scenes import random_scene, tilted_camera
+from tests.reference.scenes import random_scene, tilted_camera
 
 GOLDEN = sorted((Path(__file__).parents[1] / "data").glob("golden_v[123]*.potr"))
 

@@ -19,9 +19,9 @@ from potr_cl.codec.steps import prediction
 from potr_cl.codec.steps.fitting import FEWEST, fit_steps
 from potr_cl.codec.steps.rule import KNOTS, ColourSteps
 from potr_cl.errors import DataError
-from potr_cl.reference.scenes import random_scene
 from potr_cl.report.file import file_report, format_report
 from tests.oracles import decoder as oracle
+from tests.reference.scenes import random_scene
 
 VERSION_3 = dataclasses.replace(HyperParameters.from_quality(0.5, "best"), version=3)
 STEPS = ColourSteps(

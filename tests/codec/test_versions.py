@@ -15,7 +15,7 @@ from potr_cl.codec.quantize import HyperParameters
 from potr_cl.codec.sections import Coder
 from potr_cl.codec.versions import VERSIONS
 from potr_cl.errors import DataError, UsageError
-from potr_cl.reference.scenes import random_scene
+from tests.reference.scenes import random_scene
 
 
 def file_of(scene, parameters, **options) -> bytes:

@@ -14,7 +14,7 @@ from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.formats import load_cameras, load_scene, save_scene
 from potr_cl.formats.images import image_size
-from potr_cl.reference.scenes import random_scene
+from tests.reference.scenes import random_scene
 
 
 @pytest.fixture

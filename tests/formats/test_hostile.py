@@ -16,8 +16,8 @@ from PIL import Image
 from potr_cl.errors import DataError
 from potr_cl.formats import load_cameras, load_scene, save_scene
 from potr_cl.formats.images import image_size, read_ground_truth
-from potr_cl.reference.scenes import random_scene
 from tests.cases.own_warnings import no_warnings
+from tests.reference.scenes import random_scene
 
 #: Of double precision, by its bits: one that must not be computed with.
 SIGNALLING_NAN = struct.pack("<Q", 0x7FF0000000000001)

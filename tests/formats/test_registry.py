@@ -26,9 +26,9 @@ from potr_cl.formats.registry import CAMERA_FORMATS, SCENE_FORMATS, listed
 from potr_cl.formats.scenes.compressed_ply import is_compressed_ply
 from potr_cl.formats.scenes.scene_files import opened
 from potr_cl.host.installation import install_command
-from potr_cl.reference.scenes import random_scene
 from tests.cases.cameras import nerfstudio, view, write_json
 from tests.cases.scenes import in_order_of, turned_by
+from tests.reference.scenes import random_scene
 
 ROOT = Path(__file__).parents[2]
 WRITTEN = [entry for entry in SCENE_FORMATS if entry.save is not None]
@@ -250,16 +250,10 @@ def test_order_in_which_a_folder_is_searched(data: Path, tmp_path: Path) -> None
 # What people see -----------------------------------------------------------------------------------------------------
 
 
-def test_the_documentation_has_the_table() -> None:
-    text = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
-    found = re.findall(r"<!-- generated: formats -->\n(.*?)\n<!-- end -->", text, re.DOTALL)
-    assert found == [registry.formats_table()], "run: python -m tools.make.docs"
-
-
 def test_a_format_is_one_line_of_the_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Reading, writing, messages, help and documentation know a format as soon as the table does."""
+    """Reading, writing, messages and help know a format as soon as the table does."""
 
     def save(path: Path, scene: Scene) -> None:
         np.save(path.open("wb"), scene.means)
@@ -283,7 +277,6 @@ def test_a_format_is_one_line_of_the_table(
     said = " ".join(capsys.readouterr().out.split())
     assert said.count("or .centres") == 2
     assert ".centres needs the extra " in said
-    assert "| Centres (`.centres`) | yes | yes | the extra `centres` |" in registry.formats_table()
 
 
 def test_lists_for_people() -> None:

@@ -10,8 +10,8 @@ import pytest
 
 from potr_cl.formats import load_scene
 from potr_cl.formats.scene_size import bytes_of_scene
-from potr_cl.reference.scenes import random_scene
 from tests.cases.gltf import attributes, described, glb, gltf
+from tests.reference.scenes import random_scene
 
 
 def test_a_buffer_beside_a_gltf_file_counts_once(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from potr_cl import DataError, load_scene
 from potr_cl.errors import UsageError
 from potr_cl.formats import registry, save_scene, streams
 from potr_cl.formats.scenes import ply
-from potr_cl.reference.scenes import random_scene
+from tests.reference.scenes import random_scene
 
 
 class Dripping(io.BytesIO):

@@ -16,7 +16,7 @@ import potr_cl
 from potr_cl.errors import PotrError
 from potr_cl.formats import load_scene
 from potr_cl.host import mapped
-from potr_cl.reference.scenes import random_scene
+from tests.reference.scenes import random_scene
 
 linux = pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="looks at /proc")
 

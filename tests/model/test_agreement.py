@@ -13,10 +13,10 @@ from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model.agreement import judge_cameras, require_agreement
 from potr_cl.model.camera import train_views
 from potr_cl.placement.virtual import place_cameras
-from potr_cl.reference.captures import CAPTURES
-from potr_cl.reference.frames import MISREADINGS, MOTIONS, looking_back, moved, right, without_directions, wrong
-from potr_cl.reference.raster import sh_basis
-from potr_cl.reference.scenes import random_scene, ring_of_cameras
+from tests.reference.captures import CAPTURES
+from tests.reference.frames import MISREADINGS, MOTIONS, looking_back, moved, right, without_directions, wrong
+from tests.reference.raster import sh_basis
+from tests.reference.scenes import random_scene, ring_of_cameras
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import pytest
 
 from potr_cl.errors import DataError
 from potr_cl.model import scene as scene_module
-from potr_cl.reference.scenes import random_scene
+from tests.reference.scenes import random_scene
 
 
 def test_degrees_and_sizes():

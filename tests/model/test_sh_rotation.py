@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from potr_cl.model.sh_rotation import rotated_sh
-from potr_cl.reference.raster import rotation_matrices, sh_basis
-from potr_cl.reference.scenes import random_scene
+from tests.reference.raster import rotation_matrices, sh_basis
+from tests.reference.scenes import random_scene
 
 
 @pytest.mark.parametrize("degree", range(4))

@@ -11,7 +11,7 @@ from potr_cl.host.threads import thread_pool
 from potr_cl.model import morton, splat_groups, unseen
 from potr_cl.model.splat_groups import SplatGroups
 from potr_cl.model.unseen import opacity_weighted_areas, unseen_splats
-from potr_cl.reference.scenes import plain_splats, random_splats, ring_of_cameras, straight_camera
+from tests.reference.scenes import plain_splats, random_splats, ring_of_cameras, straight_camera
 
 
 def test_what_lies_beside_behind_and_right_in_front_is_unseen():

@@ -12,8 +12,8 @@ from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera, camera_centres
 from potr_cl.model.placement.given_views import GivenViews
 from potr_cl.model.views_between import is_between, views_between
-from potr_cl.reference.surfaces import together
 from tests.cases.surfaces import flat_splats, sphere
+from tests.reference.surfaces import together
 
 BALL = sphere(4000, 1.0, 0.03)
 

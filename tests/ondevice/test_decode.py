@@ -30,8 +30,8 @@ from potr_cl.ondevice.staged_bundles import StagedBundles
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers, uploaded
-from potr_cl.reference.scenes import random_scene
 from tests.devices import KERNELS, open_device
+from tests.reference.scenes import random_scene
 
 GOLDEN = sorted((Path(__file__).parents[1] / "data").glob("golden_v*.potr"))
 PARAMETERS = ("means", "scales", "quaternions", "log2_opacities", "sh")

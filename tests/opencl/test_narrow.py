@@ -25,38 +25,38 @@ def integers(count, seed):
 
 
 @pytest.mark.parametrize("kernels", KERNELS)
-@pytest.mark.parametrize("count", [1, 63, 64, 65, 128, 5000])
-def test_integers_arrive_as_they_were(kernels, count):
-    values = integers(count, count)
-    device = open_device(kernels)
-    with Memory(device) as memory, Narrowing(device) as there, Narrowing(device) as here:
-        narrowed = there.download(memory.upload(np.concatenate([[7, 8, 9], values]), "a test"), (count,), 3)
-        assert np.array_equal(narrowed.widened(), values)
-        assert narrowed.nbytes <= (128 + 1) * -(-count // 16)
-        arrived = memory.upload(np.full(count + 2, 5), "a test")
-        here.upload(arrived, narrowed)
-        assert np.array_equal(device.download(arrived, (count + 2,), np.int64), [*values, 5, 5])
-    assert device.allocated == 0
+def test_integers_arrive_as_they_were(kernels):
+    for count in [1, 63, 64, 65, 128, 5000]:
+        values = integers(count, count)
+        device = open_device(kernels)
+        with Memory(device) as memory, Narrowing(device) as there, Narrowing(device) as here:
+            narrowed = there.download(memory.upload(np.concatenate([[7, 8, 9], values]), "a test"), (count,), 3)
+            assert np.array_equal(narrowed.widened(), values)
+            assert narrowed.nbytes <= (128 + 1) * -(-count // 16)
+            arrived = memory.upload(np.full(count + 2, 5), "a test")
+            here.upload(arrived, narrowed)
+            assert np.array_equal(device.download(arrived, (count + 2,), np.int64), [*values, 5, 5])
+        assert device.allocated == 0
 
 
 @pytest.mark.parametrize("kernels", KERNELS)
-@pytest.mark.parametrize(("rows", "columns"), [(1, 100), (5, 64), (17, 41), (136, 192)])
-def test_columns_go_beside_each_other(kernels, rows, columns):
+def test_columns_go_beside_each_other(kernels):
     """Those of a column are about as long; those of columns are not."""
-    rng = np.random.default_rng(rows)
-    long = rng.integers(1, 60, columns)
-    values = (rng.standard_normal((rows, columns)) * 2.0**long).astype(np.int64)
-    device = open_device(kernels)
-    with Memory(device) as memory, Narrowing(device) as there, Narrowing(device) as here:
-        lying = memory.upload(np.concatenate([[7, 8, 9], values.ravel()]), "a test")
-        plain = there.download(lying, (rows, columns), 3).nbytes
-        narrowed = there.download(lying, (rows, columns), 3, turned=True)
-        assert np.array_equal(narrowed.widened(), values)
-        arrived = memory.upload(np.full(rows * columns + 2, 5), "a test")
-        here.upload(arrived, narrowed)
-        assert np.array_equal(device.download(arrived, (rows * columns + 2,), np.int64), [*values.ravel(), 5, 5])
-        if rows > 16:
-            assert narrowed.nbytes < 0.85 * plain
+    for rows, columns in [(1, 100), (5, 64), (17, 41), (136, 192)]:
+        rng = np.random.default_rng(rows)
+        long = rng.integers(1, 60, columns)
+        values = (rng.standard_normal((rows, columns)) * 2.0**long).astype(np.int64)
+        device = open_device(kernels)
+        with Memory(device) as memory, Narrowing(device) as there, Narrowing(device) as here:
+            lying = memory.upload(np.concatenate([[7, 8, 9], values.ravel()]), "a test")
+            plain = there.download(lying, (rows, columns), 3).nbytes
+            narrowed = there.download(lying, (rows, columns), 3, turned=True)
+            assert np.array_equal(narrowed.widened(), values)
+            arrived = memory.upload(np.full(rows * columns + 2, 5), "a test")
+            here.upload(arrived, narrowed)
+            assert np.array_equal(device.download(arrived, (rows * columns + 2,), np.int64), [*values.ravel(), 5, 5])
+            if rows > 16:
+                assert narrowed.nbytes < 0.85 * plain
 
 
 @pytest.mark.parametrize("count", [0, 1, 200])

@@ -12,8 +12,8 @@ from potr_cl.opencl.memory import Memory
 from potr_cl.opencl.sending import Sending
 from potr_cl.raster import scene_buffers
 from potr_cl.raster.scene_buffers import uploaded
-from potr_cl.reference.scenes import random_scene
 from tests.devices import FAMILIES, open_device
+from tests.reference.scenes import random_scene
 
 
 @pytest.fixture(scope="module", params=FAMILIES)

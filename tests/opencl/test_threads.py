@@ -15,7 +15,7 @@ import pytest
 from potr_cl.opencl.building import building
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer, render
-from potr_cl.reference.scenes import random_scene, ring_of_cameras
+from tests.reference.scenes import random_scene, ring_of_cameras
 
 
 @pytest.fixture(scope="module")

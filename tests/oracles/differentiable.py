@@ -1,7 +1,7 @@
 """A plain renderer of splats in PyTorch, float64, whose derivatives autograd finds: :func:`picture`.
 
 It is written from the definition in the original paper (Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance
-Field Rendering", 2023) with whole matrices of pixels by splats, and shares no formula with potr_cl/reference. Needs the
+Field Rendering", 2023) with whole matrices of pixels by splats, and shares no formula with tests/reference. Needs the
 extra "torch".
 """
 

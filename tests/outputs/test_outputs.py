@@ -23,9 +23,9 @@ from potr_cl.outputs.spz import Spz
 from potr_cl.pipeline.encoded import Encoded
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.reference.scenes import random_scene
 from tests.cases import judging
 from tests.cases.scenes import antialiased
+from tests.reference.scenes import random_scene
 
 EVERY = [*(kind() for kind in OUTPUTS), Spz(version=3), Spz(version=4)]
 OTHERS = EVERY[1:]

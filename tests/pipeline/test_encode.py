@@ -17,12 +17,12 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.run import Run
 from potr_cl.pipeline.stopwatch import Stopwatch
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.reference.scenes import random_scene, ring_of_cameras
 from potr_cl.stages.code import Code
 from potr_cl.stages.compact import Compact
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.stage import State
 from tests.devices import FAMILIES, open_device
+from tests.reference.scenes import random_scene, ring_of_cameras
 
 FEW = EncodeOptions.for_preset("paper", prune={"iterations": 6})
 

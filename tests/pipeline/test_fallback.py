@@ -14,9 +14,9 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.reference.scenes import random_scene, ring_of_cameras
 from potr_cl.stages.pruning.sweep_options import default_memory
 from tests.devices import skip_without_cpu
+from tests.reference.scenes import random_scene, ring_of_cameras
 
 # Tolerance 0: views that are made anew each time are swept in full, and so are those that are kept.
 OPTIONS = EncodeOptions.for_preset("paper", prune={"iterations": 3, "tolerance": 0})

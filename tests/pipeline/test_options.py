@@ -15,12 +15,12 @@ from potr_cl.codec import quantize
 from potr_cl.errors import UsageError
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.pipeline.presets import DEFAULT, PRESETS, presets_table, stages_of
-from potr_cl.reference.scenes import random_scene
+from potr_cl.pipeline.presets import DEFAULT, PRESETS, stages_of
 from potr_cl.stages.code import Code
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.refit import Refit
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
+from tests.reference.scenes import random_scene
 
 
 def test_no_options_are_the_default_preset():
@@ -96,12 +96,6 @@ def test_options_are_ready_for_json():
     back = json.loads(json.dumps(options.as_dict()))
     assert back["refit"]["ground_truth"] == "photos"
     assert back["prune"]["iterations"] == 16
-
-
-def test_the_table_names_every_preset_and_marks_the_default():
-    lines = presets_table().splitlines()[2:]
-    assert [line.split("`")[1] for line in lines] == list(PRESETS)
-    assert ["(default)" in line for line in lines] == [name == DEFAULT for name in PRESETS]
 
 
 @dataclass(frozen=True)

@@ -21,10 +21,10 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.search import encode_to_target
 from potr_cl.pipeline.target import KINDS, Target
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.reference.scenes import random_scene, ring_of_cameras
 from potr_cl.stages.stage import Stage
 from tests.cases import judging
 from tests.devices import skip_without_cpu
+from tests.reference.scenes import random_scene, ring_of_cameras
 
 FEW = EncodeOptions.for_preset("paper", prune={"iterations": 6})
 

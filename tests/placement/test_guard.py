@@ -16,8 +16,6 @@ from potr_cl.pipeline.run import Run
 from potr_cl.pipeline.stopwatch import Stopwatch
 from potr_cl.placement.guard import unresolved
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.reference.captures import looking
-from potr_cl.reference.surfaces import together
 from potr_cl.stages.code import Code
 from potr_cl.stages.guarded import UNRESOLVED
 from potr_cl.stages.pruning.on_device import prune_scene
@@ -26,6 +24,8 @@ from potr_cl.stages.pruning.schedule import PruningOptions
 from potr_cl.stages.stage import State
 from tests.cases.surfaces import box
 from tests.devices import FAMILIES, open_device
+from tests.reference.captures import looking
+from tests.reference.surfaces import together
 
 #: Splats of a room.
 _EACH = 4000

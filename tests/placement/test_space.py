@@ -14,11 +14,11 @@ from potr_cl.model.spherical_harmonics import energy, unit_coefficients
 from potr_cl.placement.memory import Memory
 from potr_cl.placement.rays import resolved_by, shown_from
 from potr_cl.placement.space import Space, _distances
-from potr_cl.reference.captures import looking
-from potr_cl.reference.scenes import random_scene
-from potr_cl.reference.surfaces import together
 from tests.cases.surfaces import box, flat_splats, sphere
 from tests.devices import KERNELS, open_device
+from tests.reference.captures import looking
+from tests.reference.scenes import random_scene
+from tests.reference.surfaces import together
 
 ROOM = together(box(9000, (3, 4, 1.5), 0.08), sphere(2000, 0.5, 0.04))
 

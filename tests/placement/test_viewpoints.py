@@ -14,9 +14,9 @@ from potr_cl.model.camera import camera_centres, focus
 from potr_cl.model.scene import Scene
 from potr_cl.placement.viewpoints import AXES, guess_up, look_around, turntable
 from potr_cl.placement.virtual import judging_views, place_cameras
-from potr_cl.reference.scenes import random_scene
-from potr_cl.reference.surfaces import together
 from tests.cases.surfaces import flat_splats
+from tests.reference.scenes import random_scene
+from tests.reference.surfaces import together
 
 
 def rotated(scene: Scene, rotation: np.ndarray) -> Scene:

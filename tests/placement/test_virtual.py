@@ -17,10 +17,10 @@ from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.placement.virtual import judging_views, place_cameras
 from potr_cl.raster.rules import INRIA
-from potr_cl.reference.raster import sh_basis
-from potr_cl.reference.scenes import random_scene
-from potr_cl.reference.surfaces import together
 from tests.cases.surfaces import box, flat_splats, sphere
+from tests.reference.raster import sh_basis
+from tests.reference.scenes import random_scene
+from tests.reference.surfaces import together
 
 BALL = sphere(8000, 1.0, 0.03)
 ROOM = box(12000, (3, 4, 1.5), 0.08)

@@ -33,7 +33,7 @@ from potr_cl.quality.compare import (
 from potr_cl.quality.judging import Judging, Looks
 from potr_cl.quality.metrics import psnr, ssim
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.reference.scenes import ring_of_cameras
+from tests.reference.scenes import ring_of_cameras
 
 BACKGROUND = (0.25, 0.5, 1.0)
 

@@ -13,7 +13,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.quality.metrics import psnr
 from potr_cl.raster.rasterizer import render
-from potr_cl.reference.scenes import random_scene, ring_of_cameras
+from tests.reference.scenes import random_scene, ring_of_cameras
 
 CAMERAS = ring_of_cameras(8)
 SCENE = random_scene(80, 1)

@@ -13,10 +13,10 @@ from potr_cl.opencl.device import Device
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.quality.metrics import psnr
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.reference.scenes import random_scene, ring_of_cameras
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets
+from tests.reference.scenes import random_scene, ring_of_cameras
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from potr_cl.model.lens import Lens
 from potr_cl.opencl.device import Device
 from potr_cl.quality.photographs import read_photograph, undistorted
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.reference.scenes import random_scene, ring_of_cameras
+from tests.reference.scenes import random_scene, ring_of_cameras
 
 LENS = Lens(200, 150, 180, 185, 101, 74, radial=(-0.15, 0.04), tangential=(0.002, -0.001))
 

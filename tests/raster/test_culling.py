@@ -11,12 +11,12 @@ from potr_cl.model import splat_groups
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.model.splat_groups import SplatGroups
-from potr_cl.raster.culling import part_seen, parts_of_views, parts_seen, work
+from potr_cl.raster.culling import part_seen, parts_of_views, work
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import GSPLAT, INRIA, RasterRules
-from potr_cl.reference.captures import looking
-from potr_cl.reference.scenes import random_scene
 from tests.devices import FAMILIES, open_device
+from tests.reference.captures import looking
+from tests.reference.scenes import random_scene
 
 
 @pytest.fixture(scope="module", params=FAMILIES)
@@ -127,12 +127,10 @@ def test_parts_have_all_views_and_what_they_see(monkeypatch):
 
 
 def test_what_views_see_is_told_from_few_splats():
-    """Little less than they do, view by view; and nothing is left out where no view says so."""
+    """About as much as they do; and nothing is left out where no view says so."""
     scene = clusters(6)
-    cameras = wide_and_narrow(scene, 40, 7, (0.05, 1.0))
+    cameras = wide_and_narrow(scene, 12, 7, (0.05, 1.0))
     groups = SplatGroups.of(scene, 1)
-    told, seen = parts_seen(scene, cameras, INRIA.near), groups.visible_by(cameras, INRIA.near).mean(axis=1)
-    assert told.shape == (40,)
-    assert np.corrcoef(told, seen)[0, 1] > 0.9
-    assert told.mean() == pytest.approx(part_seen(scene, cameras, INRIA.near))
+    seen = groups.visible_by(cameras, INRIA.near).mean()
+    assert part_seen(scene, cameras, INRIA.near) == pytest.approx(seen, rel=0.3)
     assert part_seen(scene, [], INRIA.near) == 1

@@ -17,11 +17,11 @@ from potr_cl.raster import kept_scene, scene_buffers
 from potr_cl.raster.kept_scene import KeptScene, PartOfKept, lying_on
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers
-from potr_cl.reference.scenes import random_splats, straight_camera
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.workers.host import HostPool
 from tests.devices import FAMILIES, open_device
+from tests.reference.scenes import random_splats, straight_camera
 
 OPTIONS = EncodeOptions.for_preset("best", prune={"iterations": 8}, compact={"on": True})
 

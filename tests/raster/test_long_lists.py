@@ -9,8 +9,8 @@ import pytest
 
 from potr_cl.raster import launch_gpu, long_lists
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.reference.scenes import ring_of_cameras, visible_scene
 from tests.devices import KERNELS, open_device
+from tests.reference.scenes import ring_of_cameras, visible_scene
 
 
 @pytest.fixture(scope="module", params=[kernels for kernels in KERNELS if "gpu" in str(kernels)])

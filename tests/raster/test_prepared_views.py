@@ -14,11 +14,11 @@ from potr_cl.opencl.memory import Memory
 from potr_cl.raster.preparation import Preparation
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.view_set import ViewSet
-from potr_cl.reference.scenes import plain_splats as splats
-from potr_cl.reference.scenes import random_splats, tilted_camera
-from potr_cl.reference.scenes import straight_camera as camera
 from tests.devices import open_device
 from tests.raster.test_rasterizer import read_lists
+from tests.reference.scenes import plain_splats as splats
+from tests.reference.scenes import random_splats, tilted_camera
+from tests.reference.scenes import straight_camera as camera
 
 
 def test_prepared_views_composite_as_rendered(device: Device) -> None:

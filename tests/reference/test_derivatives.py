@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from potr_cl.raster.rules import GSPLAT, INRIA
-from potr_cl.reference.derivatives import gradient
-from potr_cl.reference.raster import render
-from potr_cl.reference.scenes import ring_of_cameras, tilted_camera, visible_scene
+from tests.reference.derivatives import gradient
+from tests.reference.raster import render
+from tests.reference.scenes import ring_of_cameras, tilted_camera, visible_scene
 
 PARAMETERS = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
 

@@ -12,8 +12,8 @@ from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import PotrFile
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.quantize import HyperParameters
-from potr_cl.reference.scenes import random_scene
 from potr_cl.report.file import file_report, format_report
+from tests.reference.scenes import random_scene
 
 #: Enough for the context coder to be taken without trying others.
 SPLATS = 33_000

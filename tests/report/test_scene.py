@@ -12,8 +12,8 @@ import potr_cl
 from potr_cl import Scene
 from potr_cl.formats import registry
 from potr_cl.formats.scenes import ply
-from potr_cl.reference.scenes import random_scene
 from potr_cl.report.scene import format_scene, scene_report
+from tests.reference.scenes import random_scene
 
 
 @pytest.fixture

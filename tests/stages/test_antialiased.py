@@ -12,17 +12,17 @@ from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
-from potr_cl.reference import raster as reference
-from potr_cl.reference.refit import to_ycocg
-from potr_cl.reference.refit_cases import Case, Linearised
-from potr_cl.reference.removal import BruteForce
-from potr_cl.reference.scenes import ring_of_cameras, visible_scene
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS, ViewWeights
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from tests.cases.scenes import antialiased
 from tests.devices import KERNELS, open_device
+from tests.reference import raster as reference
+from tests.reference.refit import to_ycocg
+from tests.reference.refit_cases import Case, Linearised
+from tests.reference.removal import BruteForce
+from tests.reference.scenes import ring_of_cameras, visible_scene
 
 LOW_PASSES = [LOW_PASS, MIP_SPLATTING_LOW_PASS]
 

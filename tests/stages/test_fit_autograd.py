@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from potr_cl.raster.rules import GSPLAT, INRIA
-from potr_cl.reference.derivatives import gradient
-from potr_cl.reference.raster import render
-from potr_cl.reference.scenes import ring_of_cameras, tilted_camera, visible_scene
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from tests.devices import KERNELS, open_device
+from tests.reference.derivatives import gradient
+from tests.reference.raster import render
+from tests.reference.scenes import ring_of_cameras, tilted_camera, visible_scene
 
 torch = pytest.importorskip("torch", reason="the extra torch is not installed")
 

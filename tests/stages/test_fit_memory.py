@@ -9,7 +9,7 @@ import pytest
 
 from potr_cl.model.camera import resized, train_views
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.forecast import forecast
+from potr_cl.pipeline.forecast import memory_needed
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.fit import FitOptions, fit_scene
@@ -91,7 +91,7 @@ def test_the_forecast_knows_of_the_fit(device, own, many_splats, views):
     opened = Device(info, family=device.family)
 
     def memory(**changes):
-        return forecast(many_splats, views, EncodeOptions().changed(**changes), opened).memory
+        return memory_needed(many_splats, views, EncodeOptions().changed(**changes), opened)
 
     without, with_it = memory(memory=0), memory(memory=0, fit={"steps": 1000})
     assert with_it - without > 30_000 * 59 * 4 * 3

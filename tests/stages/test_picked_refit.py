@@ -12,7 +12,6 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.reference.refit_cases import Case, Linearised
 from potr_cl.stages.refitting import colour_map, placement, reached
 from potr_cl.stages.refitting.colour_refit import ColourRefit
 from potr_cl.stages.refitting.picked_views import PickedViews
@@ -22,6 +21,7 @@ from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.workers.host import HostPool
 from tests.cases.streets import street
 from tests.devices import KERNELS, open_device
+from tests.reference.refit_cases import Case, Linearised
 from tests.stages.test_sliced_refit import coarse, grid_of, same
 
 

@@ -9,12 +9,12 @@ import pytest
 
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.reference.scenes import ring_of_cameras, visible_scene
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions, SmoothedEffects, choose, prune
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from tests.devices import KERNELS, open_device
+from tests.reference.scenes import ring_of_cameras, visible_scene
 
 OPTIONS = PruningOptions(2e-6, 8)
 
@@ -164,7 +164,7 @@ def test_the_same_without_atomics_on_64_bits(gpu, plush_excerpt, cameras):
 @pytest.mark.one_runtime
 def test_options_that_only_the_host_knows(gpu, plush_excerpt, cameras):
     with Rasterizer(gpu, plush_excerpt) as rasterizer:
-        for sweep in (SweepOptions(turns=2), SweepOptions(sample=0.5), SweepOptions(memory=0)):
+        for sweep in (SweepOptions(turns=2), SweepOptions(memory=0)):
             with RemovalSweep(rasterizer, cameras, sweep) as removal:
                 assert removal.steering is None
                 assert prune_scene(removal, OPTIONS).kept < 1500

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from potr_cl.outputs.colour_grid import ColourGrid
-from potr_cl.reference.refit import to_ycocg
-from potr_cl.reference.refit_cases import Case
-from potr_cl.reference.scenes import ring_of_cameras, visible_scene
 from potr_cl.stages.refitting.colour_refit import ColourRefit
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from tests.devices import KERNELS, open_device
+from tests.reference.refit import to_ycocg
+from tests.reference.refit_cases import Case
+from tests.reference.scenes import ring_of_cameras, visible_scene
 
 
 @pytest.fixture(scope="module", params=KERNELS)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from potr_cl.model.camera import Camera
-from potr_cl.reference.refit import to_ycocg
-from potr_cl.reference.refit_cases import Case, Linearised
-from potr_cl.reference.scenes import plain_splats, ring_of_cameras, straight_camera, visible_scene
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from tests.devices import KERNELS, open_device
+from tests.reference.refit import to_ycocg
+from tests.reference.refit_cases import Case, Linearised
+from tests.reference.scenes import plain_splats, ring_of_cameras, straight_camera, visible_scene
 
 
 @pytest.fixture(scope="module", params=KERNELS)
@@ -144,23 +144,23 @@ def test_a_strong_pull_to_zero_is_no_better_than_what_it_costs(case):
     solve_and_check(case, RefitOptions(steps=20, gain=0, prior=1e12))
 
 
-@pytest.mark.parametrize("value", [1e4, 1e10, 1e30, 3e38])
-@pytest.mark.parametrize("where", ["dc", "ac", "both"])
-def test_absurd_coefficients(device, value, where):
-    scene = visible_scene(40)
-    rng = np.random.default_rng(0)
-    for k in range(0, 40, 7):
-        if where != "ac":
-            scene.sh[k, 0] = value * rng.choice([-1, 1], size=3)
-        if where != "dc":
-            scene.sh[k, 1:] = value * rng.choice([-1, 1], size=(15, 3))
-    with Case(device, scene, visible_scene(60, 2, 7), ring_of_cameras(3, size=40)) as case:
-        for options in (RefitOptions(), RefitOptions(lam=1), RefitOptions(prior=0), RefitOptions(drop=1e-7)):
-            refitted = case.solve(options)
-            assert np.isfinite(refitted.sh).all()
-            assert np.isfinite(refitted.errors).all()
-            if not options.drop:
-                assert refitted.errors[1] <= refitted.errors[0] or options.lam
+def test_absurd_coefficients(device):
+    for where in ["dc", "ac", "both"]:
+        for value in [1e4, 1e10, 1e30, 3e38]:
+            scene = visible_scene(40)
+            rng = np.random.default_rng(0)
+            for k in range(0, 40, 7):
+                if where != "ac":
+                    scene.sh[k, 0] = value * rng.choice([-1, 1], size=3)
+                if where != "dc":
+                    scene.sh[k, 1:] = value * rng.choice([-1, 1], size=(15, 3))
+            with Case(device, scene, visible_scene(60, 2, 7), ring_of_cameras(3, size=40)) as case:
+                for options in (RefitOptions(), RefitOptions(lam=1), RefitOptions(prior=0), RefitOptions(drop=1e-7)):
+                    refitted = case.solve(options)
+                    assert np.isfinite(refitted.sh).all()
+                    assert np.isfinite(refitted.errors).all()
+                    if not options.drop:
+                        assert refitted.errors[1] <= refitted.errors[0] or options.lam
 
 
 def test_absurd_targets(device):

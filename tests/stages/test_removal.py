@@ -13,13 +13,13 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
-from potr_cl.reference import raster as reference
-from potr_cl.reference.removal import BruteForce
-from potr_cl.reference.scenes import ring_of_cameras, visible_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions, prune
 from potr_cl.stages.pruning.sweep_options import SweepOptions, default_memory
 from tests.devices import KERNELS, open_device
+from tests.reference import raster as reference
+from tests.reference.removal import BruteForce
+from tests.reference.scenes import ring_of_cameras, visible_scene
 
 
 @pytest.fixture(scope="module", params=KERNELS)
@@ -205,49 +205,6 @@ def test_tolerance_saves_sweeps(device, plush_excerpt, plush_excerpt_cameras):
     assert sweeps[0] > sweeps[1] > sweeps[2] >= 1
 
 
-def test_tightened_lists_change_no_result(device, plush_excerpt, plush_excerpt_cameras):
-    results, intersections = {}, {}
-    for tighten in (False, True):
-        with (
-            Rasterizer(device, plush_excerpt) as rasterizer,
-            RemovalSweep(rasterizer, plush_excerpt_cameras[:3], SweepOptions(-1, tighten=tighten)) as removal,
-        ):
-            measured = [removal.measure()]
-            for start in (0, 3, 5):
-                removal.remove(np.arange(start, 1500, 7))
-                measured.append(removal.measure())
-            intersections[tighten] = removal.intersections_left()
-            views = [np.concatenate([splats, weights]) for _, splats, weights in removal.view_importances()]
-            results[tighten] = np.concatenate([np.ravel(measured), *views])
-    if device.family == "cpu":
-        assert np.array_equal(results[False], results[True])
-    else:  # the order in which the pixels of a tile are added depends on an intersection's place in the list
-        assert np.allclose(results[False], results[True], rtol=1e-6, atol=1e-6 * results[False][:1500].max())
-    assert intersections[True] < intersections[False]
-
-
-def test_tightened_lists_keep_what_is_hidden(device):
-    """Behind the end of all pixels, intersections stay: they come back when what hides them goes."""
-    scene = visible_scene(30, 0, seed=4).subset(np.arange(60) % 30)
-    scene.log_scales[:30], scene.opacity_logits[:30] = 3, 12  # thirty walls
-    cameras = ring_of_cameras(2, size=32)
-    effects = {}
-    for tighten in (False, True):
-        with (
-            Rasterizer(device, scene) as rasterizer,
-            RemovalSweep(
-                rasterizer, cameras, SweepOptions(-1, tighten=tighten, transmittance_threshold=None)
-            ) as removal,
-        ):
-            hidden = removal.measure()[1][30:] == 0
-            removal.measure()
-            removal.remove(np.arange(30))
-            effects[tighten] = removal.measure()
-    assert hidden.any()
-    assert np.array_equal(np.stack(effects[False])[:, 30:], np.stack(effects[True])[:, 30:])
-    assert (effects[True][1][30:][hidden] > 0).any()
-
-
 def test_a_removal_lets_pixels_go_on(device):
     """Where pixels end early, effects are those of the same limit on transmittance; small limits leave no jump."""
     scene = visible_scene(300, 0, seed=2).subset(np.repeat(np.arange(300), 3))
@@ -271,36 +228,6 @@ def test_a_removal_lets_pixels_go_on(device):
     assert shares[SweepOptions.transmittance_threshold] > 0.98
 
 
-@pytest.mark.one_runtime
-def test_a_random_sample_of_tiles(device, plush_excerpt, plush_excerpt_cameras):
-    """Reproducible, fewer sweeps, every tile when sampling is over."""
-    results, sweeps = [], []
-    for options in (
-        SweepOptions(0),
-        SweepOptions(0, sample=0.3, sampled=2),
-        SweepOptions(0, sample=0.3, sampled=2),
-        SweepOptions(0, sample=0.3, sampled=2, seed=1),
-    ):
-        with (
-            Rasterizer(device, plush_excerpt) as rasterizer,
-            RemovalSweep(rasterizer, plush_excerpt_cameras[:3], options) as removal,
-        ):
-            removal.measure()
-            measured = []
-            for start in range(2):
-                removal.remove(np.arange(start, 1500, 10))
-                measured.append(np.stack(removal.measure())[:, np.arange(5, 1500, 10)])
-            sweeps.append(removal.sweeps)
-            measured.append(np.stack(removal.measure())[:, np.arange(5, 1500, 10)])
-            results.append(measured)
-    everything, first, again, other = results
-    assert sweeps[1] < sweeps[0]
-    assert np.array_equal(first, again)
-    assert not np.array_equal(first[0], other[0])
-    assert not np.array_equal(first[0], everything[0])
-    assert np.array_equal(first[2], everything[2])
-
-
 @pytest.mark.parametrize(
     "bad",
     [
@@ -311,9 +238,6 @@ def test_a_random_sample_of_tiles(device, plush_excerpt, plush_excerpt_cameras):
         {"transmittance_threshold": 0.0},
         {"transmittance_threshold": 1.0},
         {"transmittance_threshold": np.nan},
-        {"sample": 0.0},
-        {"sample": 1.5},
-        {"sampled": -1},
     ],
 )
 def test_options_out_of_range(bad):

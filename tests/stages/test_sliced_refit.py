@@ -12,14 +12,14 @@ from potr_cl.opencl.device import Device
 from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.reference.refit_cases import Case
-from potr_cl.reference.scenes import ring_of_cameras, visible_scene
 from potr_cl.stages import refit as refit_stage
 from potr_cl.stages.refitting import placement
 from potr_cl.stages.refitting.colour_refit import ColourRefit
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from tests.devices import KERNELS, open_device
+from tests.reference.refit_cases import Case
+from tests.reference.scenes import ring_of_cameras, visible_scene
 
 #: Slices of 256 splats, the fewest that there can be: three of the scene, and three pieces of its vectors.
 SLICES = 256

@@ -1,4 +1,4 @@
-"""Which tiles are swept again: by tolerance, in turns, at random, and as lists of the sets."""
+"""Which tiles are swept again: by tolerance, in turns, and as lists of the sets."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_tiles_staler_than_the_tolerance():
 
 
 def test_the_first_measurement_takes_all_tiles_whatever_is_traded():
-    schedule = TileSchedule(SweepOptions(0.1, turns=3, sample=0.01), VIEWS)
+    schedule = TileSchedule(SweepOptions(0.1, turns=3), VIEWS)
     assert schedule.choose(0, NEVER_SWEPT).tolist() == [0, 1, 2, 3, 4]
 
 
@@ -42,7 +42,7 @@ def test_swept_tiles_are_fresh_but_for_a_negative_tolerance(tolerance, again):
 
 
 def test_changed_tiles_are_those_that_lost_anything():
-    schedule = TileSchedule(SweepOptions(0.5, turns=7, sample=0.01), VIEWS)
+    schedule = TileSchedule(SweepOptions(0.5, turns=7), VIEWS)
     assert schedule.changed(staleness(0, 1e-30, 0.2, np.inf, 0)).tolist() == [1, 2, 3]
 
 
@@ -62,22 +62,6 @@ def test_each_view_has_its_turn_once_in_every_round(turns, views, measurement):
             assert np.isin(np.arange(start, stop), tiles).sum() in (0, stop - start)
 
 
-def test_a_sample_is_of_its_size_and_depends_on_the_seed_alone():
-    stale = np.ones(10_000, np.float32)
-    one, again, other = (
-        TileSchedule(SweepOptions(0, sample=0.3, seed=seed), [(0, len(stale))]).choose(1, stale).tolist()
-        for seed in (0, 0, 1)
-    )
-    assert one == again != other
-    assert len(one) == pytest.approx(3000, abs=200)
-
-
-def test_sampling_ends():
-    schedule = TileSchedule(SweepOptions(0, sample=0.01, sampled=2), [(0, 1000)])
-    stale = np.ones(1000, np.float32)
-    assert [len(schedule.choose(i, stale)) == 1000 for i in range(4)] == [True, False, False, True]
-
-
 @given(st.lists(st.integers(1, 9), max_size=6), st.data())
 def test_lists_of_the_sets_name_the_same_tiles(sizes, data):
     starts = np.cumsum([0, *sizes])
@@ -94,6 +78,6 @@ def test_lists_of_the_sets_name_the_same_tiles(sizes, data):
 
 
 def test_without_cached_views_there_is_nothing_to_sweep():
-    schedule = TileSchedule(SweepOptions(0, turns=2, sample=0.5), [])
+    schedule = TileSchedule(SweepOptions(0, turns=2), [])
     assert len(schedule.choose(1, np.zeros(0, np.float32))) == 0
     assert by_set(np.zeros(0, np.int64), []).counts == []

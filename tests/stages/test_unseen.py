@@ -11,10 +11,10 @@ from potr_cl import EncodeOptions, Scene, UsageError, decode, encode
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.model.camera import train_views
 from potr_cl.opencl.device import Device
-from potr_cl.reference.surfaces import together
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.stage import State, Workbench
 from tests.devices import FAMILIES, open_device
+from tests.reference.surfaces import together
 
 FEW = {"iterations": 3}
 

@@ -14,12 +14,12 @@ from potr_cl.model.camera import Camera, camera_centres, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.reference.scenes import random_scene
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, Weighting
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS, ViewWeights
 from potr_cl.stages.pruning.removal import RemovalSweep
 from tests.cases.ridges import check_optimal, dense_weights, on_a_sphere
 from tests.devices import KERNELS, open_device
+from tests.reference.scenes import random_scene
 
 
 @pytest.fixture(scope="module", params=KERNELS)

@@ -10,8 +10,6 @@ from contextlib import contextmanager
 import pytest
 
 from potr_cl.errors import DeviceMemoryError, UsageError
-from potr_cl.workers import pace
-from potr_cl.workers.dealing import in_pieces, shares
 from potr_cl.workers.parts import Each, Parts
 from potr_cl.workers.pool import Held, Part, Pool, Shared, Traffic, Worker, WorkerLost
 
@@ -146,18 +144,14 @@ def test_what_several_threads_count_is_all_counted():
     assert traffic == Traffic(sent=40_000, received=80_000)
 
 
-@pytest.mark.parametrize("how", ["lost", "behind"])
-def test_who_stands_still_in_another_work_is_not_waited_for_in_the_end(how, monkeypatch):
+def test_who_stands_still_in_another_work_is_not_waited_for_in_the_end(monkeypatch):
     ended = []
     monkeypatch.setattr(FakeHeld, "close", lambda held: ended.append((held.worker.name, "waited")))
     monkeypatch.setattr(FakeHeld, "abandon", lambda held: ended.append((held.worker.name, "left")), raising=False)
     still, other = FakeWorker("a"), FakeWorker("b")
     with Parts(FakePool(still, other), Sum, [(0, 1), (0, 2)]) as parts:
         assert parts.tell("add", 1) == [1, 2]
-        if how == "lost":
-            still.lost = True
-        else:
-            still.behind = Future()
+        still.lost = True
     assert ended == [("a", "left"), ("b", "waited")]
 
 
@@ -191,20 +185,6 @@ def test_a_refusal_is_no_loss():
         assert parts.tell("add", 2) == [2, 2]
 
 
-def test_how_fast_workers_are_shows_in_their_first_work():
-    """What follows from that: tests/workers/test_pace.py."""
-    a, b = FakeWorker("a"), FakeWorker("b")
-    with Parts(FakePool(a, b), Sum, [(0, 1), (0, 4)], views=[15, 15]) as parts:
-        began = time.monotonic()
-        for number in range(5):
-            parts.tell("add", number)
-        took = time.monotonic() - began
-        assert a.rate is None
-    assert a.rate is not None
-    assert b.rate is not None
-    assert min(a.rate, b.rate) >= 5 * 15 / took
-
-
 def test_a_log_that_begins_anew_is_not_replayed_whole():
     first, second = FakeWorker("a", 12), FakeWorker("b")
     with Parts(FakePool(first, second), Sum, [(0, 1)]) as parts:
@@ -235,156 +215,9 @@ def test_threads_forget_their_parts_meanwhile(in_process, monkeypatch):
     assert order == ["went on", "forgotten", "forgotten"]
 
 
-class Slow(Sum):
-    """Does nothing for a while on workers that stand still; views are the numbers that it multiplies by."""
-
-    def __init__(self, device, memory, numbers):
-        self.numbers = numbers
-        self.total = 0
-        here.wait("make")
-
-    @classmethod
-    def split(cls, given, pieces):
-        (numbers,) = given
-        return [(own,) for own in in_pieces(numbers, pieces)]
-
-    def add(self, number):
-        here.wait("add")
-        self.total += number * sum(self.numbers)
-        return self.total
-
-
-here = threading.local()
-
-
-class Runner(FakeWorker):
-    """A worker that stands still, from its n-th "add" or "make" on, until it is let go on."""
-
-    def __init__(self, name, adds=None, makes=None):
-        super().__init__(name)
-        self.go_on = threading.Event()
-        self.begun = dict.fromkeys(("add", "make"), 0)
-        self.still_at = {"add": adds, "make": makes}
-        self.threads.submit(setattr, here, "wait", self.wait)
-
-    def wait(self, what):
-        self.begun[what] += 1
-        still_at = self.still_at[what]
-        if still_at is not None and self.begun[what] >= still_at:
-            self.go_on.wait(300)
-
-
-@pytest.fixture
-def runners():
-    """Workers that go on when a test ends."""
-    made = []
-
-    def of(*args, **choices):
-        made.append(Runner(*args, **choices))
-        return made[-1]
-
-    yield of
-    for each in made:
-        each.go_on.set()
-
-
-@pytest.fixture
-def in_a_hurry(monkeypatch):
-    """Slow workers are waited for little, but longer than those that a busy machine holds up."""
-    monkeypatch.setattr(pace, "_AT_LEAST", 0.5)
-    monkeypatch.setattr(pace, "_AT_FIRST", 1.5)
-
-
-def relieving(*workers):
-    pool = FakePool(*workers)
-    pool.relieves = True
-    return pool
-
-
-def sums(pool, rounds, views=12):
-    """What is found in each round, summed over parts."""
-    share = shares(pool, views).others
-    with Parts(pool, Slow, [(own,) for own in share], views=[len(own) for own in share]) as parts:
-        return [sum(parts.tell("add", number)) for number in range(rounds)]
-
-
-def sums_of_one(rounds):
-    return sums(FakePool(Runner("one")), rounds)
-
-
-@pytest.mark.parametrize("workers", [2, 3])
-def test_others_do_the_views_of_a_slow_worker(workers, in_a_hurry, caplog, runners):
-    """No round waits until it is done. How long it is waited for: tests/workers/test_pace.py."""
-    slow = runners("slow", adds=1)
-    assert sums(relieving(slow, *(runners(str(number)) for number in range(1, workers))), 8) == sums_of_one(8)
-    assert slow.begun["add"] == 1
-    assert slow.is_behind
-    assert "worker slow is slow: its views go to 1" in caplog.text
-
-
-def test_who_becomes_slow_on_the_way_and_who_is_slow_from_the_beginning(in_a_hurry, runners):
-    slow = runners("b", adds=6)
-    assert sums(relieving(runners("a"), slow, runners("c")), 12) == sums_of_one(12)
-    assert 0 < slow.begun["add"] <= 6
-    slow = runners("b", makes=1)
-    assert sums(relieving(runners("a"), slow, runners("c")), 3) == sums_of_one(3)
-    assert slow.begun == {"make": 1, "add": 0}
-
-
-def test_a_slow_worker_gets_little_in_the_next_work(in_a_hurry, runners):
-    slow = runners("slow", adds=1)
-    pool = relieving(slow, runners("a"), runners("b"))
-    sums(pool, 6)
-    assert slow.is_behind
-    # One that is still at something gets nothing; what it gets then depends on how long it was at it.
-    assert slow.rate is not None
-    slow.go_on.set()
-    assert slow.behind is not None
-    slow.behind.result(300)
-    share = shares(pool, 34)
-    counts = dict(zip(share.names, map(len, share.others), strict=True))
-    # It did 4 views in the time in which one of the others did 4 to 6 six times.
-    assert counts.get("slow", 0) <= 4
-    assert counts.get("a", 0) + counts.get("b", 0) >= 30
-
-
-def test_a_slow_worker_is_waited_for_where_others_cannot(in_a_hurry, runners):
-    """They have no room, say; and it is asked once only."""
-    slow = runners("slow", adds=1)
-
-    class Large(Slow):
-        made = 0
-
-        def __init__(self, device, memory, numbers):
-            Large.made += 1
-            if Large.made > 2:
-                slow.go_on.set()  # the other one has been asked
-                raise DeviceMemoryError("too little memory")
-            super().__init__(device, memory, numbers)
-
-    pool = relieving(slow, runners("a"))
-    with Parts(pool, Large, [([1, 2, 3],), ([4, 5],)]) as parts:
-        assert [sum(parts.tell("add", 1)) for _ in range(3)] == [15, 30, 45]
-    assert Large.made == 3
-
-
-def test_what_a_worker_is_still_at_is_nothing_to_add_to():
-    """One that others have overtaken gets no part until it is done."""
-    late: Future = Future()
-    worker = Runner("a")
-    worker.behind = late
-    assert worker.is_behind
-    late.set_result(None)
-    assert not worker.is_behind
-
-
 def test_parts_go_to_the_workers_that_they_were_meant_for():
     """Where the first worker gets none, it gets none."""
     a, b, c = (FakeWorker(name) for name in "abc")
-    a.rate, b.rate, c.rate = 0.1, 1.0, 1.0
-    pool = FakePool(a, b, c)
-    share = shares(pool, 2)
-    assert share.names == ("b", "c")
-    with Parts(pool, Sum, [(0, len(own)) for own in share.others], names=share.names) as parts:
+    with Parts(FakePool(a, b, c), Sum, [(0, 1), (0, 1)], names=("b", "c")) as parts:
         parts.tell("add", 1)
     assert (a.commands, b.commands, c.commands) == (0, 1, 1)

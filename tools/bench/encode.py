@@ -4,15 +4,15 @@
     python -m tools.bench.encode --quick                   the best device, the bundled excerpt; under two minutes
     python -m tools.bench.encode --scenes FOLDER …         folders with point_cloud.ply and cameras.json
     python -m tools.bench.encode --stages sort ridge       some stages only
-    python -m tools.bench.encode --from benchmark.json     tables and plots again
+    python -m tools.bench.encode --from benchmark.json     tables again
 
-For each stage the variants that exist: kernel family, compiler flags, formula, precision, sort, skips, iterations,
+For each stage the variants that exist: kernel family, compiler flags, sort, skips, iterations,
 steps, entropy coder, preset; each with its time and its error against float64 or against the full computation. A
 variant is on the Pareto front if no other of its stage is at least as good in time, error and bytes and better in one
 by more than the noise of 5 %.
 
 Every device runs in a process of its own. Times of the rasterizer's kernels and of the ridge are the device's own, the
-others the clock's. Each is the best of some. Prints Markdown; --json keeps the figures, --plots draws them.
+others the clock's. Each is the best of some. Prints Markdown; --json keeps the figures.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from typing import Any
 
 from potr_cl.opencl.discovery import DeviceInfo, choose_device, list_devices
 from tools.bench.stage_variants import Workload, measure
-from tools.bench.tradeoffs import STAGES, plot, print_report
+from tools.bench.tradeoffs import STAGES, print_report
 from tools.results import circumstances, processor
 from tools.workloads import SCENES, excerpt
 
@@ -82,7 +82,6 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="the excerpt at half size, fewer variants")
     parser.add_argument("--stages", nargs="+", choices=tuple(STAGES), default=list(STAGES))
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--plots", type=Path, metavar="FOLDER")
     parser.add_argument("--from", dest="kept", type=Path, nargs="+", help="figures of earlier runs, instead of a run")
     parser.add_argument("--one", nargs=3, help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -111,9 +110,6 @@ def main() -> None:
         print_report(result)
         if "failed" in result:
             print(f"\nFailed, exit code {result['failed']}.")
-        if args.plots:
-            for path in plot(result, args.plots):
-                print(f"\n![{path.stem}]({path})")
 
 
 if __name__ == "__main__":

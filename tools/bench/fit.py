@@ -6,7 +6,6 @@ A SCENE is a folder with point_cloud.ply and cameras.json. Its splats are pruned
 many are taken, which takes no time), and the fit's steps look at the training views. Tables:
 
 steps     steps a second, by views a step, and what the device does in that time, kernel by kernel
-products  a picture, Jᵀ v and J x of prepared views: time a view
 errors    run time against error: Jᵀ r against float64, where r is the difference to a picture that is nearly the same,
           by the unit that r is multiplied by while sums of it are integers, and by kernel family
 
@@ -18,7 +17,6 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
 
 import numpy as np
 import pyopencl as cl
@@ -30,15 +28,14 @@ from potr_cl.opencl.memory import Memory
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
-from potr_cl.reference.derivatives import gradient
-from potr_cl.reference.scenes import ring_of_cameras, visible_scene
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.fitting.adam import Adam, Limits, Rates
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from potr_cl.stages.fitting.pictures import TargetPictures
-from potr_cl.stages.fitting.tangents import PictureTangents
 from potr_cl.stages.fitting.views import batches
 from potr_cl.stages.refitting.targets import RenderedTargets
+from tests.reference.derivatives import gradient
+from tests.reference.scenes import ring_of_cameras, visible_scene
 from tools.results import Column, Results
 from tools.workloads import read, reduced, scene_parser
 
@@ -72,24 +69,15 @@ def main() -> None:
         Column("views a step"), Column("steps a second", "", ".1f"),
         *(Column(f"of a step: {part}", "ms", ".2f") for part in parts),
     )  # fmt: skip
-    loads = []
     for folder in args.scenes:
         scene, cameras = read(folder)
         train = train_views(cameras)[: args.views]
-        loads.append((folder.name, scene, _left(scene, train, args, plain), train))
+        load = folder.name, scene, _left(scene, train, args, plain), train
         for batch in args.batches:
             steps.add(
-                folder.name, len(loads[-1][2]), train[0].width * train[0].height, batch,
-                *_steps(plain, device, loads[-1], batch, args.steps),
+                folder.name, len(load[2]), train[0].width * train[0].height, batch,
+                *_steps(plain, device, load, batch, args.steps),
             )  # fmt: skip
-    products = results.table(
-        "products", "Products with the derivatives J of prepared views, and a picture beside them",
-        Column("scene"), Column("splats", "", ",d"), Column("pixels of a view", "", ",d"),
-        Column("picture, with preparing its view", "ms a view", ".3f"), Column("Jᵀ v", "ms a view", ".3f"),
-        Column("J x", "ms a view", ".3f"),
-    )  # fmt: skip
-    for name, _, left, train in loads:
-        products.add(name, len(left), train[0].width * train[0].height, *_products(plain, left, train))
     errors = results.table(
         "errors", "Error of derivatives against float64, and their time",
         Column("kernels"), Column("differences", "", "g"), Column("unit", "", "g"),
@@ -164,53 +152,6 @@ def _steps(plain: Device, profiled: Device, load: Load, batch: int, count: int) 
                 part = _PARTS.get(name, "views")
                 found[part] = found.get(part, 0.0) + 1e3 * seconds / count
     return rate, *(found.get(part, 0.0) for part in ("views", *dict.fromkeys(_PARTS.values())))
-
-
-def _products(device: Device, left: Scene, train: Sequence[Camera]) -> tuple[float, float, float]:
-    """Milliseconds a view of a picture, of Jᵀ v and of J x."""
-    cameras = list(train[:16])
-    together = 16 if device.family == "gpu" else 1
-    with (
-        PictureDerivatives(device, left) as derivatives,
-        PictureTangents(device, derivatives.rasterizer) as tangents,
-        Memory(device) as memory,
-    ):
-        rasterizer = derivatives.rasterizer
-        sets = [rasterizer.prepare_set(cameras[k : k + together]) for k in range(0, len(cameras), together)]
-        try:
-            most = max(views.pixels for views in sets)
-            rng = np.random.default_rng(0)
-            values = memory.upload(rng.normal(size=(most, 3)).astype(np.float32), "the values")
-            result = memory.allocate(12 * most, "the result")
-            x = rng.normal(size=(derivatives.columns.count, rasterizer.stride)).astype(np.float32)
-            direction = memory.upload(x, "the direction")
-            image = memory.allocate(12 * sum(views.pixels for views in sets), "the pictures")
-
-            def transposed() -> None:
-                for views in sets:
-                    derivatives.add_prepared(views, values, given=True)
-
-            def along() -> None:
-                for views in sets:
-                    tangents.of(views, direction, result)
-
-            def pictures() -> None:
-                rasterizer.render_into(cameras, image)
-
-            works = (pictures, transposed, along)
-            times = 1 if device.info.kind == "cpu" else 10  # the clock is coarse beside a GPU's work
-            picture, back, forth = (
-                1e3 * _least(device, partial(_repeated, work, times)) / len(cameras) / times for work in works
-            )
-            return picture, back, forth
-        finally:
-            for views in sets:
-                views.close()
-
-
-def _repeated(work: Callable[[], None], times: int) -> None:
-    for _ in range(times):
-        work()
 
 
 def _error(device: Device, size: float, unit: float) -> tuple[float, float]:

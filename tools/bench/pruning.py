@@ -1,55 +1,175 @@
-"""Quality, cost and gain of pruning.
+"""Quality and cost of pruning.
 
-    python -m tools.bench.pruning SCENE … [options] | --plot FILE …
+    python -m tools.bench.pruning SCENE … [--parts curves skips] [--truth] [--json FILE] [options]
 
-A SCENE is a folder with point_cloud.ply, cameras.json and, for --truth, images. Parts (all by default):
+A SCENE is a folder with point_cloud.ply, cameras.json and, for --truth, images. Parts (both by default):
 
 curves  PSNR on test views against the share of splats removed, for our schedule at several numbers of iterations (one
         schedule for each count of survivors) and for other pruners' orders.
 skips   the schedule at q = 0.5 with everything computed, and with each of the things that it may skip or do otherwise:
         time, tiles swept, splats kept, and what that costs, also at equal counts.
-frames  frames a second before pruning, and after it at an equal loss, by our order and by the best of the others.
 
 PSNR is the mean over test views, against the uncompressed scene's renders, and with --truth also what is lost against
-the photographs. Prints Markdown; --json writes the raw results, and --plot makes the pictures of such files (it needs
-matplotlib) and prints their tables again.
+the photographs. Prints Markdown; --json writes the raw results.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
 import json
 import math
 import statistics
+import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.model.camera import Camera
+from potr_cl.formats import load_cameras, load_scene
+from potr_cl.formats.images import read_ground_truth
+from potr_cl.model.camera import Camera, test_views, train_views
 from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Owner
+from potr_cl.quality.compare import find_ground_truth
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.pruning.schedule import PruningOptions
+from potr_cl.stages.pruning.on_device import prune_scene
+from potr_cl.stages.pruning.removal import RemovalSweep
+from potr_cl.stages.pruning.schedule import Pruned, PruningOptions
 from potr_cl.stages.pruning.sweep_options import SweepOptions
-from tools.bench.pruned_scene import Bench, log
-from tools.bench.pruning_report import LOSS_LEVELS, ONE_ORDER, PSNR_LEVELS, plot, print_results
 from tools.results import circumstances
-from tools.study.pruning_baselines import KERNELS
-from tools.workloads import scaled
+from tools.study.pruning_baselines import KERNELS, mesongs_power, removal_order, scores, transmittance_sums
 
 F64 = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Image = NDArray[np.float32]
 Row = dict[str, Any]
 
-PARTS = ("curves", "skips", "frames")
+PARTS = ("curves", "skips")
 #: ΔMSE_MAX at q = 0.5.
 DELTA_MSE_MAX = 10**-9.8
-IMAGES = Path(__file__).parents[2] / "docs" / "images"
+#: What is lost on the photographs where methods are compared, in dB.
+LOSS_LEVEL = 0.4
+ONE_ORDER = "one order"
+
+
+class Bench(Owner):
+    """One scene on one device: reference renders, and what pruned versions of it are worth.
+
+    Attributes:
+        train, test: the views to prune by and to judge by.
+    """
+
+    def __init__(self, folder: Path, device: Device, quick: bool, truth: bool) -> None:
+        self.name = folder.name
+        self.device = device
+        self.scene = load_scene(folder / "point_cloud.ply")
+        cameras = load_cameras(folder / "cameras.json")
+        every = 4 if quick else 1
+        self.train, self.test = train_views(cameras)[::every], test_views(cameras)[::every]
+        self.rasterizer = Rasterizer(device, self.scene)
+        self._test_renders = self._renders(self.test)
+        self._train_renders: list[Image] | None = None
+        self._ground_truth: list[Image] | None = None
+        if truth:
+            files = find_ground_truth(folder / "images", self.test)
+            self._ground_truth = [read_ground_truth(files[c.name], self.rasterizer.background) for c in self.test]
+            pairs = zip(self._test_renders, self._ground_truth, strict=True)
+            self._uncompressed = [decibels(squared_error(render, photograph)) for render, photograph in pairs]
+        self._orders: dict[str, Indices] = {}
+        self._baselines: dict[str, Indices] = {}
+        # Builds every kernel, so that no measurement pays for it.
+        self.pruned(self.train[:1], PruningOptions(0, 1, count=len(self.scene) // 2), SweepOptions())
+
+    def _renders(self, cameras: Sequence[Camera]) -> list[Image]:
+        return [np.clip(self.rasterizer.render(camera)[0], 0, 1) for camera in cameras]
+
+    def quality(self, survivors: Indices) -> Row:
+        """PSNR of what the survivors render against the uncompressed scene, and the loss against the photographs."""
+        with Rasterizer(self.device, self.scene.subset(survivors)) as rasterizer:
+            renders, losses = [], []
+            for number, camera in enumerate(self.test):
+                image = rasterizer.render(camera)[0]
+                renders.append(decibels(squared_error(image, self._test_renders[number])))
+                if self._ground_truth is not None:
+                    error = squared_error(image, self._ground_truth[number])
+                    losses.append(self._uncompressed[number] - decibels(error))
+        row: Row = {"kept": len(survivors), "psnr": statistics.mean(renders)}
+        if losses:
+            row["loss"] = statistics.mean(losses)
+        return row
+
+    def train_psnr(self, survivors: Indices) -> float:
+        """PSNR of the mean squared error over all training views: what pruning tries to keep."""
+        if self._train_renders is None:
+            self._train_renders = self._renders(self.train)
+        with Rasterizer(self.device, self.scene.subset(survivors)) as rasterizer:
+            errors = [
+                squared_error(rasterizer.render(camera)[0], reference)
+                for camera, reference in zip(self.train, self._train_renders, strict=True)
+            ]
+        return decibels(statistics.mean(errors))
+
+    def pruned(self, cameras: Sequence[Camera], options: PruningOptions, sweep: SweepOptions) -> tuple[Pruned, Row]:
+        """Run a schedule; its result and its cost in seconds and full sweeps."""
+        started = time.perf_counter()
+        with RemovalSweep(self.rasterizer, cameras, sweep) as removal:
+            prepared = time.perf_counter()
+            result = prune_scene(removal, options)
+            self.device.queue.finish()
+            ended = time.perf_counter()
+            sweeps = removal.sweeps
+        return result, {
+            "prepare_seconds": prepared - started,
+            "seconds": ended - started,
+            "sweeps": sweeps,
+            "rounds": result.iterations,
+        }
+
+    def ours(self, kept: int, iterations: int) -> tuple[Pruned, Row]:
+        """Our schedule to an exact count, at the default skips."""
+        return self.pruned(self.train, PruningOptions(0, iterations, count=kept), SweepOptions())
+
+    def one_order(self, kept: int, iterations: int) -> Indices:
+        """The order of one schedule down to ``kept`` survivors, made once."""
+        key = f"{kept} {iterations}"
+        if key not in self._orders:
+            self._orders[key] = self.ours(kept, iterations)[0].order
+        return self._orders[key]
+
+    def baselines(self) -> dict[str, Indices]:
+        """The other pruners' orders."""
+        if not self._baselines:
+            with RemovalSweep(self.rasterizer, self.train, SweepOptions(transmittance_threshold=None)) as sweep:
+                importance = sweep.measure()[1]
+            transmittance = transmittance_sums(self.rasterizer, self.train)
+            found = scores(self.scene, importance, transmittance, mesongs_power(self.name))
+            self._baselines = {name: removal_order(score) for name, score in found.items()}
+        return self._baselines
+
+    def close(self) -> None:
+        """Give the device's memory back."""
+        self.rasterizer.close()
+
+
+def log(text: str) -> None:
+    """Progress, to standard error."""
+    print(f"[{time.strftime('%H:%M:%S')}] {text}", file=sys.stderr, flush=True)
+
+
+def squared_error(image: Image, reference: Image) -> float:
+    """Mean over pixels and channels; the reference is clamped already."""
+    difference = (np.clip(image, 0, 1) - reference).ravel()
+    return float(difference @ difference) / difference.size
+
+
+def decibels(error: float) -> float:
+    """PSNR of a mean squared error."""
+    return -10 * math.log10(error) if error > 0 else math.inf
 
 
 def ours_name(iterations: int) -> str:
@@ -89,7 +209,6 @@ class Setting:
         iterations: of the schedule.
         sweep: what its measurements skip.
         every: only each so many-th training view counts.
-        half: measurements, after the first, that look at views of half the size; -1: all.
         pruning: other options of the schedule.
     """
 
@@ -97,7 +216,6 @@ class Setting:
     iterations: int
     sweep: SweepOptions = dataclasses.field(default_factory=SweepOptions)
     every: int = 1
-    half: int = 0
     pruning: Row = dataclasses.field(default_factory=dict)
 
 
@@ -111,23 +229,10 @@ def skip_settings(iterations: Sequence[int]) -> list[Setting]:
     settings += [Setting(f"nothing, {most - n} iterations", most - n, full) for n in (1, 2) if most > n]
     settings += [Setting(f"nothing, damping {d:g}", most, full, pruning={"decay": d}) for d in (0, 0.5, 0.9, 1)]
     settings += [Setting(f"nothing, a = {a:g}", most, full, pruning={"a": a}) for a in (1, 100)]
-    settings += [
-        Setting(f"nothing, pixels end at {e:.0e}", most, SweepOptions(0, transmittance_threshold=e))
-        for e in (1e-6, 1e-8)
-    ]
-    settings += [Setting("what touches no pixel", most, SweepOptions(0, tighten=True))]
     settings += [Setting(f"tolerance {t:g}", most, SweepOptions(t)) for t in (0.002, 0.005, 0.01, 0.02, 0.05)]
-    settings.append(Setting("tolerance 0.002, damping 0", most, pruning={"decay": 0}))
     settings += [Setting(f"{n} iterations", n) for n in fewer]
     settings += [Setting(f"views in {n} turns", most, SweepOptions(turns=n)) for n in (2, 4)]
-    settings += [Setting(f"{n} iterations, views in 4 turns", n, SweepOptions(turns=4)) for n in fewer[-3:]]
-    settings += [
-        Setting(f"tiles but {p:.0%} at random, {when}", most, SweepOptions(sample=p, sampled=number))
-        for when, number in (("first half", most // 2), ("always", most))
-        for p in (0.5, 0.25)
-    ]
     settings += [Setting(f"every {name} view", most, every=n) for name, n in (("2nd", 2), ("4th", 4))]
-    settings += [Setting(f"half-size views, {w}", most, half=n) for w, n in (("first half", most // 2), ("always", -1))]
     return settings
 
 
@@ -137,10 +242,8 @@ def skips(bench: Bench, iterations: Sequence[int]) -> list[Row]:
     for setting in skip_settings(iterations):
         options = PruningOptions(DELTA_MSE_MAX, setting.iterations, **setting.pruning)
         views = bench.train[:: setting.every]
-        if setting.half < 0:
-            views = [scaled(c, 0.5) for c in views]
-        result, cost = bench.pruned(views, options, setting.sweep, max(setting.half, 0))
-        cost["sweeps"] *= sum(c.width * c.height for c in views) / sum(c.width * c.height for c in bench.train)
+        result, cost = bench.pruned(views, options, setting.sweep)
+        cost["sweeps"] *= len(views) / len(bench.train)
         kept = rows[0]["kept"] if rows else result.kept
         at_equal_count = result.order[len(result.order) - kept :]
         own, equal = bench.quality(result.survivors), bench.quality(at_equal_count)
@@ -159,105 +262,83 @@ def skips(bench: Bench, iterations: Sequence[int]) -> list[Row]:
     return rows
 
 
-def frame_rate(rasterizer: Rasterizer, cameras: Sequence[Camera], passes: int = 5) -> float:
-    """Frames a second, finished one by one and left on the device: each view at the best of several passes."""
-    best = [math.inf] * len(cameras)
-    for _ in range(passes):
-        for number, camera in enumerate(cameras):
-            started = time.perf_counter()
-            rasterizer.render_device(camera)
-            best[number] = min(best[number], time.perf_counter() - started)
-    return 1 / statistics.mean(best)
+def _at(rows: Sequence[Row], level: float) -> float | None:
+    """The share removed at which a curve's loss reaches ``level`` dB, by interpolation from nothing removed."""
+    points = [(0.0, 0.0), *sorted((r["removed"], r["loss"]) for r in rows)]
+    for (share0, loss0), (share1, loss1) in itertools.pairwise(points):
+        if loss0 <= level < loss1:
+            return float(share0 + (share1 - share0) * (level - loss0) / (loss1 - loss0))
+    return None
 
 
-def rendering_cost(bench: Bench, survivors: Indices) -> Row:
-    """Frame rate over the training views and the intersections in their tile lists."""
-    with Rasterizer(bench.device, bench.scene.subset(survivors)) as rasterizer:
-        rate = frame_rate(rasterizer, bench.train)
-        intersections = []
-        for camera in bench.train[::8]:
-            with rasterizer.prepare(camera) as view:
-                intersections.append(view.intersection_count)
-    return {"frames_per_second": rate, "intersections": statistics.mean(intersections)}
+def print_curves(rows: Sequence[Row]) -> None:
+    """PSNR and loss by method and share."""
+    shares = sorted({r["removed"] for r in rows})
+    methods = list(dict.fromkeys(r["method"] for r in rows))
+    truth = "loss" in rows[0]
+    print("| removed | " + " | ".join(f"{s:.0%}" for s in shares) + (" | kept at 0.4 dB |" if truth else " |"))
+    print("|---" * (len(shares) + 1 + truth) + "|")
+    for method in methods:
+        mine = {r["removed"]: r for r in rows if r["method"] == method}
+        cells = [
+            f"{mine[s]['psnr']:.1f}" + (f" / {mine[s]['loss']:.2f}" if truth else "") if s in mine else ""
+            for s in shares
+        ]
+        if truth:
+            removed = _at(list(mine.values()), LOSS_LEVEL)
+            cells.append("" if removed is None else f"{1 - removed:.1%}")
+        print(f"| {method} | " + " | ".join(cells) + " |")
 
 
-def fewest(bench: Bench, order: Indices, good: Callable[[Row], bool], low: int, high: int, steps: int) -> Row:
-    """Quality and cost of the fewest splats that are still good, by bisection of the length of an order's end.
-
-    Args:
-        low, high: counts, one too small and one large enough.
-    """
-    for _ in range(steps):
-        middle = (low + high) // 2
-        if good(bench.quality(order[len(order) - middle :])):
-            high = middle
-        else:
-            low = middle
-    survivors = order[len(order) - high :]
-    return {**bench.quality(survivors), **rendering_cost(bench, survivors)}
+def pareto(rows: Sequence[Row]) -> list[Row]:
+    """The rows that no other beats in both time and PSNR at equal count, by ascending time."""
+    front: list[Row] = []
+    for row in sorted(rows, key=lambda r: (r["seconds"], -r["psnr_at_equal_count"])):
+        if not front or row["psnr_at_equal_count"] > front[-1]["psnr_at_equal_count"]:
+            front.append(row)
+    return front
 
 
-def frames(bench: Bench, truth: bool, iterations: int) -> list[Row]:
-    """Rows at each level of loss: unpruned, the other pruners, ours."""
-    splats = len(bench.scene)
-    rows: list[Row] = []
-    unpruned = rendering_cost(bench, np.arange(splats, dtype=np.int64))
-    orders = {name: bench.baselines()[name] for name in ("LightGaussian", "MesonGS", "importance")}
-    for level in LOSS_LEVELS if truth else PSNR_LEVELS:
-
-        def good(row: Row, level: float = level) -> bool:
-            return bool(row["loss"] <= level if truth else row["psnr"] >= level)
-
-        rows.append({"level": level, "method": "unpruned", "kept": splats, **unpruned})
-        for name, order in orders.items():
-            rows.append({"level": level, "method": name, **fewest(bench, order, good, 0, splats, 9)})
-        # One long order tells nearly how many are needed, a schedule to that count then orders the last few better.
-        near = fewest(bench, bench.one_order(splats // 5, iterations), good, 0, splats, 6)["kept"]
-        order = bench.ours(near, iterations)[0].order
-        ours = fewest(bench, order, good, round(0.85 * near), round(1.05 * near), 5)
-        rows.append({"level": level, "method": ours_name(iterations), **ours})
-        log(f"{bench.name}: level {level:g} done")
-    return rows
-
-
-def merged(files: Sequence[Path]) -> Row:
-    """The parts of several result files together."""
-    results: Row = {"scenes": {}}
-    for file in files:
-        found = json.loads(file.read_text())
-        results["device"] = found["device"]
-        for name, scene in found["scenes"].items():
-            results["scenes"].setdefault(name, {}).update(scene)
-    return results
+def print_skips(rows: Sequence[Row]) -> None:
+    """Cost and error of each setting; those on the Pareto front in bold."""
+    front = {r["skipped"] for r in pareto(rows)}
+    full = rows[0]
+    truth = "loss" in full
+    print(
+        "| skipped | iterations | s | of it preparing | full sweeps | kept | PSNR |"
+        + (" loss by photo |" if truth else "")
+        + " PSNR at equal count | against the full computation | on training views |"
+    )
+    print("|---" * (10 + truth) + "|")
+    for r in rows:
+        name = f"**{r['skipped']}**" if r["skipped"] in front else r["skipped"]
+        print(
+            f"| {name} | {r['iterations']} | {r['seconds']:.2f} | {r['prepare_seconds']:.2f} | {r['sweeps']:.1f} | "
+            f"{r['kept']:,} | {r['psnr']:.2f} | "
+            + (f"{r['loss']:.3f} | " if truth else "")
+            + f"{r['psnr_at_equal_count']:.2f} | {r['psnr_at_equal_count'] - full['psnr_at_equal_count']:+.2f} | "
+            f"{r['train_psnr_at_equal_count'] - full['train_psnr_at_equal_count']:+.2f} |"
+        )
 
 
 def run(arguments: argparse.Namespace) -> Row:
     """Measure what the command line asks for."""
     device = Device(arguments.device, variants=KERNELS)
-    about = circumstances(device.info)
-    results: Row = {**about, "device": device.info.name, "quick": arguments.quick, "scenes": {}}
+    results: Row = {**circumstances(device.info), "device": device.info.name, "scenes": {}}
     for folder in arguments.scenes:
-        started = time.perf_counter()
         with Bench(folder, device, arguments.quick, arguments.truth) as bench:
             found: Row = {"splats": len(bench.scene), "train": len(bench.train), "test": len(bench.test)}
             results["scenes"][folder.name] = found
-            log(f"{folder.name}: {len(bench.scene)} splats, {time.perf_counter() - started:.1f} s to load")
             if "curves" in arguments.parts:
                 found["curves"] = curves(bench, [p / 100 for p in arguments.removed], arguments.iterations)
-                log(f"{folder.name}: curves done after {time.perf_counter() - started:.1f} s")
             if "skips" in arguments.parts:
                 found["skips"] = skips(bench, arguments.iterations)
-                log(f"{folder.name}: skips done after {time.perf_counter() - started:.1f} s")
-            if "frames" in arguments.parts:
-                found["frames"] = frames(bench, arguments.truth, max(arguments.iterations))
-                log(f"{folder.name}: frames done after {time.perf_counter() - started:.1f} s")
     return results
 
 
 def main() -> None:
-    """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="*", type=Path)
+    parser.add_argument("scenes", nargs="+", type=Path)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--device")
     parser.add_argument("--quick", action="store_true", help="every 4th training view, every 4th test view")
@@ -265,19 +346,17 @@ def main() -> None:
     parser.add_argument("--removed", nargs="+", type=float, default=list(range(10, 90, 10)), help="per cent")
     parser.add_argument("--iterations", nargs="+", type=int, default=[1, 4, 8, 16, 48])
     parser.add_argument("--json", type=Path, help="write the raw results here")
-    parser.add_argument("--plot", nargs="+", type=Path, help="result files to make pictures and tables of")
-    parser.add_argument("--images", type=Path, default=IMAGES, help="folder for the pictures")
     arguments = parser.parse_args()
-    if bool(arguments.scenes) == bool(arguments.plot):
-        parser.error("give scenes to measure, or result files with --plot")
-    if arguments.plot:
-        results = merged(arguments.plot)
-        plot(results, arguments.images)
-    else:
-        results = run(arguments)
-        if arguments.json:
-            arguments.json.write_text(json.dumps(results, indent=1) + "\n")
-    print_results(results)
+    results = run(arguments)
+    if arguments.json:
+        arguments.json.write_text(json.dumps(results, indent=1) + "\n")
+    for name, found in results["scenes"].items():
+        print(f"\n## {name}: {found['splats']:,} splats, {found['train']} training and {found['test']} test views")
+        print(f"\n{results['device']}")
+        for part, printer in (("curves", print_curves), ("skips", print_skips)):
+            if part in found:
+                print(f"\n### {part}\n")
+                printer(found[part])
 
 
 if __name__ == "__main__":

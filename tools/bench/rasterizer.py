@@ -1,12 +1,11 @@
 """Speed of the rasterizer.
 
-    python -m tools.bench.rasterizer frames SCENE … | growth | plot FILE LABEL=JSON …
+    python -m tools.bench.rasterizer frames SCENE … | growth
 
 frames: frames a second of a scene's training views, finished one by one with the picture left on the device, and the
 device's time a stage. A SCENE is a folder with point_cloud.ply and cameras.json; where it has reference/metrics.json,
 gsplat's figure stands beside.
-growth: time against the number of splats, of pixels, and the overlap, on synthetic scenes. plot: draws what
-growth --json wrote, on one or several devices.
+growth: time against the number of splats, of pixels, and the overlap, on synthetic scenes.
 
 Prints Markdown for docs/benchmarks, or JSON with --json.
 """
@@ -197,27 +196,6 @@ def print_growth(results: list[dict[str, Any]]) -> None:
         print(f"| {r['varied']} | {r['splats']:,} | {r['pixels']:,} | {r['overlap']:,.0f} | {1e3 * r['seconds']:.2f} |")
 
 
-def plot_growth(runs: dict[str, list[dict[str, Any]]], path: Path) -> None:
-    """Three log-log plots, a line for each label and its results."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(1, 3, figsize=(12, 3.6), sharey=True)
-    names = {"splats": "splats", "pixels": "pixels", "overlap": "splats a tile"}
-    for axis, (varied, name) in zip(axes, names.items(), strict=True):
-        for label, results in runs.items():
-            rows = [r for r in results if r["varied"] == varied]
-            axis.loglog([r[varied] for r in rows], [1e3 * r["seconds"] for r in rows], "o-", label=label)
-        axis.set_xlabel(name)
-        axis.grid(alpha=0.3, which="both")
-    axes[0].set_ylabel("ms a frame")
-    axes[0].legend()
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-
-
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -231,14 +209,7 @@ def main() -> None:
     frames.add_argument("--views", type=int, help="only the first so many training views")
     growth = parts.add_parser("growth")
     growth.add_argument("--largest", type=int, default=5_000_000, help="splats")
-    plot = parts.add_parser("plot")
-    plot.add_argument("picture", type=Path)
-    plot.add_argument("runs", nargs="+", metavar="LABEL=JSON")
     arguments = parser.parse_args()
-    if arguments.part == "plot":
-        labelled = dict(run.split("=", 1) for run in arguments.runs)
-        plot_growth({label: json.loads(Path(p).read_text()) for label, p in labelled.items()}, arguments.picture)
-        return
     if arguments.part == "frames":
         results = [
             bench_scene(s, arguments.device, arguments.family, arguments.passes, arguments.views)

@@ -1,26 +1,19 @@
 """What the joint re-fit of the colours brings and takes.
 
     python -m tools.bench.refit measure SCENE … --json OUT.json [--removed PART …] [--drops X …] [options]
-    python -m tools.bench.refit report OUT.json [--images DIR]
+    python -m tools.bench.refit report OUT.json
 
 A SCENE is a folder with point_cloud.ply, cameras.json with test views and, if it has any, photographs in images.
-``measure`` looks at
+``measure`` looks at bytes and PSNR after removing a part of the splats, for each way to treat the colours of those that
+are left (WAYS); every re-fit is on the geometry and the opacities that a decoder sees.
 
-curves   bytes and PSNR after removing a part of the splats, for each way to treat the colours of those that are left
-         (WAYS); every re-fit is on the geometry and the opacities that a decoder sees
-steps    squared error on training views and PSNR on test views after 0 to 32 conjugate-gradient steps
-cuts     the same number of steps, with a new look at which colours are cut at 0 more or less often
-times    a step's time against a removal sweep's over the same views
-
-``--every N`` looks at every N-th view only, for machines that are slow. ``report`` prints Markdown and draws
-DIR/refit_SCENE.png from such a file.
+``--every N`` looks at every N-th view only, for machines that are slow. ``report`` prints Markdown.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import functools
 import json
 import math
 import sys
@@ -45,8 +38,6 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.quality.metrics import psnr
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.pruning.removal import RemovalSweep
-from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.refitting.colour_refit import ColourRefit
 from potr_cl.stages.refitting.refit import active_coefficients
 from potr_cl.stages.refitting.refit_options import RefitOptions
@@ -66,9 +57,6 @@ WAYS = {
 PAPER = "splat by splat"
 REMOVED = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 DROPS = (1e-11, 1e-10, 1e-9)
-STEPS = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
-#: Where in the schedule the parts on steps, cuts and times look.
-PART = 0.5
 CODER = EntropyCoder("zstd", 9)
 
 
@@ -182,68 +170,6 @@ class Bench(Owner):
                 add(f"joint, drop {drop:g}", *self.refitted(scenes[False], self.targets, options, None))
             note({name: curve for name, curve in curves.items() if curve})
 
-    # -------------------------------------------------------------------------------------- the solver
-
-    def options_of(self, steps: int) -> RefitOptions:
-        """So many steps, however little they gain."""
-        return dataclasses.replace(self.refit, gain=0, steps=steps)
-
-    def steps(self, scene: Scene, most: int) -> list[dict[str, Any]]:
-        """Errors after so many steps, before the quantiser."""
-        active, rows = self.active(scene), []
-        with ColourRefit(self.device, scene, self.train) as refit:
-            for steps in (s for s in STEPS if s <= most):
-                result = refit.solve(scene.sh, self.targets, self.options_of(steps), active)
-                rows.append(self._row(scene, result.sh, result.errors[1], steps=result.steps))
-                log(f"{self.name} {rows[-1]}")
-        return rows
-
-    def cuts(self, scene: Scene, most: int) -> list[dict[str, Any]]:
-        """The same number of steps in runs of different lengths: each run begins with a new linearisation."""
-        active, rows = self.active(scene), []
-        with ColourRefit(self.device, scene, self.train) as refit:
-            for runs in (1, 2, 4, 8):
-                options, sh = self.options_of(max(most // runs, 1)), scene.sh
-                for _ in range(runs):
-                    result = refit.solve(sh, self.targets, options, active)
-                    sh = result.sh
-                rows.append(self._row(scene, sh, result.errors[1], runs=runs, steps=options.steps))
-                log(f"{self.name} {rows[-1]}")
-        return rows
-
-    def _row(self, scene: Scene, sh: FloatArray, error: float, **facts: Any) -> dict[str, Any]:
-        return {**facts, "train_error": error, **self.evaluator(dataclasses.replace(scene, sh=sh))}
-
-    def times(self, scene: Scene) -> dict[str, float]:
-        """Seconds of a step and of a removal sweep of every tile; the shortest of three."""
-        with (
-            Rasterizer(self.device, scene) as rasterizer,
-            RemovalSweep(rasterizer, self.train, SweepOptions(tolerance=-1)) as removal,
-        ):
-            removal.measure()
-            sweeps = [_seconds(removal.measure) for _ in range(3)]
-        began = time.perf_counter()
-        with ColourRefit(self.device, scene, self.train) as refit:
-            prepared = time.perf_counter() - began
-            active, solves = self.active(scene), {}
-            for steps in (2, 6):
-                solve = functools.partial(refit.solve, scene.sh, self.targets, self.options_of(steps), active)
-                solves[steps] = min(_seconds(solve) for _ in range(3))
-        step = (solves[6] - solves[2]) / 4
-        return {
-            "sweep": min(sweeps),
-            "step": step,
-            "ratio": step / min(sweeps),
-            "prepare": prepared,
-            "solve_6": solves[6],
-        }
-
-
-def _seconds(work: Callable[[], Any]) -> float:
-    began = time.perf_counter()
-    work()
-    return time.perf_counter() - began
-
 
 def _measure(args: argparse.Namespace) -> None:
     device = Device(args.device)
@@ -267,11 +193,6 @@ def _measure(args: argparse.Namespace) -> None:
                 entry["curves"] = curves
                 write_json(args.json, results)
 
-            scene = bench.on_decoded_geometry(bench.reduced(PART, True))
-            entry["times"] = bench.times(scene)
-            entry["step_rows"] = bench.steps(scene, args.most_steps)
-            entry["cut_rows"] = bench.cuts(scene, args.most_steps)
-            write_json(args.json, results)
             bench.curves(tuple(args.removed), tuple(args.drops), note)
 
 
@@ -315,50 +236,10 @@ def _report(args: argparse.Namespace) -> None:
                 print(f"| {part:.0%} | {way} | {p['bytes'] / 1e6:.3f} | {p['sparsity']:.1%} | {cells} |")
         if ground_truth:
             print(f"\nUncompressed against the photographs: {entry['uncompressed']['truth_psnr']:.2f} dB.")
-        print(f"\n{PART:.0%} removed, {PAPER}, then joint, before the quantiser of the colours:\n")
-        print("| steps | mean squared error, training views | PSNR, test views |\n|---|---|---|")
-        for row in entry["step_rows"]:
-            print(f"| {row['steps']} | {row['train_error']:.3e} | {row['psnr']:.2f} dB |")
-        print("\n| runs, each with a new look at the cuts | mean squared error | PSNR, test views |\n|---|---|---|")
-        for row in entry["cut_rows"]:
-            print(f"| {row['runs']} × {row['steps']} steps | {row['train_error']:.3e} | {row['psnr']:.2f} dB |")
-        t = entry["times"]
-        print(
-            f"\nA step {1e3 * t['step']:.1f} ms, a removal sweep {1e3 * t['sweep']:.1f} ms: {t['ratio']:.2f} times. "
-            f"Views prepared in {t['prepare']:.2f} s, six steps with all before and after {t['solve_6']:.2f} s.\n"
-        )
-        if args.images is not None:
-            _plot(name, entry, keys, args.images / f"refit_{name}.png")
-
-
-def _plot(name: str, entry: dict[str, Any], keys: list[str], path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, len(keys), figsize=(6.4 * len(keys), 4.8), squeeze=False)
-    titles = {"psnr": "PSNR against the uncompressed renders, dB", "truth_psnr": "PSNR against the photographs, dB"}
-    for axis, key in zip(axes[0], keys, strict=True):
-        for way, points in entry["curves"].items():
-            axis.plot([p["bytes"] / 1e6 for p in points], [p[key] for p in points], marker="o", ms=4, label=way)
-        if key in entry["uncompressed"]:
-            axis.axhline(entry["uncompressed"][key], color="0.6", lw=1, ls="--", label="uncompressed")
-        axis.set_xscale("log")
-        axis.set_xlabel("MB")
-        axis.set_ylabel(titles[key])
-        axis.grid(alpha=0.3)
-    axes[0][-1].legend(loc="lower right", fontsize="small")
-    parts = [p["removed"] for p in entry["curves"][PAPER]]
-    figure.suptitle(f"{name}: {min(parts):.0%} to {max(parts):.0%} of {entry['splats']:,} splats removed")
-    figure.tight_layout()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
 
 
 def main() -> None:
-    parser, measure, report = study_parser(__doc__, _measure, _report)
+    parser, measure, _ = study_parser(__doc__, _measure, _report)
     measure.add_argument("--removed", nargs="+", type=float, default=REMOVED, help="parts of the splats")
     measure.add_argument("--drops", nargs="*", type=float, default=DROPS, help="mean squared errors a coefficient")
     measure.add_argument("--quality", type=float, default=0.5)
@@ -366,9 +247,7 @@ def main() -> None:
     measure.add_argument("--iterations", type=int, default=48, help="of pruning")
     measure.add_argument("--steps", type=int, default=RefitOptions.steps, help="of the curves' re-fits")
     measure.add_argument("--prior", type=float, default=RefitOptions.prior)
-    measure.add_argument("--most-steps", type=int, default=max(STEPS), help="of the parts steps and cuts")
     measure.add_argument("--every", type=int, default=1, help="look at every N-th view only")
-    report.add_argument("--images", type=Path)
     args = parser.parse_args()
     args.run(args)
 

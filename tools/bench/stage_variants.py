@@ -26,20 +26,17 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import GSPLAT, INRIA
-from potr_cl.reference import raster as reference
-from potr_cl.reference.removal import BruteForce
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, Precision
+from potr_cl.stages.compaction.view_weights import ViewWeights
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.refitting.targets import RenderedTargets
-from tools.bench.pruned_scene import Bench
-from tools.bench.pruning import skips
+from tests.reference import raster as reference
+from tests.reference.removal import BruteForce
+from tools.bench.pruning import Bench, skips
 from tools.bench.tradeoffs import Row
-from tools.study.compaction_curves import measured_weights
-from tools.study.removal_exactness import choose_splats
-from tools.study.removal_formulas import PREFIX_SUMS
 from tools.workloads import best_of, scaled
 
 F64 = NDArray[np.float64]
@@ -221,7 +218,7 @@ def rasterizer_rows(info: DeviceInfo, load: Workload, quick: bool, stages: Seque
 
 
 def removal_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]:
-    """Formula, family, flags, and where pixels end."""
+    """Family, flags, and where pixels end."""
     camera = load.some[0]
     flags = ("no flags", "mad", "fast relaxed") if quick else tuple(FLAGS)
     default = SweepOptions()
@@ -235,11 +232,7 @@ def removal_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]
         for name in flags:
             flagged = profiled(info, family, FLAGS[name])
             variants.append((f"{family}, {name}", own and name == "no flags", flagged, default))
-        prefix_sums = Device(info, profiling=True, family=family, variants=PREFIX_SUMS)
-        variants.append((f"{family}, prefix sums", False, prefix_sums, default))
         plain = profiled(info, family)
-        other = dataclasses.replace(default, tighten=not default.tighten)
-        variants.append((f"{family}, {'not ' if default.tighten else ''}tightened", False, plain, other))
         for threshold in thresholds:
             if threshold != (default.transmittance_threshold or INRIA.transmittance_threshold):
                 ends = dataclasses.replace(default, transmittance_threshold=threshold)
@@ -265,6 +258,15 @@ def removal_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]
         yield Row("removal", label, best, error, is_default)
 
 
+def choose_splats(importance: F64, count: int) -> NDArray[np.int64]:
+    """About ``count`` splats that the views see, evenly over the logarithm of importance."""
+    seen = np.flatnonzero(importance > 0)
+    by_importance = seen[np.argsort(importance[seen], kind="stable")]
+    low, high = np.log(importance[by_importance[[len(seen) // 100, -1]]])
+    at = np.searchsorted(np.log(importance[by_importance]), np.linspace(low, high, count))
+    return np.unique(by_importance[at.clip(0, len(seen) - 1)])
+
+
 def prune_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]:
     """What the schedule may skip, see tools.bench.pruning."""
     with Bench(load.folder, Device(info), quick, truth=False) as bench:
@@ -280,7 +282,7 @@ def ridge_errors(scene: Scene, compacted: Scene, centres: F64, weights: Any, opt
 
     Relative to the largest coefficient or 1.
     """
-    from potr_cl.reference.ridge import YCOCG, Ridges, triangles  # needs scipy
+    from tests.reference.ridge import YCOCG, Ridges, triangles  # needs scipy
 
     before, after = scene.sh @ YCOCG.T, compacted.sh @ YCOCG.T
     largest = np.maximum(np.abs(before).max(axis=1), 1)
@@ -299,6 +301,13 @@ def ridge_errors(scene: Scene, compacted: Scene, centres: F64, weights: Any, opt
     return np.concatenate(errors)
 
 
+def measured_weights(device: Device, scene: Scene, cameras: Sequence[Camera]) -> ViewWeights:
+    """How much each splat shows in each view."""
+    with Rasterizer(device, scene) as rasterizer, RemovalSweep(rasterizer, cameras) as sweep:
+        sweep.measure()
+        return ViewWeights.from_importances(len(scene), sweep.view_importances())
+
+
 def ridge_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]:
     """Precision of the least squares, and family."""
     views = load.train if quick else load.train[::2]
@@ -307,10 +316,7 @@ def ridge_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]:
     weights = measured_weights(Device(info), scene, views)
     for family in families(info):
         device = profiled(info, family)
-        doubles = "cl_khr_fp64" in info.handle.extensions.split()
         for precision in get_args(Precision):
-            if precision == "fp64" and not doubles:
-                continue
             # λ 0.01 and no column dropped: as hard as it gets.
             options = CompactionOptions(lam=0.01, alpha=1, precision=precision)
             compactor = Compactor(device)

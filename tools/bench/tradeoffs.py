@@ -1,10 +1,9 @@
-"""One variant of a stage, its time and its error (:class:`Row`); tables and plots of many, for tools.bench.encode."""
+"""One variant of a stage, its time and its error (:class:`Row`); tables of many, for tools.bench.encode."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 #: Part by which a time or an error must be lower to be lower.
@@ -86,41 +85,3 @@ def print_report(result: dict[str, Any]) -> None:
         for row in own:
             if row.default and not on_front(row, own):
                 print(f"\nThe default, {row.variant}, is not on the front.")
-
-
-def plot(result: dict[str, Any], folder: Path) -> list[Path]:
-    """One picture a stage: time on one axis, error on the other, the front blue and joined, the default red."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = []
-    for stage, (what, error) in STAGES.items():
-        own = [Row(**row) for row in result["rows"] if row["stage"] == stage]
-        if not own:
-            continue
-        figure, axes = plt.subplots(figsize=(10, 5), layout="constrained")
-        front = sorted((row for row in own if on_front(row, own)), key=lambda r: r.seconds)
-        # An error of 0 has no place on a logarithmic axis: it stands at the bottom.
-        least = min((row.error for row in own if row.error > 0), default=1.0) / 3
-        height = {row.variant: max(row.error, least) for row in own}
-        axes.plot([r.seconds for r in front], [height[r.variant] for r in front], "-", color="0.7", zorder=0)
-        listed = []
-        for place, row in enumerate(sorted(own, key=lambda r: r.seconds), 1):
-            colour = "C3" if row.default else ("C0" if row in front else "0.6")
-            axes.scatter(row.seconds, height[row.variant], s=30, color=colour)
-            axes.annotate(
-                str(place), (row.seconds, height[row.variant]), (4, 3), textcoords="offset points", fontsize=7
-            )
-            size = f", {row.nbytes / 1e6:.2f} MB" if row.nbytes is not None else ""
-            listed.append(f"{place}  {row.variant}{size}{' (default)' if row.default else ''}")
-        axes.annotate("\n".join(listed), (1.02, 1), xycoords="axes fraction", va="top", fontsize=7)
-        axes.set(xscale="log", yscale="log", xlabel=f"seconds of {what}", ylabel=error)
-        axes.set_title(f"{stage}: {result['scene']}, {result['device'].split(',')[0]}", fontsize=9)
-        slug = "".join(c if c.isalnum() else "_" for c in f"{result['scene']}_{result['device'].split(',')[0]}_{stage}")
-        paths.append(folder / f"benchmark_{slug}.png")
-        figure.savefig(paths[-1], dpi=110)
-        plt.close(figure)
-    return paths

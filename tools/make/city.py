@@ -26,8 +26,8 @@ from potr_cl.formats import load_cameras, load_scene
 from potr_cl.formats.scenes import ply
 from potr_cl.model.camera import Camera, camera_centres, focus, test_views, train_views
 from potr_cl.model.scene import Scene
-from potr_cl.reference.captures import looking
-from potr_cl.reference.frames import moved
+from tests.reference.captures import looking
+from tests.reference.frames import moved
 from tools.cameras_json import entry
 
 F64 = NDArray[np.float64]

@@ -9,7 +9,7 @@ import argparse
 from collections.abc import Iterator
 
 from potr_cl.cli import command_parser
-from tools.make.markdown import NOTICE, cell, table
+from tools.make.tables import NOTICE, cell, table
 
 
 def cli_page() -> str:

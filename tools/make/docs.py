@@ -1,7 +1,6 @@
 """Make the generated parts of the documentation: python -m tools.make.docs [--check]
 
 - docs/cli.md, from the command line's own parsers;
-- docs/api.md, from the docstrings of the package;
 - the tables between ``<!-- generated: NAME -->`` and ``<!-- end -->`` in other pages, from the code that knows them.
 
 The pages are committed, so that they can be read without building anything. ``--check`` writes nothing and fails if a
@@ -17,23 +16,22 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from tools.make.api_page import api_page
 from tools.make.cli_page import cli_page
 
 ROOT = Path(__file__).parents[2]
 
 #: Tables that other pages hold, and the function that makes each.
 _TABLES = {
-    "figures": "tools.make.readme_figures:figures_table",
-    "formats": "potr_cl.formats.registry:formats_table",
-    "presets": "potr_cl.pipeline.presets:presets_table",
-    "quirks": "tools.make.quirks_table:quirks_table",
+    "figures": "tools.make.benchmarks:figures_table",
+    "formats": "tools.make.tables:formats_table",
+    "presets": "tools.make.tables:presets_table",
+    "quirks": "tools.make.tables:quirks_table",
 }
 
 
 def generated() -> dict[Path, str]:
     """The text that each page should have."""
-    pages = {ROOT / "docs" / "cli.md": cli_page(), ROOT / "docs" / "api.md": api_page()}
+    pages = {ROOT / "docs" / "cli.md": cli_page()}
     for path in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]:
         if path not in pages:
             text = path.read_text("utf-8")

@@ -24,7 +24,7 @@ from potr_cl.codec.quantize import HyperParameters
 from potr_cl.model.scene import MIP_SPLATTING_LOW_PASS, Scene
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.reference.scenes import random_scene, ring_of_cameras
+from tests.reference.scenes import random_scene, ring_of_cameras
 
 DATA = Path(__file__).parents[2] / "tests" / "data"
 KEEP = EncodeOptions.for_preset("paper", prune=False, compact=False)

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from potr_cl.formats import load_scene
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene, joined
-from potr_cl.reference.captures import looking
-from potr_cl.reference.frames import moved
+from tests.reference.captures import looking
+from tests.reference.frames import moved
 from tools.cameras_json import entry
 
 F64 = NDArray[np.float64]

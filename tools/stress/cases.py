@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.raster.rules import GSPLAT, INRIA, RasterRules
-from potr_cl.reference.scenes import (
+from potr_cl.stages.compaction.ridge import CompactionOptions
+from potr_cl.stages.refitting.refit_options import RefitOptions
+from tests.reference.scenes import (
     plain_splats,
     random_scene,
     random_splats,
@@ -26,8 +28,6 @@ from potr_cl.reference.scenes import (
     straight_camera,
     tilted_camera,
 )
-from potr_cl.stages.compaction.ridge import CompactionOptions
-from potr_cl.stages.refitting.refit_options import RefitOptions
 
 F64 = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from potr_cl.formats import load_scene, save_scene
 from potr_cl.model.camera import Camera
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.reference.scenes import ring_of_cameras, visible_scene
+from tests.reference.scenes import ring_of_cameras, visible_scene
 from tools.results import ROOT
 
 SPLATS, VIEWS, SIDE = 400, 6, 48

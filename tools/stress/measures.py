@@ -29,7 +29,6 @@ WHAT = {
     "removal: effect": "of a splat's ΔMSE, relative to the sum of its terms' magnitudes",
     "fit: finite": "a derivative of a picture that is not finite",
     "fit: gradient": "of the pictures' derivatives by a kind of parameters, relative to their length",
-    "fit: J x": "x · Jᵀ J x over ‖J x‖², less 1",
     "fit: steps": "what steps of the fit add to the held-out error, relative; or a parameter that is not finite",
     "fit: settling": "a value that is not finite after coefficients were chosen, geometry rounded and the rest fitted",
     "surely seen": "splats of which a device and float64 say that views see them and that none does",

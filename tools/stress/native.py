@@ -41,7 +41,7 @@ from potr_cl.codec.native.values import BUNDLE, PackedValues
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.codec.sections import Coder, Property
 from potr_cl.errors import DataError
-from potr_cl.reference.scenes import random_scene
+from tests.reference.scenes import random_scene
 from tools.make.native import compile_library
 from tools.results import ROOT, Column, Results
 from tools.stress.hostile import potr_files

@@ -36,19 +36,19 @@ from potr_cl.quality.metrics_device import Similarity
 from potr_cl.quality.pictures import Picture
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import GSPLAT, INRIA
-from potr_cl.reference import raster as reference
-from potr_cl.reference.derivatives import gradient
-from potr_cl.reference.refit import Array, to_ycocg
-from potr_cl.reference.refit_cases import Case, Linearised, Pictures
-from potr_cl.reference.scenes import (
+from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
+from potr_cl.stages.fitting.derivatives import PictureDerivatives
+from potr_cl.stages.refitting.refit_options import RefitOptions
+from tests.reference import raster as reference
+from tests.reference.derivatives import gradient
+from tests.reference.refit import Array, to_ycocg
+from tests.reference.refit_cases import Case, Linearised, Pictures
+from tests.reference.scenes import (
     random_splats,
     ring_of_cameras,
     tilted_camera,
     visible_scene,
 )
-from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
-from potr_cl.stages.fitting.derivatives import PictureDerivatives
-from potr_cl.stages.refitting.refit_options import RefitOptions
 
 #: As in the tests: pixels that come no nearer, relatively, to 1/255 and 1e-4 cannot flip.
 CLEAR = 1e-4

@@ -17,7 +17,7 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.raster.rules import RasterRules
 from potr_cl.raster.view_set import TILE
-from potr_cl.reference import raster as reference
+from tests.reference import raster as reference
 from tools.stress.cases import Case
 
 F64 = NDArray[np.float64]

@@ -9,12 +9,12 @@ import numpy as np
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import SPLAT_GROUP
-from potr_cl.reference.refit import Reference, to_ycocg
-from potr_cl.reference.ridge import YCOCG, objective, ridge, weighted_basis
 from potr_cl.stages.compaction.ridge import Compactor
 from potr_cl.stages.compaction.view_weights import ViewWeights
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.targets import RenderedTargets
+from tests.reference.refit import Reference, to_ycocg
+from tests.reference.ridge import YCOCG, objective, ridge, weighted_basis
 from tools.stress.cases import RefitCase, RidgeCase
 from tools.stress.measures import Measures
 from tools.stress.precise import F64, ULP

@@ -4,10 +4,10 @@
     python -m tools.study.ablation report OUT.json [--json RESULTS.json]
 
 The steps are those of the paper's table "Ablation study": serialisation and quantisation, entropy coding, pruning,
-SH compaction, YCoCg; those before YCoCg quantise R, G and B. The others are ours: the re-fit with balanced steps and
-the context coder; what version 3 of the format and the rounding of colours bring (tools.study.colour_steps); and views
-between the training views, which make the preset best. A second table has the bytes a splat of each property, compared
-with the float32 values of a PLY (normals left out). ``report`` prints both, and --json keeps them for docs/benchmarks.
+SH compaction, YCoCg; those before YCoCg quantise R, G and B. The others are ours: the re-fit with steps of equal worth
+and the context coder; and views between the training views, which make the preset best. A second table has the bytes a
+splat of each property, compared with the float32 values of a PLY (normals left out). ``report`` prints both, and --json
+keeps them for docs/benchmarks.
 """
 
 from __future__ import annotations
@@ -31,7 +31,6 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.report.file import file_report
 from potr_cl.stages.stage import State
 from tools.results import Column, Results, circumstances, write_json
-from tools.study.colour_steps import WAYS, coded, pruned_state, refit_options
 from tools.study.evaluation import EvaluatedScene
 from tools.workloads import reduced_state, study_parser
 
@@ -98,13 +97,12 @@ def measure_steps(evaluator: EvaluatedScene, device: Device, q: float) -> list[d
         left = reduced_state(evaluator.source, views, changed, device)
         steps.append({"step": name, **_plain(evaluator, changed, left, rgb)})
     best = EncodeOptions.for_preset("best", q=q)
-    pruned = pruned_state(evaluator.source, views, best.changed(between=False), device)
-    for way in WAYS:
-        name = "re-fit, balanced steps, contexts" if way is WAYS[0] else way.name.removeprefix("+ ")
-        data = coded(pruned, way, best.parameters, q, device, refit_options(best))
-        steps.append({"step": name, **_figures(evaluator, data)})
-    encoded = encode(evaluator.source, views, best, device=device)
-    steps.append({"step": "views between the training views: preset best", **_figures(evaluator, encoded.data)})
+    for name, changed in (
+        ("re-fit, steps of equal worth, contexts", best.changed(between=False)),
+        ("views between the training views: preset best", best),
+    ):
+        encoded = encode(evaluator.source, views, changed, device=device)
+        steps.append({"step": name, **_figures(evaluator, encoded.data)})
     return steps
 
 

@@ -5,9 +5,9 @@
 
 ``measure`` writes each scene in each format with splat-transform (npm's @playcanvas/splat-transform), lets the same
 tool decode it to a PLY, and judges that by all test views. A format that does not finish in time is left out.
-The rows of :data:`EARLIER` are added. ``report`` prints Markdown: our size at their PSNR and our PSNR at their size,
-interpolated along the curve that tools.study.rate_distortion measured, linearly in the logarithm of the size. With
---json it keeps the tables of docs/benchmarks for the curve that --series names, by default best. There OUT.json may be
+The rows of :data:`EARLIER` are added. ``report`` prints the tables of docs/benchmarks and keeps them with --json: our
+size at their PSNR and at their loss, interpolated along the curve that tools.study.rate_distortion measured, linearly
+in the logarithm of the size, and that --series names, by default best. OUT.json may be
 the page's own results, docs/benchmarks/results/other_formats.json: other formats do not change as ours does.
 """
 
@@ -30,7 +30,7 @@ from potr_cl.opencl.device import Device
 from tools.results import Cell, Column, Results, circumstances, write_json
 from tools.study.curves import merged
 from tools.study.evaluation import EvaluatedScene
-from tools.study.rate_distortion import size_at, value_at
+from tools.study.rate_distortion import size_at
 from tools.workloads import study_parser
 
 FORMATS = ("compressed.ply", "spz", "sog")
@@ -108,23 +108,6 @@ def _measure(args: argparse.Namespace) -> None:
 # ------------------------------------------------------------------------------------------------ report
 
 
-def _cells(points: list[dict[str, Any]], row: dict[str, Any], key: str) -> str:
-    """Our size at their value, how many times smaller, and our value at their size."""
-    if row.get(key) is None:
-        return " | |"
-    size, value = size_at(points, key, row[key]), value_at(points, key, row["bytes"])
-    values, sizes = [p[key] for p in points], [p["bytes"] for p in points]
-    worst, best = (max(values), min(values)) if key == "psnr_loss" else (min(values), max(values))
-    if size is not None:
-        smaller = f"{size / 1e6:.2f} MB, {row['bytes'] / size:.1f} ×"
-    elif (row[key] > best) != (key == "psnr_loss"):
-        smaller = f"beyond our best, {best:.2f} dB"
-    else:
-        smaller = f"below {min(sizes) / 1e6:.2f} MB ({worst:.2f} dB), more than {row['bytes'] / min(sizes):.1f} ×"
-    ours = f"{value:.2f} dB" if value is not None else f"{best:.2f} dB at {max(sizes) / 1e6:.2f} MB"
-    return f" {smaller} | {ours} |"
-
-
 def measured_formats(path: Path) -> dict[str, list[dict[str, Any]]]:
     """The formats of each scene: what ``measure`` has left, or the table "sizes" of docs/benchmarks."""
     content = json.loads(path.read_text())
@@ -146,7 +129,9 @@ def measured_formats(path: Path) -> dict[str, list[dict[str, Any]]]:
     return found
 
 
-def keep_tables(formats: dict[str, list[dict[str, Any]]], curves: dict[str, Any], series: str, path: Path) -> None:
+def keep_tables(
+    formats: dict[str, list[dict[str, Any]]], curves: dict[str, Any], series: str, path: Path | None
+) -> None:
     """The tables of docs/benchmarks: a series against each format, by interpolation along its curve.
 
     Raises:
@@ -186,28 +171,8 @@ def _how_small(row: dict[str, Any], size: float | None, least: int) -> tuple[Cel
 
 
 def _report(args: argparse.Namespace) -> None:
-    measured = merged([args.curves, *args.more], [args.series] if args.json is not None else ())
-    if args.json is not None:
-        keep_tables(measured_formats(args.results), measured, args.series, args.json)
-        return
-    results = json.loads(args.results.read_text())
-    curves = measured["scenes"]
-    print(f"{results['tool']}; rows with * were measured earlier with their authors' code.\n")
-    for name, entry in results["scenes"].items():
-        for series, curve in curves[name]["series"].items():
-            points = curve["encodes"]
-            print(f"### {name}: other formats, and {series} on the curve\n")
-            print(
-                "| | MB | PSNR against uncompressed | ours at that PSNR | ours at that size | lost on photographs "
-                "| ours at that loss | ours at that size |\n|---|---|---|---|---|---|---|---|"
-            )
-            for row in entry["formats"]:
-                lost = f"{row['psnr_loss']:.2f} dB" if row.get("psnr_loss") is not None else ""
-                print(
-                    f"| {row['format']}{'' if row['measured'] else ' *'} | {row['bytes'] / 1e6:.2f} "
-                    f"| {row['psnr']:.2f} dB |{_cells(points, row, 'psnr')} {lost} |{_cells(points, row, 'psnr_loss')}"
-                )
-            print()
+    measured = merged([args.curves, *args.more], [args.series])
+    keep_tables(measured_formats(args.results), measured, args.series, args.json)
 
 
 def main() -> None:

@@ -7,7 +7,7 @@
 ``judge`` takes two scenes or more (point_cloud.ply and cameras.json in each), moves each in the ways in which scenes
 are moved, and gives it the cameras of the next. It writes by how much the best motion fits better, and how much is
 needed: found is what has more. Right cameras must have less. ``made`` does the same with scenes made by rule
-(:mod:`potr_cl.reference.captures`), for kinds of which no real one is at hand.
+(:mod:`tests.reference.captures`), for kinds of which no real one is at hand.
 
 ``unseen`` encodes each scene with and without the splats that no training view sees, with all its training views and
 with half of them, those of one side.
@@ -30,8 +30,8 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.metrics import psnr
-from potr_cl.reference.captures import CAPTURES
-from potr_cl.reference.frames import right, without_directions, wrong
+from tests.reference.captures import CAPTURES
+from tests.reference.frames import right, without_directions, wrong
 from tools.results import Column, Results, Table
 from tools.workloads import pictures, read
 

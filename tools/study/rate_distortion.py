@@ -1,19 +1,16 @@
 """Size against quality: encode at many qualities, decode, judge by all test views; then tables and plots.
 
     python -m tools.study.rate_distortion measure SCENE … --json OUT.json [--series NAME[:OPTION=VALUE,…] …] [options]
-    python -m tools.study.rate_distortion report OUT.json … [--formats FORMATS.json] [--images DIR] [options]
+    python -m tools.study.rate_distortion report OUT.json … [--json FILE] [options]
 
 A SCENE is a folder with point_cloud.ply, cameras.json and, if it has any, photographs in images. A series is a curve:
 the name it gets and the options of EncodeOptions in which it differs from the defaults, those of a stage with its name,
 as in exact:preset=best,prune.tolerance=0; photos=True stands for --photos with the folder images. ``measure`` writes
 its results after every encode and goes on where an existing file stops; with --seconds it begins no encode after that
 many. Several files of ``measure`` become one curve (tools.study.curves); --series takes some of their series alone,
-in that order. ``report`` prints Markdown and draws DIR/rate_distortion_SCENE.png; the points of other formats come from
-tools.study.compare_formats. With --json it keeps the tables of docs/benchmarks: the curves, the uncompressed scenes,
-and the seconds of each stage at quality 0.5; with --losses NAME too, another one instead: what each other series loses
-on photographs, and what the series NAME loses at the same PSNR against the uncompressed renders, by interpolation; of
-all qualities, or of those of --qualities. With --against it prints instead how many bytes more or fewer each series
-takes at the PSNR that the series NAME has at quality Q, by interpolation, and how long its encodes take.
+in that order. ``report`` prints the tables of docs/benchmarks, and keeps them with --json: the curves, the uncompressed
+scenes, and the seconds of each stage at quality 0.5. With --against it prints instead how many bytes more or fewer each
+series takes at the PSNR that the series NAME has at quality Q, by interpolation, and how long its encodes take.
 """
 
 from __future__ import annotations
@@ -25,7 +22,6 @@ import json
 import math
 import statistics
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -140,73 +136,6 @@ def _measure(args: argparse.Namespace) -> None:
 # ------------------------------------------------------------------------------------------------ report
 
 
-def _table(entry: dict[str, Any]) -> str:
-    ground_truth = "truth_psnr" in entry["uncompressed"]
-    head = "| series | q | splats | MB | times smaller | bytes a splat | PSNR, SSIM against uncompressed |"
-    rule = "|---|---|---|---|---|---|---|"
-    if ground_truth:
-        head += " PSNR, SSIM against photographs | lost |"
-        rule += "---|---|"
-    lines = [head, rule]
-    plain = entry["uncompressed"]
-    row = f"| uncompressed | | {entry['source_splats']:,} | {entry['source_bytes'] / 1e6:.1f} | 1 | "
-    row += f"{entry['source_bytes'] / entry['source_splats']:.0f} | |"
-    if ground_truth:
-        row += f" {plain['truth_psnr']:.2f} dB, {plain['truth_ssim']:.4f} | |"
-    lines.append(row)
-    for name, curve in entry["series"].items():
-        for p in curve["encodes"]:
-            row = f"| {name} | {p['q']:g} | {p['splats']:,} | {p['bytes'] / 1e6:.3f} | "
-            row += f"{entry['source_bytes'] / p['bytes']:.1f} | {p['bytes'] / p['splats']:.2f} | "
-            row += f"{p['psnr']:.2f} dB, {p['ssim']:.4f} |"
-            if ground_truth:
-                row += f" {p['truth_psnr']:.2f} dB, {p['truth_ssim']:.4f} | {p['psnr_loss']:.2f} dB |"
-            lines.append(row)
-    return "\n".join(lines)
-
-
-def _plot(entry: dict[str, Any], formats: list[dict[str, Any]], path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    panels = [("psnr", "PSNR against the uncompressed renders, dB")]
-    if "truth_psnr" in entry["uncompressed"]:
-        panels.append(("truth_psnr", "PSNR against the photographs, dB"))
-    figure, axes = plt.subplots(1, len(panels), figsize=(6.4 * len(panels), 4.8), squeeze=False)
-    for axis, (key, title) in zip(axes[0], panels, strict=True):
-        for name, curve in entry["series"].items():
-            points = curve["encodes"]
-            axis.plot([p["bytes"] / 1e6 for p in points], [p[key] for p in points], marker="o", ms=4, label=name)
-        for row in formats:
-            value = row.get(key)
-            if value is None and key == "truth_psnr" and row.get("psnr_loss") is not None:
-                value = entry["uncompressed"]["truth_psnr"] - row["psnr_loss"]
-            if value is not None:
-                axis.plot(row["bytes"] / 1e6, value, marker="s", ms=5, ls="", color="0.4")
-                axis.annotate(row["format"], (row["bytes"] / 1e6, value), xytext=(4, -9), textcoords="offset points")
-        if key == "truth_psnr":
-            axis.axhline(entry["uncompressed"][key], color="0.6", lw=1, ls="--", label="uncompressed")
-        axis.set_xscale("log")
-        ticks = [t for t in (0.5, 1, 2, 3, 4, 6, 8, 12, 20, 40) if _within(axis.get_xlim(), t)]
-        axis.set_xticks(ticks, [f"{t:g}" for t in ticks])
-        axis.minorticks_off()
-        axis.set_xlabel("MB")
-        axis.set_ylabel(title)
-        axis.grid(alpha=0.3)
-        axis.legend(loc="lower right")
-    figure.suptitle(f"{entry['scene']}: {entry['source_splats']:,} splats, {entry['source_bytes'] / 1e6:.1f} MB as PLY")
-    figure.tight_layout()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-
-
-def _within(limits: tuple[float, float], value: float) -> bool:
-    return limits[0] <= value <= limits[1]
-
-
 def size_at(points: list[dict[str, Any]], key: str, value: float) -> float | None:
     """Bytes at which a curve reaches ``value`` of ``key``; None beyond its ends."""
     ordered = sorted(points, key=lambda p: float(p[key]))
@@ -214,24 +143,6 @@ def size_at(points: list[dict[str, Any]], key: str, value: float) -> float | Non
     if not values[0] <= value <= values[-1]:
         return None
     return float(np.exp(np.interp(value, values, np.log([p["bytes"] for p in ordered]))))
-
-
-def value_at(points: list[dict[str, Any]], key: str, size: float) -> float | None:
-    """What a curve has of ``key`` at ``size`` bytes; None beyond its ends."""
-    ordered = sorted(points, key=lambda p: int(p["bytes"]))
-    sizes = np.log([p["bytes"] for p in ordered])
-    if not sizes[0] <= np.log(size) <= sizes[-1]:
-        return None
-    return float(np.interp(np.log(size), sizes, [p[key] for p in ordered]))
-
-
-def along_psnr(points: list[dict[str, Any]], key: str, psnr: float) -> float | None:
-    """What a curve has of ``key`` at a PSNR against the uncompressed renders; None beyond its ends."""
-    ordered = sorted(points, key=lambda p: float(p["psnr"]))
-    psnrs = [p["psnr"] for p in ordered]
-    if not psnrs[0] <= psnr <= psnrs[-1]:
-        return None
-    return float(np.interp(psnr, psnrs, [p[key] for p in ordered]))
 
 
 def print_gaps(scenes: dict[str, Any], against: str, q: float) -> None:
@@ -256,7 +167,7 @@ def print_gaps(scenes: dict[str, Any], against: str, q: float) -> None:
         print(f"| {series} | " + " | ".join(cells) + " |")
 
 
-def keep_tables(measured: dict[str, Any], path: Path) -> None:
+def keep_tables(measured: dict[str, Any], path: Path | None) -> None:
     """The tables of docs/benchmarks: a curve for each scene, "uncompressed", and "stages"."""
     results = Results(None, path, measured)
     scenes: dict[str, Any] = measured["scenes"]
@@ -320,41 +231,6 @@ def keep_tables(measured: dict[str, Any], path: Path) -> None:
                     )  # fmt: skip
 
 
-def keep_losses(measured: dict[str, Any], against: str, path: Path, qualities: Sequence[float] = ()) -> None:
-    """The table "losses": what each series loses on photographs, beside what one of them loses at the same PSNR.
-
-    Args:
-        measured: what ``measure`` has left.
-        against: the series whose curve is interpolated.
-        path: of the file to write.
-        qualities: of the rows; empty: all.
-    """
-    table = Results(None, path, measured).table(
-        "losses",
-        f"What files lose on photographs, and what those of {against} lose at the same PSNR, all test views",
-        Column("scene"),
-        Column("preset", default="{preset}"),
-        Column("q", default="{quality:g}"),
-        Column("bytes", format=","),
-        Column("bytes at equal PSNR", "%", "+.1f"),
-        Column("PSNR against uncompressed", "dB", ".2f"),
-        Column("lost on photographs", "dB", ".3f"),
-        Column(f"lost by {against} at this PSNR", "dB", ".3f"),
-        Column("SSIM against photographs", format=".4f"),
-        Column(f"SSIM of {against} at this PSNR", format=".4f"),
-    )
-    for name, entry in measured["scenes"].items():
-        reference = entry["series"][against]["encodes"]
-        for series, curve in entry["series"].items():
-            if series == against:
-                continue
-            for p in [p for p in curve["encodes"] if not qualities or p["q"] in qualities]:
-                size = size_at(reference, "psnr", p["psnr"])
-                loss, ssim = (along_psnr(reference, key, p["psnr"]) for key in ("psnr_loss", "truth_ssim"))
-                gap = None if size is None else 100 * (p["bytes"] / size - 1)
-                table.add(name, series, p["q"], p["bytes"], gap, p["psnr"], p["psnr_loss"], loss, p["truth_ssim"], ssim)
-
-
 def _report(args: argparse.Namespace) -> None:
     results = merged([args.results, *args.more], args.series)
     if args.against is not None:
@@ -364,22 +240,7 @@ def _report(args: argparse.Namespace) -> None:
                 raise UsageError(f"{args.results}: {name} has no encode of '{args.against}' at quality {args.at:g}")
         print_gaps(results["scenes"], args.against, args.at)
         return
-    if args.losses is not None:
-        if args.json is None:
-            raise UsageError("--losses makes a table: say with --json where to keep it")
-        keep_losses(results, args.losses, args.json, args.qualities)
-        return
-    if args.json is not None:
-        keep_tables(results, args.json)
-        return
-    formats = json.loads(args.formats.read_text())["scenes"] if args.formats is not None else {}
-    for name, entry in results["scenes"].items():
-        views = entry["test_views"]
-        print(f"### {name}, {entry['source_splats']:,} splats, {views} test views, encoded on {results['device']}\n")
-        print(_table(entry), end="\n\n")
-        if args.images is not None:
-            rows = formats[name]["formats"] if name in formats else []
-            _plot(entry, rows, args.images / f"rate_distortion_{name}.png")
+    keep_tables(results, args.json)
 
 
 def main() -> None:
@@ -389,12 +250,8 @@ def main() -> None:
     measure.add_argument("--series", nargs="+", default=["default"], metavar="NAME[:OPTION=VALUE,…]")
     report.add_argument("more", nargs="*", type=Path, metavar="OUT.json", help="further files of measure")
     report.add_argument("--series", nargs="+", default=[], metavar="NAME", help="these alone, in this order")
-    report.add_argument("--formats", type=Path, help="what tools.study.compare_formats measured")
-    report.add_argument("--images", type=Path, metavar="DIR", help="draw the curves too")
     report.add_argument("--json", type=Path, metavar="FILE", help="keep tables for docs/benchmarks")
     report.add_argument("--against", metavar="NAME")
-    report.add_argument("--losses", metavar="NAME")
-    report.add_argument("--qualities", nargs="+", type=float, default=(), metavar="Q", help="of the rows of --losses")
     report.add_argument("--at", type=float, default=0.5, metavar="Q")
     args = parser.parse_args()
     args.run(args)

@@ -1,45 +1,14 @@
-"""The pruning benchmark's own parts: measurements of half-size views, Pareto front, settings."""
+"""The pruning benchmark's own parts: Pareto front, settings."""
 
 from __future__ import annotations
 
-import numpy as np
-
-from tools.bench.pruned_scene import HalfSizeFirst
-from tools.bench.pruning import skip_settings
-from tools.bench.pruning_report import pareto
-
-
-class Recorder:
-    """Effects that say who measured them, and when."""
-
-    def __init__(self, name, calls):
-        self.name, self.calls = name, calls
-
-    def measure(self):
-        self.calls.append(self.name)
-        return self.name, None
-
-    def remove(self, splats):
-        self.calls.append(f"{self.name} loses {len(splats)}")
-
-
-def test_half_size_views_first():
-    calls = []
-    effects = HalfSizeFirst(Recorder("full", calls), Recorder("half", calls), 2)
-    measured = []
-    for _ in range(4):
-        measured.append(effects.measure()[0])
-        effects.remove(np.arange(3))
-    # The first measurement renders the targets of both.
-    assert measured == ["full", "half", "half", "full"]
-    assert calls.count("full") == 2
-    assert calls.count("half") == 3
-    assert calls.count("full loses 3") == calls.count("half loses 3") == 4
+from tools.bench.pruning import pareto, skip_settings
 
 
 def test_pareto_front():
-    rows = [{"seconds": s, "psnr_at_equal_count": p} for s, p in [(3, 50), (1, 40), (2, 39), (4, 49), (3, 51)]]
-    assert [(r["seconds"], r["psnr_at_equal_count"]) for r in pareto(rows)] == [(1, 40), (3, 51)]
+    points = {"a": (3, 50.0), "b": (1, 40.0), "c": (2, 39.0), "d": (2, 45.0), "e": (4, 50.0)}
+    rows = [{"skipped": n, "seconds": s, "psnr_at_equal_count": p} for n, (s, p) in points.items()]
+    assert [r["skipped"] for r in pareto(rows)] == ["b", "d", "a"]
 
 
 def test_the_full_computation_comes_first_and_every_name_once():

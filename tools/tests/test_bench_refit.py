@@ -23,7 +23,7 @@ def test_measure_and_report(monkeypatch, tmp_path, data, capsys):
     shutil.copy(data / "plush_excerpt.ply", scene / "point_cloud.ply")
     shutil.copy(data / "plush_excerpt_cameras.json", scene / "cameras.json")
     out = tmp_path / "out.json"
-    few = ["--removed", 0.4, 0.6, "--drops", 1e-10, "--iterations", 4, "--most-steps", 4, "--every", 2]
+    few = ["--removed", 0.4, 0.6, "--drops", 1e-10, "--iterations", 4, "--every", 2]
     call(monkeypatch, "measure", scene, "--json", out, *few)
     entry = json.loads(out.read_text())["scenes"]["excerpt"]
     assert set(entry["curves"]) == {
@@ -37,15 +37,7 @@ def test_measure_and_report(monkeypatch, tmp_path, data, capsys):
         assert [p["splats"] for p in points] == [900, 600]
         if "joint" in name:
             assert all(p["errors"][1] < p["errors"][0] for p in points)
-    errors = [row["train_error"] for row in entry["step_rows"]]
-    assert [row["steps"] for row in entry["step_rows"]] == [0, 1, 2, 3, 4]
-    assert errors == sorted(errors, reverse=True)
     capsys.readouterr()
     call(monkeypatch, "report", out)
     text = capsys.readouterr().out
     assert f"{entry['curves']['joint'][1]['psnr']:.2f} dB" in text
-    assert f"{entry['times']['ratio']:.2f} times" in text
-
-    pytest.importorskip("matplotlib", reason="the extra bench is not installed")
-    call(monkeypatch, "report", out, "--images", tmp_path)
-    assert (tmp_path / "refit_excerpt.png").stat().st_size > 1000

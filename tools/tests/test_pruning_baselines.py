@@ -10,12 +10,11 @@ import pytest
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import GSPLAT, INRIA
-from potr_cl.reference import raster as reference
-from potr_cl.reference.scenes import random_scene, ring_of_cameras
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from tests.devices import FAMILIES, open_device
-from tools.bench.pruning_report import pareto
+from tests.reference import raster as reference
+from tests.reference.scenes import random_scene, ring_of_cameras
 from tools.study import pruning_baselines as baselines
 from tools.study.pruning_baselines import mesongs_power, removal_order, scores, transmittance_sums
 
@@ -117,9 +116,3 @@ def test_removal_order():
 def test_mesongs_power():
     assert mesongs_power("lego") == 0.05
     assert mesongs_power("unknown") == 0.1
-
-
-def test_pareto_front():
-    points = {"a": (3, 50.0), "b": (1, 40.0), "c": (2, 39.0), "d": (2, 45.0), "e": (4, 50.0)}
-    rows = [{"skipped": n, "seconds": s, "psnr_at_equal_count": p} for n, (s, p) in points.items()]
-    assert [r["skipped"] for r in pareto(rows)] == ["b", "d", "a"]

@@ -12,7 +12,7 @@ import pytest
 
 from potr_cl.errors import UsageError
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.reference.scenes import random_scene
+from tests.reference.scenes import random_scene
 from tools.study import ablation, compare_formats, rate_distortion
 
 
@@ -45,8 +45,7 @@ def test_series():
 
 
 def test_a_curve_is_measured_written_and_continued(monkeypatch, folder, tmp_path, capsys):
-    pytest.importorskip("matplotlib", reason="the extra bench is not installed")
-    out, images = tmp_path / "out.json", tmp_path / "images"
+    out = tmp_path / "out.json"
     call(monkeypatch, rate_distortion, "measure", folder, "--json", out, "--qualities", 0.3)
     first = json.loads(out.read_text())["scenes"]["excerpt"]["series"]["default"]["encodes"]
     call(monkeypatch, rate_distortion, "measure", folder, "--json", out, "--qualities", 0.1, 0.3)
@@ -56,9 +55,8 @@ def test_a_curve_is_measured_written_and_continued(monkeypatch, folder, tmp_path
     assert points[0]["bytes"] < points[1]["bytes"]
     assert sum(points[0]["sections"].values()) == points[0]["bytes"]
     capsys.readouterr()
-    call(monkeypatch, rate_distortion, "report", out, "--images", images)
-    assert f"{points[0]['psnr']:.2f} dB" in capsys.readouterr().out
-    assert (images / "rate_distortion_excerpt.png").stat().st_size > 1000
+    call(monkeypatch, rate_distortion, "report", out)
+    assert f"| {points[0]['psnr']:.2f} |" in capsys.readouterr().out
 
 
 def test_series_of_the_sweeps_options_and_their_gaps(monkeypatch, folder, tmp_path, capsys):
@@ -84,31 +82,7 @@ def test_series_of_the_sweeps_options_and_their_gaps(monkeypatch, folder, tmp_pa
 def test_interpolation_along_a_curve():
     points = [{"bytes": b, "psnr": p} for b, p in ((4000, 40.0), (1000, 30.0), (16000, 45.0))]
     assert rate_distortion.size_at(points, "psnr", 35.0) == pytest.approx(2000)
-    assert rate_distortion.value_at(points, "psnr", 2000) == pytest.approx(35)
-    assert rate_distortion.value_at(points, "psnr", 16000) == 45
     assert rate_distortion.size_at(points, "psnr", 45.1) is None
-    assert rate_distortion.value_at(points, "psnr", 999) is None
-
-
-def test_the_report_on_formats(monkeypatch, tmp_path, capsys):
-    sizes = ((0.3, 1_000_000, 30.0), (0.5, 4_000_000, 40.0))
-    ours = [{"q": q, "bytes": b, "psnr": p, "psnr_loss": 50 - p} for q, b, p in sizes]
-    theirs = [
-        {"format": ".a", "bytes": 4_000_000, "psnr": 35.0, "psnr_loss": 15.0, "measured": True},
-        {"format": ".b", "bytes": 9_000_000, "psnr": 41.0, "psnr_loss": 9.0, "measured": True},
-        {"format": "c", "bytes": 8_000_000, "psnr": 20.0, "psnr_loss": 30.0, "measured": False},
-    ]
-    formats, curve = tmp_path / "formats.json", tmp_path / "curve.json"
-    formats.write_text(json.dumps({"tool": "t 1", "scenes": {"s": {"formats": theirs}}}))
-    curve.write_text(json.dumps({"scenes": {"s": {"series": {"default": {"encodes": ours}}}}}))
-    call(monkeypatch, compare_formats, "report", formats, curve)
-    a, b, c = (line for line in capsys.readouterr().out.splitlines() if line.startswith(("| .", "| c")))
-    assert a.count("2.00 MB, 2.0 ×") == 2
-    assert "40.00 dB" in a
-    assert "10.00 dB" in a
-    assert b.count("beyond our best") == 2
-    assert "| c * |" in c
-    assert c.count("more than 8.0 ×") == 2
 
 
 def test_tables_of_curves_and_formats(monkeypatch, folder, tmp_path, capsys):
@@ -165,9 +139,8 @@ def test_ablation(monkeypatch, folder, tmp_path, capsys):
     call(monkeypatch, ablation, "measure", folder, "--json", out)
     steps = json.loads(out.read_text())["scenes"]["excerpt"]["steps"]
     sizes = [step["bytes"] for step in steps]
-    assert len(steps) == 12
+    assert len(steps) == 7
     assert sizes[:6] == sorted(sizes[:6], reverse=True), "a part of the codec adds bytes"
-    assert sizes[-1] < sizes[5]
     assert steps[0]["psnr"] == steps[1]["psnr"]
     for step in steps[1:]:
         listed = sum(step["bytes_a_splat"].values()) * step["splats"]
@@ -175,27 +148,5 @@ def test_ablation(monkeypatch, folder, tmp_path, capsys):
     call(monkeypatch, ablation, "report", out, "--json", tmp_path / "results.json")
     assert "| as PLY | 12.00 |" in capsys.readouterr().out
     results = json.loads((tmp_path / "results.json").read_text())
-    assert [len(results[name]["rows"]) for name in ("excerpt", "bytes_excerpt")] == [13, 13]
+    assert [len(results[name]["rows"]) for name in ("excerpt", "bytes_excerpt")] == [8, 8]
     assert results["excerpt"]["machine"] == json.loads(out.read_text())["machine"]
-
-
-def test_losses_on_photographs_at_equal_psnr(monkeypatch, tmp_path):
-    def points(*rows):
-        names = ("q", "bytes", "psnr", "psnr_loss", "truth_ssim")
-        return {"encodes": [dict(zip(names, row, strict=True)) for row in rows]}
-
-    best = points((0.3, 1000, 40.0, 0.4, 0.90), (0.5, 4000, 44.0, 0.2, 0.94))
-    other = points((0.3, 1600, 42.0, 0.35, 0.91), (0.5, 9000, 45.0, 0.1, 0.95))
-    about = {"machine": "m", "date": "2026-01-31", "command": ["c"], "commit": "abc"}
-    measured = {**about, "scenes": {"s": {"series": {"best": best, "smallest": other}}}}
-    curves, kept = tmp_path / "curves.json", tmp_path / "kept.json"
-    curves.write_text(json.dumps(measured))
-    call(monkeypatch, rate_distortion, "report", curves, "--losses", "best", "--json", kept)
-    first, second = json.loads(kept.read_text())["losses"]["rows"]
-    assert first[:4] == ["s", "smallest", 0.3, 1600]
-    assert first[4:] == pytest.approx([-20, 42.0, 0.35, 0.3, 0.91, 0.92], rel=1e-4)
-    assert second == ["s", "smallest", 0.5, 9000, None, 45.0, 0.1, None, 0.95, None], "beyond the ends of best"
-    call(monkeypatch, rate_distortion, "report", curves, "--losses", "best", "--json", kept, "--qualities", 0.5)
-    assert json.loads(kept.read_text())["losses"]["rows"] == [second]
-    with pytest.raises(UsageError, match="--json"):
-        call(monkeypatch, rate_distortion, "report", curves, "--losses", "best")

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from potr_cl.raster.rules import INRIA
-from potr_cl.reference import raster as reference
-from potr_cl.reference.scenes import random_splats, ring_of_cameras
+from tests.reference import raster as reference
+from tests.reference.scenes import random_splats, ring_of_cameras
 from tools.results import ROOT, Column, Results, circumstances, write_json
 from tools.workloads import best_of, scaled
 

@@ -11,9 +11,9 @@ from potr_cl.codec.decoder import decode
 from potr_cl.opencl.device import Device
 from potr_cl.raster.picked_splats import PickedSplats
 from potr_cl.raster.rules import GSPLAT, INRIA
-from potr_cl.reference import raster as reference
-from potr_cl.reference.scenes import random_splats, tilted_camera
 from tests.devices import FAMILIES, open_device
+from tests.reference import raster as reference
+from tests.reference.scenes import random_splats, tilted_camera
 from tools.stress import cases as stress_cases
 from tools.stress import measures, precise, roads, run, solvers, views
 

@@ -10,13 +10,11 @@
    its digits out of the rounding of the AC terms.
 
    Macros:
-       LANES, DOUBLE        see reals.clh; LANES is 1 on GPUs;
-       SH_COUNT             coefficients of a channel: 4, 9 or 16;
-       BLOCK                rows of the matrix that are reduced at a time;
-       ORTHOGONAL           1: reduce by reflections (ridge_orthogonal.clh);
-                            0: by the normal equations (ridge_cholesky.clh);
-       SHIFT_DC             1: solve for the change of the DC term, 0: for the term itself;
-       SCALED, REFINEMENTS  see ridge_cholesky.clh. */
+       LANES       see reals.clh; 1 on GPUs;
+       SH_COUNT    coefficients of a channel: 4, 9 or 16;
+       BLOCK       rows of the matrix that are reduced at a time;
+       ORTHOGONAL  1: reduce by reflections (ridge_orthogonal.clh);
+                   0: by the normal equations (ridge_cholesky.clh). */
 
 #include "include/reals.clh"
 #include "include/sh_basis.clh"
@@ -139,9 +137,7 @@ kernel void compact(
             original = mad(target[k], target[k], original);
             keep[k] = usable[k];
         }
-#if SHIFT_DC
         target[0] = 0;
-#endif
         solve(state, target, keep, lambda, x);
         if (scale_factor > 0) {
             for (int k = 1; k < SH_COUNT; ++k)
@@ -165,9 +161,7 @@ kernel void compact(
         VREAL start = squared_norm(state, start_error) + lambda * start_penalty;
         VREAL noise = 256 * ROUNDING * ROUNDING * original * column_product(state, 0, 0);
         VREAL limit = LARGEST_GROWTH * fmax(sqrt(original), (VREAL)(1));
-#if SHIFT_DC
         x[0] += coefficients[c][0];
-#endif
         for (int k = 0; k < SH_COUNT; ++k) {
             /* It is read before the choice. Of a choice between two elements of private arrays Intel's CPU compiler
                makes a read at a chosen address, and its vectoriser gives all work-items what the first one reads

@@ -13,7 +13,6 @@
        ANTIALIASED, LEAST_COMPENSATION_SQUARED, LOW_PASS,
        LOW_PASS_SQUARED                                  see project.cl. */
 
-#define DOUBLE 0
 #include "include/reals.clh"
 #include "include/splat.clh"
 #include "include/view_set.clh"

@@ -9,8 +9,6 @@
    Lists of more than SEGMENT splats are walked twice: h at a segment's end follows from what the later segments add to
    the pixels, which is only known after a first walk.
 
-   errors[tile] becomes the sum of v^2.
-
    Macros:
        LANES                               8 or 16, see lanes.clh;
        ALPHA_CAP, TRANSMITTANCE_THRESHOLD  see subtile_vectors.clh;
@@ -118,7 +116,6 @@ kernel void derivatives(
     int given,
     float unit,
     float scale,
-    global float *errors,
     volatile global uint *totals)
 {
     const int tile = get_global_id(0);
@@ -134,7 +131,6 @@ kernel void derivatives(
     vfloat t[SUBTILES], rgb[SUBTILES][3];
     float values[SUBTILES][3][LANES];
     vfloat whole[SUBTILES]; /* the pixel's colour . v, of lists that are walked twice */
-    float error = 0.0f;
     const int twice = end - begin > SEGMENT;
     for (int pass = twice ? 0 : 1; pass < 2; ++pass) {
         for (int i = 0; i < SUBTILES; ++i) {
@@ -159,7 +155,7 @@ kernel void derivatives(
                         MAD(through, (vfloat)(red), rgb[i][0]),
                         MAD(through, (vfloat)(green), rgb[i][1]),
                         MAD(through, (vfloat)(blue), rgb[i][2])};
-                    error += pixel_values(
+                    pixel_values(
                         colour, i, origin, view.width, view.height, target, 1, given, unit, LARGEST_VALUE, values[i]);
                     whole[i] = (vfloat)(0.0f);
                     for (int channel = 0; channel < 3; ++channel)
@@ -186,5 +182,4 @@ kernel void derivatives(
                 break;
         }
     }
-    errors[tile] = error;
 }

@@ -40,7 +40,6 @@ void derivatives(
     int given,
     float unit,
     float scale,
-    global float *errors,
     volatile global uint *totals)
 {
     local State state;
@@ -87,14 +86,6 @@ void derivatives(
         behind[i] = MAD(state.r[i], red, MAD(state.g[i], green, state.b[i] * blue));
     }
     atomic_max(&ends[mine.subtile], end);
-    pair_w[lid] = error;
-    for (int step = ITEMS / 2; step > 0; step /= 2) {
-        barrier(CLK_LOCAL_MEM_FENCE);
-        if (lid < step)
-            pair_w[lid] += pair_w[lid + step];
-    }
-    if (lid == 0)
-        errors[views->first_tile + tile] = pair_w[0];
     if (swept == 0)
         return;
     barrier(CLK_LOCAL_MEM_FENCE);

@@ -14,14 +14,13 @@
    transmittances before each are kept. Then, from the last segment to the first, each is walked forward once more for
    its alphas and weights, and back.
 
-   On the way a list loses, in place, the intersections of removed splats and those that the last sweep marked. A
-   tile's list begins at offsets[tile] and has lengths[tile] intersections.
+   On the way a list loses, in place, the intersections of removed splats. A tile's list begins at offsets[tile] and has
+   lengths[tile] intersections.
 
    Macros:
        LANES                               8 or 16, see lanes.clh;
        ALPHA_CAP, TRANSMITTANCE_THRESHOLD  see subtile_vectors.clh;
-       INT64_ATOMICS                       see totals.clh;
-       TIGHTEN                             1: mark the intersections that touch no pixel. */
+       INT64_ATOMICS                       see totals.clh. */
 
 #include "include/lanes.clh"
 #include "include/splat.clh"
@@ -43,12 +42,11 @@ inline uint walk(
     float2 first,
     vfloat t[1],
     vfloat rgb[3],
-    float *memory,
-    uchar *touching)
+    float *memory)
 {
     vfloat through = t[0], r = rgb[0], g = rgb[1], b = rgb[2];
     uint j = 0;
-    while (j < length && (TIGHTEN || VANY(through > 0.0f))) {
+    while (j < length && VANY(through > 0.0f)) {
         const uint stop = min(j + PAIRS_AT_ONCE, length);
         for (; j < stop; ++j) {
             const Splat *splat = &splats[list[j]];
@@ -59,8 +57,6 @@ inline uint walk(
             b = MAD(weight, (vfloat)(splat->blue), b);
             VSTORE(goes_on ? alpha : (vfloat)(0.0f), 2 * j, memory);
             VSTORE(weight, 2 * j + 1, memory);
-            if (TIGHTEN && VANY(power >= LOG2_ALPHA_MIN))
-                touching[list[j]] = 1;
         }
     }
     t[0] = through;
@@ -147,7 +143,7 @@ kernel void removal(
     uint kept = begin;
     for (uint read = begin; read < end; ++read) {
         const uint number = intersections[read];
-        if (alive[number] == SPLAT_REMOVED || sums[read].y < 0.0f)
+        if (alive[number] == SPLAT_REMOVED)
             continue;
         if (kept < read) {
             intersections[kept] = number;
@@ -163,7 +159,6 @@ kernel void removal(
     Splat splats[SEGMENT];
     ushort lists[SUBTILES][SEGMENT];
     uint listed[SUBTILES];
-    uchar touching[SEGMENT];
     float memory[2 * (SEGMENT + LANES) * LANES];
     float2 fresh[SEGMENT];
     vfloat t[SUBTILES], rgb[SUBTILES][3], twice[SUBTILES][3], behind[SUBTILES][3];
@@ -185,7 +180,7 @@ kernel void removal(
                 checkpoints[last / apart][i] = t[i];
         gather_splats(shapes, colours, intersections, subtiles, begin + last * SEGMENT, kept, splats, lists, listed);
         for (int i = 0; i < SUBTILES; ++i)
-            walk(splats, lists[i], listed[i], subtile_centre(origin, i), &t[i], rgb[i], memory, touching);
+            walk(splats, lists[i], listed[i], subtile_centre(origin, i), &t[i], rgb[i], memory);
     }
 
     for (uint segment = last + 1; segment-- > 0;) {
@@ -198,17 +193,15 @@ kernel void removal(
                 gather_splats(
                     shapes, colours, intersections, subtiles, begin + before * SEGMENT, kept, splats, lists, listed);
                 for (int i = 0; i < SUBTILES; ++i)
-                    walk(splats, lists[i], listed[i], subtile_centre(origin, i), &t[i], rgb[i], memory, touching);
+                    walk(splats, lists[i], listed[i], subtile_centre(origin, i), &t[i], rgb[i], memory);
             }
         }
         const uint count = gather_splats(shapes, colours, intersections, subtiles, from, kept, splats, lists, listed);
-        for (uint k = 0; k < count; ++k) {
+        for (uint k = 0; k < count; ++k)
             fresh[k] = (float2)(0.0f, 0.0f);
-            touching[k] = 0;
-        }
         for (int i = 0; i < SUBTILES; ++i) {
             const uint walked =
-                walk(splats, lists[i], listed[i], subtile_centre(origin, i), &t[i], rgb[i], memory, touching);
+                walk(splats, lists[i], listed[i], subtile_centre(origin, i), &t[i], rgb[i], memory);
             if (segment == last) {
                 const vfloat through = fabs(t[i]);
                 float differences[3][LANES];
@@ -236,7 +229,7 @@ kernel void removal(
             if (k + PREFETCH_AHEAD < count)
                 PREFETCH_TO_WRITE(totals + TOTAL_WORDS * intersections[from + k + PREFETCH_AHEAD]);
             replace_sums(totals + TOTAL_WORDS * intersections[from + k], sums[from + k], fresh[k], scale, bound);
-            sums[from + k] = TIGHTEN && !touching[k] ? NEVER : fresh[k];
+            sums[from + k] = fresh[k];
         }
     }
     /* What lies behind the last pixel's end has no effect any more. */

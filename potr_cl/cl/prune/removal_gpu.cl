@@ -4,7 +4,6 @@
    Macros:
        ALPHA_CAP, TRANSMITTANCE_THRESHOLD, NATIVE_EXP2  see subtile_lists.clh;
        INT64_ATOMICS                                    see totals.clh;
-       TIGHTEN                                          1: mark the intersections that touch no pixel;
        PICKED                                           1: splats have other numbers in totals and states, which
                                                         `numbers` has. */
 
@@ -56,9 +55,6 @@ void removal(
     local Walk walk;
     local float behind_r[TILE * TILE], behind_g[TILE * TILE], behind_b[TILE * TILE];
     local int unfinished[2];
-#if TIGHTEN
-    local int reached[BATCH];
-#endif
 
     const int lid = get_local_id(0), share = lid % SHARE;
     const uint set_tile = tiles[start + get_group_id(0)];
@@ -115,9 +111,6 @@ void removal(
     }
     if (swept == 0 || first_time == ONLY_TARGET)
         return;
-#if TIGHTEN
-    end = INT_MAX; /* every intersection shows whether it touches a pixel */
-#endif
     end_subtile(&walk, mine.subtile, end);
     barrier(CLK_LOCAL_MEM_FENCE);
 
@@ -145,10 +138,6 @@ void removal(
             bb[p] = behind_b[i];
         }
         clear_sums(&walk, lid);
-#if TIGHTEN
-        for (int i = lid; i < BATCH; i += ITEMS)
-            reached[i] = 0;
-#endif
         barrier(CLK_LOCAL_MEM_FENCE);
         const int rounds = agree_on_rounds(&walk, &turn, lid);
         if (share == 0)
@@ -167,10 +156,6 @@ void removal(
 #pragma unroll
                 for (int p = 0; p < PIXELS; ++p) {
                     const float power = power_at(mine, p, u0, s0, s1);
-#if TIGHTEN
-                    if (power >= LOG2_ALPHA_MIN)
-                        atomic_or(&reached[k], 1);
-#endif
                     const int takes = power >= LOG2_ALPHA_MIN && place + i <= last[p];
                     const float most = fmin(EXP2(power), ALPHA_CAP);
                     const float alpha = takes ? most : 0.0f;
@@ -208,11 +193,7 @@ void removal(
             const float2 before = sums[first + i], after = sums_of(&walk, i);
             replace_sums(
                 totals + TOTAL_WORDS * SCENE_NUMBER(batch.splats[i]), before, after, view_scale, view_bound);
-#if TIGHTEN
-            sums[first + i] = reached[i] ? after : NEVER;
-#else
             sums[first + i] = after;
-#endif
         }
         if (first == 0)
             break;

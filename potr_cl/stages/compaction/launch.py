@@ -24,16 +24,9 @@ class LaunchShape:
     pinned: bool
 
 
-def launch_shape(device: Device, double: bool) -> LaunchShape:
-    """The shape for a device's kernel family.
-
-    Args:
-        double: whether it computes in double precision, of which CPUs take half as many at a time.
-    """
+def launch_shape(device: Device) -> LaunchShape:
+    """The shape for a device's kernel family."""
     if device.family == "gpu":
         return LaunchShape(lanes=1, block=4, group=64, pinned=True)
-    lanes = device.vector_width
-    if double and lanes > 1:
-        lanes = max(lanes // 2, 4)
     # Work-groups of one work-item: these kernels keep kilobytes of private memory each.
-    return LaunchShape(lanes=lanes, block=8, group=1, pinned=False)
+    return LaunchShape(lanes=device.vector_width, block=8, group=1, pinned=False)

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.errors import DeviceError, UsageError
+from potr_cl.errors import UsageError
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.kernel import Kernel
@@ -26,19 +26,11 @@ from potr_cl.stages.compaction.view_weights import ViewWeights
 
 ColourModel = Literal["ycocg", "rgb"]
 Weighting = Literal["importance", "visibility"]
-Precision = Literal["plain", "scaled", "refined", "orthogonal", "fp64"]
+Precision = Literal["orthogonal", "cholesky"]
 
 #: The largest lambda whose squares and sums stay finite in single precision.
 _LARGEST_LAMBDA = 1e24
 
-_CHOLESKY = {"ORTHOGONAL": 0, "DOUBLE": 0, "SCALED": 1, "SHIFT_DC": 1, "REFINEMENTS": 0}
-_VARIANTS: dict[str, dict[str, int]] = {
-    "plain": _CHOLESKY | {"SCALED": 0, "SHIFT_DC": 0},
-    "scaled": _CHOLESKY,
-    "refined": _CHOLESKY | {"REFINEMENTS": 1},
-    "orthogonal": {"ORTHOGONAL": 1, "DOUBLE": 0, "SHIFT_DC": 1},
-    "fp64": _CHOLESKY | {"DOUBLE": 1},
-}
 #: Bytes of the splats that are on the device at a time: enough to fill it, little to pin.
 _BATCHES = 64 << 20
 #: Threads that copy to pinned memory: one does not reach what the bus carries.
@@ -57,9 +49,8 @@ class CompactionOptions:
         two_pass: solve again without the coefficients that would be quantised to 0.
         colour_model: the channels to solve (and to quantise, for the second pass) in.
         weighting: "importance" takes the weights, "visibility" 1 for every view in which the splat has any.
-        precision: how the least squares are solved: "orthogonal" in float32 by Householder reflections; by Cholesky's
-            factor of the normal equations in float32 "plain", "scaled" to a unit diagonal, or "refined" by one step
-            more, and scaled in float64 ("fp64", if the device has it).
+        precision: how the least squares are solved: "orthogonal" by Householder reflections, or "cholesky", faster and
+            less exact, by Cholesky's factor of the normal equations, scaled to a unit diagonal.
 
     Raises:
         UsageError: a value is out of range.
@@ -87,7 +78,7 @@ class CompactionOptions:
         for name, value, known in (
             ("colour model", self.colour_model, ("ycocg", "rgb")),
             ("weighting", self.weighting, ("importance", "visibility")),
-            ("precision", self.precision, tuple(_VARIANTS)),
+            ("precision", self.precision, ("orthogonal", "cholesky")),
         ):
             if value not in known:
                 raise UsageError(f"unknown {name} '{value}': choose one of {', '.join(known)}")
@@ -126,14 +117,14 @@ class Compactor:
 
         Raises:
             UsageError: scene, centres and weights do not belong together.
-            DeviceError: the device fails, has no fp64 when that is asked for, or a batch of one splat does not fit.
+            DeviceError: the device fails, or a batch of one splat does not fit.
         """
         options = options or CompactionOptions()
         splats, count = scene.sh.shape[:2]
         _check(splats, camera_centres, weights)
         if count == 1:
             return scene
-        shape = launch_shape(self.device, bool(_VARIANTS[options.precision]["DOUBLE"]))
+        shape = launch_shape(self.device)
         kernel = self._kernel(count, options, shape)
 
         share = camera_centres.shape[1] if camera_centres.ndim == 3 else 1
@@ -185,12 +176,9 @@ class Compactor:
         return replace(scene, sh=result)
 
     def _kernel(self, sh_count: int, options: CompactionOptions, shape: LaunchShape) -> Kernel:
-        device = self.device
-        variant = _VARIANTS[options.precision]
-        if variant["DOUBLE"] and "cl_khr_fp64" not in device.info.handle.extensions.split():
-            raise DeviceError(f"device {device.info} has no double precision: choose another precision than 'fp64'")
-        return device.kernel(
-            "compact/ridge.cl", "compact", LANES=shape.lanes, SH_COUNT=sh_count, BLOCK=shape.block, **variant
+        macros = {"LANES": shape.lanes, "SH_COUNT": sh_count, "BLOCK": shape.block}
+        return self.device.kernel(
+            "compact/ridge.cl", "compact", ORTHOGONAL=int(options.precision == "orthogonal"), **macros
         )
 
     def _batches(self, offsets: NDArray[np.int64], sh_count: int) -> list[tuple[int, int]]:

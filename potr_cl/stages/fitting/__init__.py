@@ -2,8 +2,7 @@
 
 - fit.py brings a scene's pictures near to targets, round by round, and keeps the best round. The other files are its
   parts:
-- derivatives.py goes from numbers for pixels back to the splats' parameters, tangents.py from changes of parameters to
-  those of pixels; launcher.py runs both on a device;
+- derivatives.py goes from numbers for pixels back to the splats' parameters; launcher.py runs it on a device;
 - adam.py takes steps down such a gradient;
 - views.py says which views are looked at in which order, and which are held out; pictures.py has their targets.
 """

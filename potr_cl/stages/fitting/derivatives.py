@@ -8,7 +8,7 @@ is half the gradient of the squared error. A view takes three steps:
 2. ``derivatives`` goes back from the pixels to nine sums for each splat (cl/fit/derivatives_cpu.cl and its twin);
 3. ``chain`` goes back from those to the splat's parameters (cl/fit/chain.cl).
 
-What the rasterizer decides by comparing numbers is taken as constant (:mod:`potr_cl.reference.derivatives` lists it).
+What the rasterizer decides by comparing numbers is taken as constant (:mod:`tests.reference.derivatives` lists it).
 """
 
 from __future__ import annotations
@@ -92,7 +92,6 @@ class PictureDerivatives(Owner):
         self._launcher = launcher_for(device, rules)
         self._memory = Memory(device)
         self._totals = Scratch(device, "the derivatives' sums")
-        self._errors = Scratch(device, "the tiles' errors")
         self._factors = Scratch(device, "the views' weights")
         self._written: list[float] | None = None
         self._views: ViewSet | None = None
@@ -160,7 +159,6 @@ class PictureDerivatives(Owner):
         if self._totals.reserve(_SUMS * views.stride * len(views.views)):
             # They become zero again whenever they have been used.
             self._device.fill(self._totals.buffer, np.uint32(0), self._totals.nbytes)
-        self._errors.reserve(4 * views.tiles)
         if self._factors.reserve(4 * len(views.views)):
             self._written = None
 
@@ -194,7 +192,6 @@ class PictureDerivatives(Owner):
                 given=given,
                 unit=unit,
                 scale=scale,
-                errors=self._errors.buffer,
                 totals=self._totals.buffer,
             )
         )
@@ -212,15 +209,6 @@ class PictureDerivatives(Owner):
         lanes = self._launcher.lanes
         self._chain.launch((parameters.stride // lanes,), (SPLAT_GROUP // lanes,))
 
-    def squared_error(self, views: ViewSet) -> float:
-        """The sum of v² over the pixels and channels of the views that were added last, which are these.
-
-        Raises:
-            DeviceError: the device failed.
-        """
-        sums = self._device.download(self._errors.buffer, (views.tiles,), np.float32)
-        return float(sums.sum(dtype=np.float64))
-
     def read(self) -> FloatArray:
         """(N, columns) float32, the gradient."""
         shape = (self.columns.count, self.rasterizer.stride)
@@ -232,7 +220,7 @@ class PictureDerivatives(Owner):
         if self._views is not None:
             self._views.close()
             self._views = None
-        for scratch in (self._totals, self._errors, self._factors):
+        for scratch in (self._totals, self._factors):
             scratch.close()
 
     def close(self) -> None:

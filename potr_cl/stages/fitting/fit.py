@@ -52,7 +52,7 @@ _LARGEST_UNIT = 2.0**20
 RATES = Rates(means=0.005, log_scales=1e-2, quaternions=2e-3, opacity_logits=4e-2, dc=5e-3, ac=5e-4)
 _USUAL_ERROR, _SLOWEST = 1 / 128, 0.02
 #: A fit has gained enough to be taken without a look at files if what it leaves of the cost is below the one part, and
-#: of the error, where it has made up for no splats, below the other (docs/benchmarks/fit.md).
+#: of the error, where it has made up for no splats, below the other (docs/benchmarks/findings.md).
 _MUCH_CHEAPER, _MUCH = 0.9, 0.4
 
 

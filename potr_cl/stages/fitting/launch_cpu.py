@@ -6,7 +6,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.raster.macros import totals_limits
 from potr_cl.raster.rules import RasterRules
 from potr_cl.raster.view_set import camera_struct
-from potr_cl.stages.fitting.pixel_sums import PixelSums, PixelTangents, pixel_macros, sums_macros
+from potr_cl.stages.fitting.pixel_sums import PixelSums, sums_macros
 
 
 class CpuLauncher:
@@ -28,20 +28,8 @@ class CpuLauncher:
             **sums_macros(rules),
             **totals_limits(device),
         )
-        self._device, self._rules = device, rules
 
     def sweep(self, sums: PixelSums) -> None:
         """See :meth:`potr_cl.stages.fitting.launcher.Launcher.sweep`."""
         (view,) = sums.views.views
         self._sweep.bind(view=camera_struct(view.camera), **sums.arguments).launch((sums.views.tiles,), (1,))
-
-    def tangents(self, tangents: PixelTangents) -> None:
-        """See :meth:`potr_cl.stages.fitting.launcher.Launcher.tangents`."""
-        (view,) = tangents.views.views
-        kernel = self._device.shared_kernel(
-            "fit/tangents_cpu.cl",
-            "tangents",
-            LANES=max(self._device.vector_width, 8),
-            **pixel_macros(self._rules),
-        )
-        kernel.bind(view=camera_struct(view.camera), **tangents.arguments).launch((view.tiles,), (1,))

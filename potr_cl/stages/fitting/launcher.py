@@ -8,11 +8,11 @@ from potr_cl.opencl.device import Device
 from potr_cl.raster.rules import RasterRules
 from potr_cl.stages.fitting.launch_cpu import CpuLauncher
 from potr_cl.stages.fitting.launch_gpu import GpuLauncher
-from potr_cl.stages.fitting.pixel_sums import PixelSums, PixelTangents
+from potr_cl.stages.fitting.pixel_sums import PixelSums
 
 
 class Launcher(Protocol):
-    """Goes from pixels back to splats, and from splats to pixels, in one kernel family's way."""
+    """Goes from pixels back to splats, in one kernel family's way."""
 
     @property
     def lanes(self) -> int:
@@ -29,14 +29,6 @@ class Launcher(Protocol):
 
         Raises:
             DeviceError: the device refused it.
-        """
-        ...
-
-    def tangents(self, tangents: PixelTangents) -> None:
-        """Enqueue the changes of some views' pixels.
-
-        Raises:
-            DeviceError: the device refused it, or the kernel cannot be built.
         """
         ...
 

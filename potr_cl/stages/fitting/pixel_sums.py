@@ -1,4 +1,4 @@
-"""What both kernel families are told of a sweep over pixels: :class:`PixelSums`, its counterpart, and macros."""
+"""What both kernel families are told of a sweep over pixels: :class:`PixelSums`, and macros."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ class PixelSums:
             the target, times ``unit``.
         unit: see there.
         scale: the views' fixed point.
-        errors: (tiles,) float32, becomes each tile's sum of v².
         totals: (views, stride, 9) int64, the sums are added to them.
     """
 
@@ -36,73 +35,35 @@ class PixelSums:
     given: bool
     unit: float
     scale: float
-    errors: cl.Buffer
     totals: cl.Buffer
 
     @property
     def arguments(self) -> dict[str, Any]:
         """The arguments that the kernels of both families have, by name."""
+        red, green, blue = self.background
         return {
-            **_of_views(self.views, self.background),
+            "shapes": self.views.shapes,
+            "colours": self.views.colours,
+            "offsets": self.views.offsets,
+            "intersections": self.views.intersections,
+            "subtiles": self.views.subtiles,
+            "red": red,
+            "green": green,
+            "blue": blue,
             "target": self.target,
             "first_pixel": self.first_pixel,
             "given": self.given,
             "unit": self.unit,
             "scale": self.scale,
-            "errors": self.errors,
             "totals": self.totals,
         }
 
 
-@dataclass(frozen=True)
-class PixelTangents:
-    """What both kernel families are told to composite.
-
-    Attributes:
-        views: prepared, with their geometry.
-        background: R, G, B behind the splats.
-        changes: (views, stride, 12) float32, as cl/fit/splat_tangents.cl says.
-        first_pixel: where these views' pixels begin in the result.
-        result: (pixels, 3) float32.
-    """
-
-    views: ViewSet
-    background: tuple[float, float, float]
-    changes: cl.Buffer
-    first_pixel: int
-    result: cl.Buffer
-
-    @property
-    def arguments(self) -> dict[str, Any]:
-        """The arguments that the kernels of both families have, by name."""
-        return {
-            **_of_views(self.views, self.background),
-            "changes": self.changes,
-            "first_pixel": self.first_pixel,
-            "result": self.result,
-        }
-
-
-def _of_views(views: ViewSet, background: tuple[float, float, float]) -> dict[str, Any]:
-    """What all these kernels are told of the views."""
-    red, green, blue = background
-    return {
-        "shapes": views.shapes,
-        "colours": views.colours,
-        "offsets": views.offsets,
-        "intersections": views.intersections,
-        "subtiles": views.subtiles,
-        "red": red,
-        "green": green,
-        "blue": blue,
-    }
-
-
-def pixel_macros(rules: RasterRules) -> dict[str, Any]:
-    """Macros that all these kernels need."""
-    return {"ALPHA_CAP": float(rules.alpha_cap), "TRANSMITTANCE_THRESHOLD": rules.transmittance_threshold}
-
-
 def sums_macros(rules: RasterRules) -> dict[str, Any]:
     """Macros that the kernels of the sums need, of both families."""
-    return pixel_macros(rules) | {"LARGEST_VALUE": LARGEST_VALUE, "LARGEST_GAP": LARGEST_GAP}
+    return {
+        "ALPHA_CAP": float(rules.alpha_cap),
+        "TRANSMITTANCE_THRESHOLD": rules.transmittance_threshold,
+        "LARGEST_VALUE": LARGEST_VALUE,
+        "LARGEST_GAP": LARGEST_GAP,
+    }

@@ -52,7 +52,7 @@ class Settling:
 
     choosing: float
     rounding: float
-    gentle: float
+    gentle: float = 0.1
     through: float = 0.3
     last: float = 0.1
 

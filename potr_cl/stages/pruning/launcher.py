@@ -91,7 +91,6 @@ def launcher_for(rasterizer: Rasterizer, options: SweepOptions, fixed_point: Fix
     macros: dict[str, float | int] = {
         "ALPHA_CAP": float(rules.alpha_cap),
         "TRANSMITTANCE_THRESHOLD": rules.transmittance_threshold if threshold is None else threshold,
-        "TIGHTEN": int(options.tighten),
     } | totals_limits(device)
     launcher = GpuLauncher if device.family == "gpu" else CpuLauncher
     return launcher(rasterizer, fixed_point, macros)

@@ -56,8 +56,7 @@ def measurement(
 
     device, pool, views = bench.opened, bench.pool, state.views
     splats = len(state.scene) if seen is None else len(seen)
-    # A sample of the tiles is drawn from all of them in turn, so one device does it.
-    share = None if pool is None or options.sample < 1 else shares(pool, len(views))
+    share = None if pool is None else shares(pool, len(views))
     with ExitStack() as stack:
         if pool is None or share is None or not share.others:
             if sights is not None:
@@ -88,9 +87,7 @@ def measurement(
             sent = stack.enter_context(bench.shared(pool, state, seen))
             sights = sights if pool.in_process else None
             given = [(sent, views, options, bench.background, numbers, sights) for numbers in share.others]
-        others = stack.enter_context(
-            Parts(pool, RemovalPart, given, options.memory, [len(each) for each in share.others], share.names)
-        )
+        others = stack.enter_context(Parts(pool, RemovalPart, given, options.memory, share.names))
         own: RemovalSweep | ViewByView | None = None
         stride = splats
         if share.own:

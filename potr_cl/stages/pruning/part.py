@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -34,7 +33,6 @@ from potr_cl.stages.pruning.survivors import Bits
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.pruning.view_by_view import ViewByView, can_go_by_view
 from potr_cl.stages.pruning.visible_parts import PartedRemoval
-from potr_cl.workers.dealing import in_pieces
 from potr_cl.workers.pool import Part
 
 Indices = NDArray[np.int64]
@@ -99,11 +97,6 @@ class RemovalPart(Part):
         self._device = device
         self._sent: NDArray[np.int64] | None = None
         self._told: tuple[int, Iterator[tuple[int, Indices, NDArray[np.float64]]]] | None = None
-
-    @classmethod
-    def split(cls, given: tuple[Any, ...], pieces: int) -> list[tuple[Any, ...]]:
-        scene, cameras, options, background, numbers, *sights = given
-        return [(scene, cameras, options, background, own, *sights) for own in in_pieces(numbers, pieces)]
 
     @property
     def steers(self) -> bool:

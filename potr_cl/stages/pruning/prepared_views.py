@@ -220,10 +220,6 @@ class PreparedSet(Owner):
                         cl.enqueue_copy(self._device.queue, array, buffer, src_offset=offset, is_blocking=True)
             yield number, view, intersections, sums
 
-    def intersections_left(self) -> int:
-        """Intersections in the lists that no sweep has dropped yet."""
-        return int(self._device.download(self.lengths, (self.views.tiles,), np.uint32).sum(dtype=np.int64))
-
     def close(self) -> None:
         """Give the memory back, including that of the views."""
         self.views.close()

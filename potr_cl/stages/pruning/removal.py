@@ -226,10 +226,6 @@ class RemovalSweep(Owner):
             splats = np.flatnonzero((total > 0) & alive)
             yield self._numbers[number], splats, total[splats] / view.pixels
 
-    def intersections_left(self) -> int:
-        """Tile intersections in the lists of the cached views that no sweep has dropped yet."""
-        return sum(views.intersections_left() for views in self._prepared.cached)
-
     def close(self) -> None:
         """Give all device memory back."""
         self._owned.close()

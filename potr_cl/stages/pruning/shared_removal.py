@@ -134,7 +134,7 @@ class SharedRemoval(Owner):
 
     def _numbers_of(self, part: int) -> Indices:
         assert self._numbers is not None
-        return self._numbers[self._others.origin(part)]
+        return self._numbers[part]
 
     def _places(self, splats: Indices) -> Indices | Each:
         """What tells the parts about these splats."""
@@ -227,7 +227,7 @@ class _SharedSteering(Owner):
             self._fetch(pending.results())
         elif self._added is not None:
             for place, changes in enumerate(pending.results()):
-                splats, numbers = self._numbers.get(shared._others.origin(place), (self.splats, None))
+                splats, numbers = self._numbers.get(place, (self.splats, None))
                 self._added.add(self.totals, changes, splats, numbers)
         else:
             found = shared.found_by_others(pending)

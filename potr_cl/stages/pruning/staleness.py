@@ -18,10 +18,10 @@ Indices = NDArray[np.int64]
 
 
 class TileSchedule:
-    """Chooses the tiles of a measurement by staleness, in turns, and at random.
+    """Chooses the tiles of a measurement by staleness, and in turns.
 
     Args:
-        options: tolerance, turns and sample.
+        options: tolerance and turns.
         views: (number among the cameras, tiles) of the views whose tiles are numbered through, in their order.
     """
 
@@ -29,21 +29,18 @@ class TileSchedule:
         self._options = options
         self._numbers = np.array([number for number, _ in views], np.int64)
         self._tiles = np.array([tiles for _, tiles in views], np.int64)
-        self._random = np.random.default_rng(options.seed)
 
     def choose(self, measurement: int, stale: NDArray[np.float32]) -> Indices:
         """The tiles that a measurement sweeps, ascending.
 
         Args:
-            measurement: its number, from 0. The first takes no turns and no sample.
+            measurement: its number, from 0. The first takes no turns.
             stale: (tiles,) each tile's staleness.
         """
         options = self._options
         wanted = stale > options.tolerance
         if options.turns > 1 and measurement > 0:
             wanted &= np.repeat((measurement + self._numbers) % options.turns == 0, self._tiles)
-        if options.sample < 1 and 0 < measurement <= options.sampled:
-            wanted &= self._random.random(len(wanted)) < options.sample
         return np.flatnonzero(wanted)
 
     def changed(self, stale: NDArray[np.float32]) -> Indices:

@@ -26,13 +26,9 @@ class SweepOptions:
         turns: with n, a view is swept only in every n-th measurement after the first. Views that do not fit the memory
             budget are swept in each measurement.
         memory: bytes of device memory that the views may take; None: :func:`default_memory`.
-        tighten: drop a tile's intersections that reach alpha 1/255 in none of its pixels. Changes no result.
         transmittance_threshold: a pixel ends before its transmittance falls below this; None: where the rasterizer's
             rules end it. When a removal lets a pixel go on one splat longer, its colour jumps by up to the hundredfold
             of this.
-        sample: the part, drawn at random, of the tiles due that is really swept; the others keep their sums for now.
-        sampled: in how many measurements after the first only such a sample is swept.
-        seed: of the random sample.
 
     Raises:
         UsageError: a value is out of range.
@@ -41,11 +37,7 @@ class SweepOptions:
     tolerance: float = 0.01
     turns: int = 1
     memory: int | None = None
-    tighten: bool = False
     transmittance_threshold: float | None = 1e-8
-    sample: float = 1.0
-    sampled: int = 24
-    seed: int = 0
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.tolerance):
@@ -59,15 +51,11 @@ class SweepOptions:
                 f"a pixel cannot end at a transmittance of {self.transmittance_threshold:g}: at least "
                 f"{_LEAST_THRESHOLD:g}, below 1"
             )
-        if not 0 < self.sample <= 1:
-            raise UsageError(f"a sample of {self.sample:g} of the tiles: it must be above 0 and at most 1")
-        if self.sampled < 0:
-            raise UsageError(f"{self.sampled} sampled measurements are less than none")
 
     @property
     def only_by_tolerance(self) -> bool:
-        """Whether a tile's staleness alone decides when it is swept again: no turns, no sample."""
-        return self.turns == 1 and self.sample == 1
+        """Whether a tile's staleness alone decides when it is swept again: no turns."""
+        return self.turns == 1
 
 
 def default_memory(device: Device) -> int:

@@ -80,7 +80,7 @@ def sights_worth_it(
         run: shares the work out.
     """
     # A sample of the tiles is drawn from all of them in turn.
-    if len(scene) < LEAST_SPLATS or options.sample < 1 or not cameras:
+    if len(scene) < LEAST_SPLATS or not cameras:
         return None
     sights = Sights.of(scene, cameras, INRIA.near, groups, run)
     return sights if sights.totals.sum() <= WORTH_IT * len(scene) * len(cameras) else None

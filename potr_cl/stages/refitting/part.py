@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -24,7 +23,7 @@ from potr_cl.raster.rules import RasterRules
 from potr_cl.raster.scene_buffers import SceneBuffers, stride_of
 from potr_cl.raster.view_shares import Excerpt
 from potr_cl.stages.refitting.coefficients import Coefficients
-from potr_cl.stages.refitting.colour_map import ColourMap, parts_of
+from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.coming_scene import AnyScene, arrived, colourless
 from potr_cl.stages.refitting.launcher import launcher_for
 from potr_cl.stages.refitting.packing import Packing
@@ -34,7 +33,6 @@ from potr_cl.stages.refitting.sparse_vector import SentVector, SparseVectors
 from potr_cl.stages.refitting.targets import RenderedTargets, Targets
 from potr_cl.stages.refitting.vector_space import Layout
 from potr_cl.stages.refitting.visible_targets import VisibleTargets
-from potr_cl.workers.dealing import in_pieces
 from potr_cl.workers.pool import Part
 
 
@@ -129,11 +127,6 @@ class ColourPart(Part):
             self._blocks = owned.enter_context(Memory(device))
             self._block_sums: cl.Buffer | None = None
             self._owned = owned.pop_all()
-
-    @classmethod
-    def split(cls, given: tuple[Any, ...], pieces: int) -> list[tuple[Any, ...]]:
-        *before, cameras, numbers, sights = given
-        return [(*before, cameras, own, sights) for own in in_pieces(numbers, pieces, parts_of(len(cameras)))]
 
     def gradient(
         self,

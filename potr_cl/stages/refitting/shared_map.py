@@ -104,7 +104,7 @@ class SharedViews(Owner):
             found = result.sums if isinstance(result, Gradient) else result
             if self._drawn is not None:
                 assert isinstance(found, Narrowed)
-                self._drawn.add_sums(sums, self._others.origin(place), found)
+                self._drawn.add_sums(sums, place, found)
             else:
                 self._packing.add_sums(sums, found)
         if self._ask_drawn:
@@ -125,8 +125,7 @@ class SharedViews(Owner):
         drawn: dict[int, NDArray[np.bool_]] = {}
         for place, found in enumerate(results):
             assert found.drawn is not None
-            part, seen = self._others.origin(place), unpacked(found.drawn, self._coefficients.layout.splats)
-            drawn[part] = drawn[part] | seen if part in drawn else seen
+            drawn[place] = unpacked(found.drawn, self._coefficients.layout.splats)
         if DrawnRows.are_worth_it(drawn):
             with suppress(DeviceMemoryError):  # a device without room for that many rows goes on with one for all
                 self._drawn = DrawnRows(self._coefficients, self._packing, drawn)
@@ -200,6 +199,5 @@ def colour_parts(
             (shape, sh_count, rules, background, own, cameras, numbers, sights)
             for (own, sights), numbers in zip(pictured, share.others, strict=True)
         ]
-        views = [len(each) for each in share.others]
-        with Parts(pool, ColourPart, given, memory, views, share.names) as parts:
+        with Parts(pool, ColourPart, given, memory, share.names) as parts:
             yield parts

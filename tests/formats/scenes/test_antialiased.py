@@ -18,9 +18,9 @@ from potr_cl.formats.scenes.scene_files import joined
 from potr_cl.model.scene import LOW_PASS, MIP_SPLATTING_LOW_PASS, Scene
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.reference.scenes import random_scene
 from tests.cases.own_warnings import no_warnings
 from tests.cases.scenes import antialiased
+from tests.reference.scenes import random_scene
 
 ARRAYS = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
 

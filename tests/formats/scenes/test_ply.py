@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from potr_cl import DataError, PotrError, Scene, UsageError
 from potr_cl.formats import load_scene
 from potr_cl.formats.scenes import ply
-from potr_cl.reference.scenes import random_scene
 from tests.cases.own_warnings import warnings_are_errors
+from tests.reference.scenes import random_scene
 
 XYZ = ["x", "y", "z"]
 NORMALS = ["nx", "ny", "nz"]

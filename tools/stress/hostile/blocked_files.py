@@ -15,7 +15,7 @@ from potr_cl.codec.blocks.encoder import code_blocks
 from potr_cl.codec.blocks.geometry import GeometryOfBlocks, quantise
 from potr_cl.codec.blocks.splitting import blocks_of
 from potr_cl.codec.quantize import HyperParameters
-from potr_cl.reference.scenes import random_scene
+from tests.reference.scenes import random_scene
 from tools.stress.hostile import potr_files
 from tools.stress.hostile.changes import damaged, damaged_json, interesting
 

@@ -16,7 +16,7 @@ import zstandard
 
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.quantize import HyperParameters
-from potr_cl.reference.scenes import random_scene
+from tests.reference.scenes import random_scene
 from tools.stress.hostile import (
     blocked_files,
     camera_files,

@@ -24,7 +24,7 @@ from potr_cl.codec.quantize import HyperParameters, Preset
 from potr_cl.codec.steps.fitting import fit_steps
 from potr_cl.codec.steps.rule import ColourSteps
 from potr_cl.model.scene import Scene
-from potr_cl.reference.scenes import random_scene, ring_of_cameras
+from tests.reference.scenes import random_scene, ring_of_cameras
 from tools.stress.hostile.changes import damaged, damaged_json, interesting, interesting_double
 
 _HEADER = struct.Struct("<8sHHIQQBBHI8d8s8s")

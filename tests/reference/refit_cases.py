@@ -1,0 +1,117 @@
+"""Scenes to re-fit on a device and in float64, and the device's vectors laid open beside the definition's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import Scene
+from potr_cl.opencl.device import Device
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.stages.refitting.blocks import SplatBlocks
+from potr_cl.stages.refitting.coefficients import Coefficients
+from potr_cl.stages.refitting.colour_refit import ColourRefit
+from potr_cl.stages.refitting.refit import refit_colours
+from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
+from potr_cl.stages.refitting.targets import RenderedTargets, Targets
+from tests.reference.refit import Array, Reference
+
+
+class Case:
+    """A scene to re-fit to the pictures of another."""
+
+    def __init__(
+        self,
+        device: Device,
+        scene: Scene,
+        other: Scene,
+        cameras: Sequence[Camera],
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        self.device, self.scene, self.cameras, self.background = device, scene, cameras, background
+        self.rasterizer = Rasterizer(device, other, background=background)
+        self.pictures = [self.rasterizer.render(c)[0] for c in cameras]
+        self.targets = RenderedTargets(self.rasterizer, cameras)
+
+    def reference(self, **changes: Any) -> Reference:
+        return Reference(self.scene, self.cameras, self.pictures, background=self.background, **changes)
+
+    def solve(self, options: RefitOptions, active: NDArray[np.bool_] | None = None) -> Refitted:
+        return refit_colours(
+            self.device, self.scene, self.cameras, self.targets, options, active, background=self.background
+        )
+
+    def __enter__(self) -> Case:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.rasterizer.close()
+
+
+class Linearised:
+    """The map at a scene's own colours, cut where they are.
+
+    Attributes:
+        gradient: (N, M, 3) in Y, Co, Cg, A transposed W (pictures - targets).
+        error: |pictures - targets|^2 by W.
+        blocks: (N, M, M), the splats' own blocks.
+        room: bytes that are left of the memory for views and targets.
+    """
+
+    def __init__(self, case: Case, targets: Targets | None = None, memory: int | None = None) -> None:
+        self._refit = ColourRefit(case.device, case.scene, case.cameras, background=case.background, memory=memory)
+        vectors, colour_map = self._refit.coefficients, self._refit.colour_map
+        assert isinstance(vectors, Coefficients)
+        self._at, result = vectors.vector(), vectors.vector()
+        vectors.write_sh(self._at, case.scene.sh)
+        vectors.zero(result)
+        with SplatBlocks(vectors) as blocks:
+            blocks.zero()
+            self.error = colour_map.gradient(self._at, targets or case.targets, result, blocks)
+            self.blocks: Array = blocks.read().astype(np.float64)
+        self.gradient: Array = vectors.read(result).astype(np.float64)
+        self.room = colour_map.room
+
+    def normal(self, direction: Array, part: int | None = None) -> Array:
+        """A transposed W A times a direction, by a part of the views or by all."""
+        vectors = self._refit.coefficients
+        assert isinstance(vectors, Coefficients)
+        x, result = vectors.vector(), vectors.vector()
+        vectors.write(x, direction)
+        vectors.zero(result)
+        self._refit.colour_map.normal(x, self._at, result, part=part)
+        product: Array = vectors.read(result).astype(np.float64)
+        return product
+
+    def __enter__(self) -> Linearised:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._refit.close()
+
+
+class Pictures:
+    """Targets that are given as arrays."""
+
+    def __init__(self, device: Device, pictures: Sequence[NDArray[np.floating[Any]]]) -> None:
+        self.device, self.pictures = device, pictures
+        self.buffers = [device.upload(np.ascontiguousarray(p, np.float32), "a picture") for p in pictures]
+
+    def into(self, numbers: Sequence[int], buffer: cl.Buffer) -> None:
+        start = 0
+        for number in numbers:
+            picture = self.buffers[number]
+            cl.enqueue_copy(self.device.queue, buffer, picture, byte_count=picture.size, dst_offset=start)
+            start += picture.size
+
+    def __enter__(self) -> Pictures:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for buffer in self.buffers:
+            self.device.free(buffer)

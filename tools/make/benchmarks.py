@@ -1,0 +1,346 @@
+"""The pages of docs/benchmarks from the results beside them: their tables, their plots, README's table of figures.
+
+    python -m tools.make.benchmarks                  fill the tables, draw the plots (needs the extra "bench")
+    python -m tools.make.benchmarks --check          write nothing; fail and say what is stale
+    python -m tools.make.benchmarks --take TABLES.json FILE [NAME[=AS] …] [--remark TEXT]
+
+The pages are prose with markers: between ``<!-- table: encode/stages -->`` and ``<!-- end -->`` stands the result
+"stages" of docs/benchmarks/results/encode.json, with its title and a line with its machine, date, commit and command.
+--take puts tables that a tool kept with --json (:mod:`tools.results`) into FILE.json there, all or those named, in
+place of what has that name (or the name AS), whose title stays.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import hashlib
+import json
+import re
+import sys
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from potr_cl.host.atomic_write import replacing
+from tools.results import ROOT, Cell, Column
+
+PAGES, IMAGES = ROOT / "docs" / "benchmarks", ROOT / "docs" / "images"
+RESULTS = PAGES / "results"
+SCENES = ("lego", "plush")
+_BLOCK = re.compile(r"<!-- table: (?P<name>\S+) -->\n.*?<!-- end -->", re.DOTALL)
+
+
+class ResultError(ValueError):
+    """A result, or a page that uses one, is wrong; says where and what."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """One measurement.
+
+    Attributes:
+        title: what is measured, of what.
+        machine, date, commit, command: where, when and by what; of several commands one is run after the other.
+        columns, rows: the figures, a row a list with a cell for each column.
+        remark: what else a reader must know, a sentence.
+    """
+
+    title: str
+    machine: str
+    date: str
+    command: tuple[str, ...]
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    commit: str = ""
+    remark: str = ""
+
+    def records(self) -> list[dict[str, Any]]:
+        """Each row as a dictionary by columns' names."""
+        return [dict(zip([column.name for column in self.columns], row, strict=True)) for row in self.rows]
+
+    def row(self, **wanted: Any) -> dict[str, Any]:
+        """The only row with these cells.
+
+        Raises:
+            ResultError: there is no such row, or more than one.
+        """
+        rows = [row for row in self.records() if all(row[key] == value for key, value in wanted.items())]
+        if len(rows) != 1:
+            raise ResultError(f"'{self.title}' has {len(rows)} rows with {wanted}, not one")
+        return rows[0]
+
+    def markdown(self) -> str:
+        """Title, table, and the line that says what it is of."""
+        lines = [[column.head for column in self.columns]]
+        lines += [[column.text(cell) for column, cell in zip(self.columns, row, strict=True)] for row in self.rows]
+        table = [f"| {' | '.join(line)} |" for line in lines]
+        table.insert(1, "|---" * len(self.columns) + "|")
+        about = [self.machine, self.date or "date unknown", *([f"commit {self.commit}"] if self.commit else [])]
+        line = ", ".join(about) + (": " + ", then ".join(f"`{each}`" for each in self.command) if self.command else "")
+        return f"**{self.title}**\n\n" + "\n".join(table) + f"\n\n*{line}.{' ' + self.remark if self.remark else ''}*"
+
+
+Results = dict[str, Result]
+
+
+def load(folder: Path | None = None) -> Results:
+    """All results of a folder, docs/benchmarks/results by default, by "file/name".
+
+    Raises:
+        ResultError: one of them is not what a result must be.
+    """
+    found = {}
+    for path in sorted((folder or RESULTS).glob("*.json")):
+        for name, raw in json.loads(path.read_text("utf-8")).items():
+            try:
+                columns = tuple(Column(**{k: v for k, v in each.items() if k != "default"}) for each in raw["columns"])
+                rows, command = tuple(map(tuple, raw["rows"])), tuple(raw["command"])
+                raw = {key: value for key, value in raw.items() if key not in ("state", "options")}
+                found[f"{path.stem}/{name}"] = Result(**{**raw, "columns": columns, "rows": rows, "command": command})
+            except (TypeError, KeyError) as error:
+                raise ResultError(f"{path.name}, '{name}': {error}") from error
+            for number, row in enumerate(rows, 1):
+                if len(row) != len(columns):
+                    said = f"row {number} has {len(row)} cells, there are {len(columns)} columns"
+                    raise ResultError(f"{path.name}, '{name}': {said}")
+    return found
+
+
+# ------------------------------------------------------------------------------------------------ pages
+
+
+def filled_pages(results: Results) -> dict[Path, str]:
+    """Every page's text with its tables filled in.
+
+    Raises:
+        ResultError: a page asks for a result that is not there.
+    """
+
+    def fill(match: re.Match[str], path: Path) -> str:
+        name = match["name"]
+        if name not in results:
+            raise ResultError(f"{path}: there is no result '{name}' in {RESULTS}")
+        return f"<!-- table: {name} -->\n\n{results[name].markdown()}\n\n<!-- end -->"
+
+    return {path: _BLOCK.sub(partial(fill, path=path), path.read_text("utf-8")) for path in sorted(PAGES.glob("*.md"))}
+
+
+def problems(results: Results) -> list[str]:
+    """What is stale or wrong, a line each."""
+    found = []
+    pages = filled_pages(results)
+    shown = {match["name"] for text in pages.values() for match in _BLOCK.finditer(text)}
+    for path, text in pages.items():
+        if path.read_text("utf-8") != text:
+            found.append(f"{path}: stale, run python -m tools.make.benchmarks")
+    found += [f"{RESULTS}: no page shows '{name}'" for name in sorted(results.keys() - shown)]
+    stale = [plot for plot in PLOTS if kept_digest(plot) != plot.digest(results)]
+    return found + [f"{plot.path}: drawn of other figures, run python -m tools.make.benchmarks" for plot in stale]
+
+
+_GPU, _CPU = "NVIDIA H200, 32 processors", "Intel's CPU runtime, 2 processors"
+#: Scenes as README's table calls them.
+_NAMES = {"lego": "lego (NeRF-Synthetic)", "plush": "plush (captured)"}
+
+
+def figures_table() -> str:
+    """The table at the beginning of the README: sizes, losses and times at quality 0.5."""
+    results = load()
+    heads = "at quality 0.5 | PLY | `.potr` | | PSNR against uncompressed | lost on the photographs | encoded in, H200 "
+    lines = [f"| {heads}| 2 CPU cores |", "|---" * 8 + "|"]
+    for preset in ("best", "smallest"):
+        for scene, name in _NAMES.items():
+            uncompressed = results["rate_distortion/uncompressed"].row(scene=scene)
+            file = results[f"rate_distortion/{scene}"].row(preset=preset, q=0.5)
+            cells = [
+                name if preset == "best" else f"{scene}, `--preset {preset}`",
+                f"{uncompressed['PLY bytes'] / 1e6:.1f} MB",
+                f"{file['size']:.2f} MB",
+                f"{file['times smaller']:.0f} × smaller",
+                f"{file['PSNR against uncompressed']:.1f} dB",
+                f"{file['lost']:.2f} dB of {uncompressed['PSNR against photographs']:.2f}",
+                *(_encode_time(results["whole_commands/commands"], scene, preset, device) for device in (_GPU, _CPU)),
+            ]
+            lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _encode_time(commands: Result, scene: str, preset: str, device: str) -> str:
+    try:
+        seconds = commands.row(scene=scene, preset=preset, device=device)["encode"]
+    except ResultError:
+        return ""
+    return f"{seconds / 60:.0f} min" if seconds >= 120 else f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
+
+
+# ------------------------------------------------------------------------------------------------ plots
+
+#: Of lines, in turn: colours of falling brightness in print, with a marker and a dash each.
+_STYLES: list[dict[str, Any]] = [
+    {"color": "#000000", "marker": "o", "ls": "-"},
+    {"color": "#0072b2", "marker": "s", "ls": "--"},
+    {"color": "#d55e00", "marker": "^", "ls": "-."},
+    {"color": "#009e73", "marker": "D", "ls": ":"},
+]
+_PRESETS = ("best", "fast", "paper", "smallest")
+_FITTED_SERIES = ("paper", "best", "smallest", "smallest with photographs")
+#: Of single points: shapes alone.
+_SHAPES = ["s", "D", "^", "v", "P", "X", "<", "*", ">"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Plot:
+    """One picture of two panels; keeps a digest of the figures that it was drawn of, so that changed ones are noticed.
+
+    Attributes:
+        name: of the file, without its suffix.
+        results: names of the results that it is drawn of.
+        draw: draws them into the panels, one a scene.
+        title: the question that it answers.
+    """
+
+    name: str
+    results: tuple[str, ...]
+    draw: Callable[[Results, Sequence[Any]], None]
+    title: str
+
+    @property
+    def path(self) -> Path:
+        return IMAGES / f"{self.name}.png"
+
+    def digest(self, results: Results) -> str:
+        """Of the figures that it is drawn of."""
+        figures = [[r.title, [c.name for c in r.columns], r.rows] for r in (results[name] for name in self.results)]
+        return hashlib.sha256(json.dumps([self.title, *figures]).encode()).hexdigest()
+
+
+def kept_digest(plot: Plot) -> str:
+    """Of the figures that a picture was drawn of; empty without a picture."""
+    if not plot.path.exists():
+        return ""
+    with Image.open(plot.path) as image:
+        return str(image.info.get("Results", ""))
+
+
+def _curves(
+    results: Results, axes: Sequence[Any], of: str, series: Sequence[str], against: str, points: bool = True
+) -> None:
+    """PSNR by size: a line for each series, and a point for each other format."""
+    full = {row["scene"]: row for row in results[f"{of}/uncompressed"].records()}
+    for scene, axis in zip(SCENES, axes, strict=True):
+        rows, truth = results[f"{of}/{scene}"].records(), full[scene]["PSNR against photographs"]
+        for name, style in zip(series, _STYLES, strict=True):
+            of_it = [row for row in rows if row["preset"] == name]
+            axis.plot([r["size"] for r in of_it], [r[f"PSNR against {against}"] for r in of_it], label=name, **style)
+        for row, shape in zip(results["other_formats/sizes"].records()[1:] if points else (), _SHAPES, strict=False):
+            lost = against == "photographs"
+            value = truth - row[f"{scene}: lost"] if lost else row[f"{scene}: PSNR"]
+            label = row["format"].replace("`", "").replace(", 1000 iterations on the photographs", ", fine-tuned")
+            axis.plot(row[f"{scene}: size"], value, marker=shape, ms=8, ls="", mfc="w", mec="0.25", label=label)
+        if against == "photographs":
+            axis.axhline(truth, color="0.5", ls=":", label="uncompressed")
+        ticks = (0.5, 1, 2, 4, 8, 16)
+        axis.set_xscale("log")
+        axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+        axis.minorticks_off()
+        axis.set(title=f"{scene}, {full[scene]['PLY bytes'] / 1e6:.1f} MB as PLY", xlabel="MB")
+        if not points:
+            axis.set_ylim(bottom=truth - 1.6)  # below this a file is smaller than anybody asks for
+    axes[0].set_ylabel(f"PSNR against the {against}{' renders' if against == 'uncompressed' else ''}, dB")
+
+
+def _draw(plot: Plot, results: Results) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    with pyplot.rc_context({"font.size": 10, "axes.grid": True, "grid.alpha": 0.3, "lines.markersize": 5}):
+        figure, axes = pyplot.subplots(1, 2, figsize=(10, 5), squeeze=False)
+        plot.draw(results, axes[0])
+        figure.suptitle(plot.title, fontsize=12)
+        handles, labels = axes[0][0].get_legend_handles_labels()
+        rows = -(-len(labels) // 4)
+        figure.tight_layout(rect=(0, 0.015 + 0.045 * rows, 1, 1))
+        figure.legend(handles, labels, loc="lower center", ncols=4, fontsize=9)
+        figure.savefig(plot.path, dpi=120, metadata={"Results": plot.digest(results), "Software": None})
+        pyplot.close(figure)
+
+
+_RATES = (*(f"rate_distortion/{scene}" for scene in SCENES), "rate_distortion/uncompressed", "other_formats/sizes")
+_PHOTOGRAPHS = (*(f"photographs/{scene}" for scene in SCENES), "photographs/uncompressed")
+PLOTS = (
+    Plot(
+        "rate_distortion_uncompressed",
+        _RATES,
+        partial(_curves, of="rate_distortion", series=_PRESETS, against="uncompressed"),
+        "How near does a file of a size come to the uncompressed scene?",
+    ),
+    Plot(
+        "rate_distortion_photographs",
+        _RATES,
+        partial(_curves, of="rate_distortion", series=_PRESETS, against="photographs"),
+        "How near does a file of a size come to the photographs?",
+    ),
+    Plot(
+        "photographs",
+        _PHOTOGRAPHS,
+        partial(_curves, of="photographs", series=_FITTED_SERIES, against="photographs", points=False),
+        "What does a fit to photographs bring, on photographs that nobody has looked at?",
+    ),
+)
+
+
+# ----------------------------------------------------------------------------------------------- results
+
+
+def take(tables: Path, subject: str, names: Sequence[str], remark: str = "") -> None:
+    """Put tables that a tool has kept into a file of results; the titles that stand there stay."""
+    taken, path = json.loads(tables.read_text("utf-8")), RESULTS / f"{subject}.json"
+    content = json.loads(path.read_text("utf-8")) if path.exists() else {}
+    for name, _, other in (each.partition("=") for each in names or taken):
+        target = other or name
+        title = content.get(target, taken[name])["title"]
+        content[target] = {**taken[name], "title": title, **({"remark": remark} if remark else {})}
+    write(path, content)
+
+
+def write(path: Path, content: dict[str, Any]) -> None:
+    """A file of results, each column and each row a line."""
+    text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
+
+    def one_line(match: re.Match[str]) -> str:
+        return match[1] + json.dumps(json.loads(match[0]), ensure_ascii=False)
+
+    text = re.sub(r"(?<=\n)(   )([\[{])\n.*?\n   [\]}](?=,?\n)", one_line, text, flags=re.DOTALL)
+    with replacing(path) as file:
+        file.write(text.encode() + b"\n")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="write nothing, fail if a page or a plot is stale")
+    parser.add_argument("--take", nargs="+", metavar="TABLES.json FILE NAME[=AS]", help="take results of a tool first")
+    parser.add_argument("--remark", default="", help="of the results that are taken")
+    args = parser.parse_args()
+    if args.take:
+        tables, subject, *names = args.take
+        take(Path(tables), subject, names, args.remark)
+    results = load()
+    if args.check:
+        found = problems(results)
+        print("\n".join(found), file=sys.stderr)
+        sys.exit(1 if found else 0)
+    for path, text in filled_pages(results).items():
+        path.write_text(text, "utf-8")
+    for plot in PLOTS:
+        if kept_digest(plot) != plot.digest(results):
+            _draw(plot, results)
+
+
+if __name__ == "__main__":
+    main()

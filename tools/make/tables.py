@@ -1,0 +1,80 @@
+"""Tables of the documentation that are made from the code; python -m tools.make.docs puts them into the pages."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from potr_cl.formats.registry import CAMERA_FORMATS, SCENE_FORMATS
+from potr_cl.opencl import quirks
+from potr_cl.pipeline.presets import DEFAULT, PRESETS, PURPOSE
+from potr_cl.stages.code import Code
+from potr_cl.stages.prune import Prune
+from potr_cl.stages.refit import Refit
+
+#: Says of a page that it is made.
+NOTICE = "<!-- Made by `python -m tools.make.docs`. Do not edit this page: edit the code that it describes. -->"
+
+
+def cell(text: str) -> str:
+    """Text that stays in one cell of a table."""
+    return text.replace("|", "\\|").replace("<", "&lt;")
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    return "\n".join(f"| {' | '.join(row)} |" for row in [head, ["---"] * len(head), *rows])
+
+
+def quirks_table() -> str:
+    """The workarounds of potr_cl/opencl/quirks.py, for docs/architecture.md."""
+    rows = [
+        (f"`{name}`", *map(cell, (f"{quirk.vendor}, {quirk.versions}", quirk.reason, quirk.still_needed)))
+        for name, quirk in quirks.ALL.items()
+    ]
+    return table(
+        ("quirk", "runtime and versions", "what goes wrong without it", "how to see if it is still needed"), rows
+    )
+
+
+def formats_table() -> str:
+    """All formats, for docs/formats.md: a table of scenes and one of cameras."""
+    scenes = [
+        (
+            f"{entry.name} ({', '.join(f'`{name}`' for name in (*entry.suffixes, *entry.names))})",
+            "yes",
+            "no" if entry.save is None else "yes",
+            _needs(entry.extra),
+            entry.note,
+        )
+        for entry in SCENE_FORMATS
+    ]
+    cameras = [
+        (entry.name, "yes", "no", _needs(entry.extra), entry.note)
+        for entry in sorted(CAMERA_FORMATS, key=lambda entry: entry.extra is not None)
+    ]
+    columns = ["reads", "writes", "needs", "note"]
+    return "\n\n".join([table(["scenes", *columns], scenes), table(["cameras", *columns], cameras)])
+
+
+def _needs(extra: str | None) -> str:
+    return "nothing" if extra is None else f"the extra `{extra}`"
+
+
+def presets_table() -> str:
+    """The presets, for README.md."""
+    lines = ["| preset | pruning iterations | colours | entropy coder | for |", "|---|---|---|---|---|"]
+    for name, stages in PRESETS.items():
+        by_name = {stage.name: stage for stage in stages}
+        prune, compact, refit, code = (by_name[each] for each in ("prune", "compact", "refit", "code"))
+        assert isinstance(prune, Prune)
+        assert isinstance(refit, Refit)
+        assert isinstance(code, Code)
+        colours = f"re-fitted together in {refit.steps} steps" if refit.steps else "as they are"
+        if compact.on:
+            colours = "compacted splat by splat"
+        # The file's version that goes with the paper's steps has no context coder.
+        coder = "zstd" if name == "paper" else code.entropy
+        coder += f" {code.zstd_level}" if coder == "zstd" else ""
+        mark = " (default)" if name == DEFAULT else ""
+        lines.append(f"| `{name}`{mark} | {prune.iterations} | {colours} | {coder} | {PURPOSE[name]} |")
+    return "\n".join(lines)
