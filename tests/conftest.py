@@ -67,10 +67,12 @@ def judged_once() -> Iterator[None]:
     """
     judge, known = agreement.judge_cameras, {}
 
-    def judged(scene: Scene, cameras: Sequence[Camera]) -> agreement.Judgement:
-        key = hashlib.sha256(pickle.dumps((scene, list(cameras)))).digest()
+    def judged(
+        scene: Scene, cameras: Sequence[Camera], evidence: agreement.Evidence | None = None
+    ) -> agreement.Judgement:
+        key = hashlib.sha256(pickle.dumps((scene, list(cameras), evidence))).digest()
         if key not in known:
-            known[key] = judge(scene, cameras)
+            known[key] = judge(scene, cameras, evidence)
         return known[key]
 
     with pytest.MonkeyPatch.context() as patch:

@@ -290,7 +290,7 @@ class Parts(Owner):
                 for piece, answer in zip(pieces, answers, strict=True):
                     piece.found = self._answer(answer)
         except DeviceError as error:
-            _log.info("others cannot do the views of a slow worker (%s)", error)
+            _log.debug("others cannot do the views of a slow worker (%s)", error)
             for making in makings:
                 making.add_done_callback(_abandon_made)
             return None
