@@ -18,6 +18,10 @@ from potr_cl.model import agreement, virtual_cameras
 from potr_cl.model.placement.candidates import Candidates, Run
 from potr_cl.model.placement.matter import Frame, Matter
 from potr_cl.opencl.loader import register_runtimes
+from potr_cl.opencl.verdict import TRUST_VARIABLE
+
+# Tests take devices as they are; tests/opencl/test_verdict.py tries them.
+os.environ.setdefault(TRUST_VARIABLE, "1")
 
 DATA = Path(__file__).parent / "data"
 #: Where Chromium is, if it has another name than systems give it.

@@ -90,7 +90,7 @@ def for_each_scene(works: Sequence[argparse.Namespace], work: Work, tells_json: 
             code = max(code, error.exit_code if isinstance(error, PotrError) else 1)
             failed.append(str(one.scene))
             said = _said(error)
-            note(f"potr-cl: {said}" if str(one.scene) in said else f"potr-cl: '{one.scene}': {said}")
+            note(f"potr-cl: {said}" if str(one.scene) in said else f"potr-cl: '{one.scene}': {said}", "error")
             if tells_json:
                 say_line({"source": {"file": str(one.scene)}, "file": str(one.output), "error": said})
     if failed:
