@@ -146,7 +146,7 @@ def _compare(args: argparse.Namespace) -> None:
         # Sizes need no device, and may be all that is wanted of a machine without one.
         files = [named(path, read_scene(args, path)) for path in (args.a, args.b)]
         _tell(args, size_report(*files), format_sizes(*files))
-        note("sizes only: there is no OpenCL device to compare pictures on")
+        note("warning: sizes only: there is no OpenCL device to compare pictures on", "warning")
         return
     comparison: SceneComparison | None = None
     try:
