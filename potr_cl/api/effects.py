@@ -92,7 +92,7 @@ def removal_effects(
 
     def work(device: Device, memory: int | None) -> _Totals:
         with Rasterizer(device, what, background=colour) as rasterizer:
-            found = []
+            found: _Totals = []
             for group in groups:
                 tell("removal effects", len(found) / len(groups))
                 with RemovalSweep(rasterizer, views, SweepOptions(memory=memory), numbers=group) as sweep:

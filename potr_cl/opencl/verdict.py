@@ -21,8 +21,6 @@ from typing import TYPE_CHECKING
 
 import platformdirs
 
-from potr_cl.plain_text import plain
-
 if TYPE_CHECKING:
     from potr_cl.opencl.discovery import DeviceInfo
 
@@ -80,7 +78,7 @@ def _trial(info: DeviceInfo) -> tuple[bool, str | None]:
     if run.returncode < 0 or run.returncode >= 1 << 30:  # a signal, or an exception of Windows
         return True, "its driver crashes while an encode runs"
     lines = run.stderr.decode("utf-8", "replace").strip().splitlines()
-    return True, plain(lines[-1]) if lines else f"its self-check ended with exit code {run.returncode}"
+    return True, lines[-1] if lines else f"its self-check ended with exit code {run.returncode}"
 
 
 def _file(info: DeviceInfo) -> Path:

@@ -54,6 +54,8 @@ _PUBLIC = {
         "RefittedScene",
         "fit",
         "FittedScene",
+        "removal_effects",
+        "RemovalEffects",
     ),
     "Pictures": ("render", "Rendering", "Renderings", "preview", "compare", "SceneComparison", "view"),
     "Views for scenes without cameras": ("place_cameras", "look_around", "turntable"),
