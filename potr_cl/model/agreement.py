@@ -254,8 +254,8 @@ def require_agreement(scene: Scene, cameras: Sequence[Camera], evidence: Evidenc
         _log.warning("%s", judged.doubt)
     elif judged.taken_as_they_are:
         _log.info(
-            "no photographs or points of a reconstruction lie beside the cameras that could confirm them: they are "
-            "taken as they are"
+            "no photographs or reconstruction points were found to check the cameras against: the cameras were taken "
+            "as they are"
         )
 
 

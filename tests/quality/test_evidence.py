@@ -105,7 +105,7 @@ def test_cameras_that_nothing_confirms_are_taken_as_they_are(building, caplog):
     bare = [dataclasses.replace(view, image_path=None) for view in views]
     with caplog.at_level(logging.INFO, "potr_cl"):
         check_frame(scene, bare, anyway=False)
-    assert "taken as they are" in caplog.text
+    assert "were taken as they are" in caplog.text
 
 
 @pytest.mark.slow
