@@ -188,6 +188,8 @@ class Judgement:
             if self.motion.misread is not None:
                 return self.motion.misread.remedy
             return "give the cameras of this scene, or undo what moved it"
+        if self.evidence is not None and self.evidence.agrees is False:
+            return "undo what moved the scene, or give its own cameras"
         return "give the cameras of this scene"
 
 

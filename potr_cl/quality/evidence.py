@@ -89,11 +89,13 @@ def by_photographs(scene: Scene, cameras: Sequence[Camera]) -> Evidence | None:
         return None
     best = sorted(found)[-2:][0]
     agrees = True if best >= _ALIKE else False if best < _UNLIKE and pixels >= _ENOUGH_PIXELS else None
+    looks = "hardly looks" if agrees is None else "does not look"
+    views = "1 view correlate" if len(found) == 1 else f"{len(found)} views correlate"
     return Evidence(
         agrees,
         best,
-        f"seen from the cameras, the scene {'hardly looks' if agrees is None else 'does not look'} like the photos "
-        f"(details of {len(found)} views correlate by {best:.2f}, of right cameras by {_ALIKE} or more)",
+        f"seen from the cameras, the scene {looks} like the photos (details of {views} by {best:.2f}, of right cameras "
+        f"by {_ALIKE} or more)",
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -159,3 +160,14 @@ def test_no_view_at_all(size, plush_excerpt, plush_excerpt_cameras, monkeypatch)
         for none in ([], (), np.array([], str)):
             with pytest.raises(UsageError, match="the list of views is empty: name at least one, or leave it out"):
                 call(plush_excerpt, plush_excerpt_cameras, views=none)
+
+
+def test_photographs_are_looked_for_before_the_work(plush_excerpt, plush_excerpt_cameras, tmp_path):
+    def progress(stage, done):
+        raise AssertionError(f"{stage} has begun")
+
+    for folder in (tmp_path, tmp_path / "nowhere"):
+        with pytest.raises(UsageError, match=re.escape(str(folder))):
+            potr_cl.encode(plush_excerpt, plush_excerpt_cameras, progress=progress, photos=folder)
+        with pytest.raises(UsageError, match=re.escape(str(folder))):
+            potr_cl.encode_ladder(plush_excerpt, tmp_path / "out", "0.5", plush_excerpt_cameras, photos=folder)
