@@ -33,8 +33,9 @@ F64 = NDArray[np.float64]
 #: Pixels of a drawing's longer side; half of the window within which what is coarser is taken out; photographs that are
 #: looked at.
 _SIDE, _COARSE, _PHOTOGRAPHS = 64, 3, 8
-#: Pixels of the scene that make a view worth comparing, and those of all views that it takes to refuse them.
-_LEAST_PIXELS, _ENOUGH_PIXELS = 40, 500
+#: Pixels of the scene that make a view worth comparing; and what it takes to refuse views: pixels of all of them, and
+#: splats, as few large ones are more than the pixels of their centres.
+_LEAST_PIXELS, _ENOUGH_PIXELS, _ENOUGH_SPLATS = 40, 500, 2000
 #: Correlation of details that the second best view reaches where cameras are right, and where they are wrong.
 _ALIKE, _UNLIKE = 0.4, 0.3
 #: By how much a photograph's shape may differ from its view's.
@@ -88,7 +89,8 @@ def by_photographs(scene: Scene, cameras: Sequence[Camera]) -> Evidence | None:
     if not found:
         return None
     best = sorted(found)[-2:][0]
-    agrees = True if best >= _ALIKE else False if best < _UNLIKE and pixels >= _ENOUGH_PIXELS else None
+    enough = pixels >= _ENOUGH_PIXELS and len(scene) >= _ENOUGH_SPLATS
+    agrees = True if best >= _ALIKE else False if best < _UNLIKE and enough else None
     looks = "hardly looks" if agrees is None else "does not look"
     views = "1 view correlate" if len(found) == 1 else f"{len(found)} views correlate"
     return Evidence(
