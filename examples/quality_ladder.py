@@ -15,7 +15,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Encode a scene at several qualities and judge each.")
     parser.add_argument("scene")
     parser.add_argument("cameras")
-    parser.add_argument("--preset", default="best", choices=("best", "fast", "paper"))
+    parser.add_argument("--preset", default="best", choices=("best", "smallest", "fast", "paper"))
     parser.add_argument("--steps", type=int, default=5, help="qualities from 0 to 1")
     args = parser.parse_args()
     device = Device()

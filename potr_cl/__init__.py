@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from potr_cl.api.comparing import SceneComparison, compare
     from potr_cl.api.describing import SceneInfo, info
     from potr_cl.api.editing import CompactedScene, PrunedScene, RefittedScene, compact, prune, refit
+    from potr_cl.api.effects import RemovalEffects, removal_effects
     from potr_cl.api.encoding import encode
     from potr_cl.api.files import convert, decode, decode_to_device, save
     from potr_cl.api.fitting import FittedScene, fit
@@ -67,6 +68,7 @@ __all__ = [
     "PotrError",
     "PrunedScene",
     "RefittedScene",
+    "RemovalEffects",
     "Rendering",
     "Renderings",
     "Scene",
@@ -96,6 +98,7 @@ __all__ = [
     "read_cameras",
     "read_scene",
     "refit",
+    "removal_effects",
     "render",
     "save",
     "turntable",
@@ -115,6 +118,7 @@ _HOMES = {
     "PotrError": "errors",
     "PrunedScene": "api.editing",
     "RefittedScene": "api.editing",
+    "RemovalEffects": "api.effects",
     "Rendering": "api.pictures",
     "Renderings": "api.pictures",
     "Scene": "model.scene",
@@ -143,6 +147,7 @@ _HOMES = {
     "read_cameras": "formats",
     "read_scene": "formats",
     "refit": "api.editing",
+    "removal_effects": "api.effects",
     "render": "api.pictures",
     "save": "api.files",
     "turntable": "placement.viewpoints",

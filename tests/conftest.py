@@ -16,6 +16,10 @@ from potr_cl import Camera, Scene
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model import agreement
 from potr_cl.opencl.loader import register_runtimes
+from potr_cl.opencl.verdict import TRUST_VARIABLE
+
+# Tests take devices as they are; tests/opencl/test_verdict.py tries them.
+os.environ.setdefault(TRUST_VARIABLE, "1")
 
 DATA = Path(__file__).parent / "data"
 #: Where Chromium is, if it has another name than systems give it.
@@ -58,10 +62,12 @@ def judged_once() -> Iterator[None]:
     """
     judge, known = agreement.judge_cameras, {}
 
-    def judged(scene: Scene, cameras: Sequence[Camera]) -> agreement.Judgement:
-        key = hashlib.sha256(pickle.dumps((scene, list(cameras)))).digest()
+    def judged(
+        scene: Scene, cameras: Sequence[Camera], evidence: agreement.Evidence | None = None
+    ) -> agreement.Judgement:
+        key = hashlib.sha256(pickle.dumps((scene, list(cameras), evidence))).digest()
         if key not in known:
-            known[key] = judge(scene, cameras)
+            known[key] = judge(scene, cameras, evidence)
         return known[key]
 
     with pytest.MonkeyPatch.context() as patch:

@@ -164,6 +164,7 @@ def compare(
     cameras: CamerasSource | None = None,
     *,
     truth: str | os.PathLike[str] | None = None,
+    lpips: bool = False,
     views: Sequence[str | int] | str | int | None = None,
     split: str | None = None,
     virtual_views: int | None = None,
@@ -186,13 +187,14 @@ def compare(
         b: the one to judge: a scene, a file, or the result of :func:`potr_cl.encode`.
         cameras: or their file; None: views are placed around A.
         truth: a folder of photographs named after the views: A and B are judged by them too.
+        lpips: whether to tell LPIPS too, which needs the extra ``lpips``.
         views: names or indices of views.
         split: "train", "test" or "all"; by default the test views, or all if there are none.
         virtual_views, turntable, up, size: of the views that are placed, see :func:`potr_cl.render`.
         output: a PNG file to write: the worst view of A, of B, and their difference, labelled.
         device: to render on, or what it is called. Several share the views out: a list, "all", or "0,1".
         cluster: a Dask cluster whose workers share the views out: its scheduler's address, or a client. With
-            photographs, or with LPIPS installed, the device of this computer does all.
+            photographs, or with LPIPS, the device of this computer does all.
         rules: of the rasterizer to follow: inria or gsplat.
         background: R, G, B from 0 to 1, or a colour's name.
         trust, antialiased: as of :func:`potr_cl.load_scene`.
@@ -229,6 +231,7 @@ def compare(
             rules=wanted,
             background=colour,
             truth=None if truth is None else Path(truth),
+            lpips=lpips,
             progress=progress,
             notes=[] if given else [f"no cameras: {told(there)}"],
             coded=coded,
@@ -266,6 +269,7 @@ def compare_scenes(
     rules: RasterRules,
     background: Colour,
     truth: Path | None = None,
+    lpips: bool = False,
     progress: Callable[[str, float], None] | None = None,
     notes: Sequence[str] = (),
     coded: Sequence[CodedScene | None] = (None, None),
@@ -279,9 +283,10 @@ def compare_scenes(
     Raises:
         As :func:`compare`.
     """
+    metric = Lpips() if lpips else None  # what is missing is told before the work
     views = within_photographs(views) if truth is not None else views
     ground_truth = find_ground_truth(truth, views) if truth is not None else None
-    lpips, told_of = None, list(notes)
+    told_of = list(notes)
     if ground_truth is not None:
         told_of += filter(None, [missing_photographs(ground_truth, views)])
         views = [view for view in views if view.name in ground_truth]
@@ -291,12 +296,8 @@ def compare_scenes(
             for name, scene in (("A", a[1]), ("B", b[1]))
         )
         told_of.append(f"warning: {ways}, as the files say: give --antialiased yes or no to render both alike")
-    try:
-        lpips = Lpips()
-    except UsageError as missing:
-        told_of.append(str(missing))
     opened, tell, stage = workers.device, progress or (lambda _stage, _done: None), comparing(len(views))
-    looks = Looks(background, rules, ground_truth, lpips)
+    looks = Looks(background, rules, ground_truth, metric)
     tell(stage, 0.0)
     with SharedJudging(opened, a[1], views, looks, workers.pool, anyway=True, coded=coded[0]) as judging:
         found = judging.figures(b[1], views, coded[1], lambda done: tell(stage, done / len(views)))

@@ -97,11 +97,11 @@ def _format_of(path: Path) -> SceneFormat:
     """The format that reads a scene; .potr where no suffix of a file says another one, as content tells these.
 
     Raises:
-        UsageError: a folder, of no format.
+        UsageError: a folder, of no format; or the checkpoint of a training.
     """
     try:
         return registry.format_of(path)
     except UsageError:
-        if path.is_dir():
+        if path.is_dir() or registry.is_checkpoint(path):
             raise
         return POTR

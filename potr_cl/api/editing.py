@@ -6,13 +6,14 @@ import contextlib
 import dataclasses
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from potr_cl.api.choices import CompactChoices, PruneChoices, with_choices
 from potr_cl.api.encoding import encode_options, views_or_placed
 from potr_cl.api.files import result_writer
 from potr_cl.api.inputs import (
@@ -54,6 +55,9 @@ from potr_cl.stages.stage import Progress, Stage, State
 
 #: Coefficients that round to 0 at so many steps a unit are 0, but for what storing R, G and B leaves of them.
 _ZERO_SF = 1e5
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 
 @dataclass(frozen=True, repr=False)
@@ -150,6 +154,7 @@ class RefittedScene(Edited):
         return f"{len(self.scene):,} splats re-fitted in {self.refitted.steps} steps, {views}"
 
 
+@with_choices(PruneChoices)
 def prune(
     scene: SceneSource,
     cameras: CamerasSource | None = None,
@@ -165,7 +170,7 @@ def prune(
     antialiased: bool | None = None,
     cameras_anyway: bool = False,
     progress: Progress | None = None,
-    **choices: Any,
+    **choices: Unpack[PruneChoices],
 ) -> PrunedScene:
     """Remove the splats that no view misses, as the command ``prune`` does; nothing else changes.
 
@@ -203,6 +208,7 @@ def prune(
     return PrunedScene(state.scene, len(what), used, pruned, state.learnt["unseen"])
 
 
+@with_choices(CompactChoices)
 def compact(
     scene: SceneSource,
     cameras: CamerasSource | None = None,
@@ -218,7 +224,7 @@ def compact(
     antialiased: bool | None = None,
     cameras_anyway: bool = False,
     progress: Progress | None = None,
-    **choices: Any,
+    **choices: Unpack[CompactChoices],
 ) -> CompactedScene:
     """Make the colours' coefficients sparse, as the command ``compact`` does; nothing else changes.
 
@@ -247,7 +253,7 @@ def stage_options(
     q: float,
     background: ColourSource,
     memory: float | None,
-    choices: dict[str, Any],
+    choices: Mapping[str, Any],
     sf_sh: float | None = None,
 ) -> EncodeOptions:
     """Options of an encode in which one stage alone looks at views, checked.

@@ -5,11 +5,12 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from potr_cl.api.choices import EncodeChoices, with_choices
 from potr_cl.api.inputs import (
     CamerasSource,
     ColourSource,
@@ -55,7 +56,11 @@ from potr_cl.stages.stage import Progress, Stage, flags
 from potr_cl.workers.opening import ClusterSource, DevicesSource, open_workers
 from potr_cl.workers.pool import Pool, Traffic
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
+
+@with_choices(EncodeChoices)
 def encode(
     scene: SceneSource,
     cameras: CamerasSource | None = None,
@@ -81,7 +86,7 @@ def encode(
     antialiased: bool | None = None,
     cameras_anyway: bool | None = None,
     tell: Callable[[str], None] | None = None,
-    **choices: Any,
+    **choices: Unpack[EncodeChoices],
 ) -> Encoded:
     """Encode a scene, as the command ``encode`` does, with the same options.
 
@@ -97,7 +102,7 @@ def encode(
             views out among them: a list, "all", or "0,1".
         cluster: a Dask cluster whose workers share the views out among them: its scheduler's address, or a client.
         q: quality, 0 (smallest) to 1 (best); 0.5 by default.
-        preset: best, fast or paper; best by default.
+        preset: best, smallest, fast or paper; best by default.
         max_size: find the quality that fills this size: bytes, or a text such as "8MB".
         min_psnr: find the quality that just reaches this PSNR in decibels against the uncompressed scene.
         virtual_views: how many views to place without cameras.
@@ -135,6 +140,7 @@ def encode(
     if report is None and report_view is not None:
         raise UsageError("report_view needs report, the page that shows it")
     views = cameras_of(cameras, virtual_views)
+    photographs_of(settings, views)  # a folder without any is told before the work
     with bounded(settings.memory):
         what = scene_of(scene, trust, antialiased)
     if views is None and (virtual_views is not None or report is not None) and settings.look_at_views(what):
@@ -176,9 +182,8 @@ def encode(
             watch = Stopwatch(progress)
             if judging is not None:
                 used_device = encoded.device or opened or Device()
-                folder = settings.stage(Refit).ground_truth
-                if folder is not None and views is not None:
-                    ground_truth = GroundTruth(folder, views, encoded.options.background)
+                ground_truth = photographs_of(settings, views)
+                if ground_truth is not None and views is not None:
                     photographs = by_photographs(
                         ground_truth, views, encoded, (kept or what, written.scene), used_device,
                         encoded.options.background, pool,
@@ -202,7 +207,7 @@ def encode(
 def encode_options(
     options: EncodeOptions | None,
     preset: Preset | None,
-    choices: dict[str, Any],
+    choices: Mapping[str, Any],
     *,
     q: float | None = None,
     background: ColourSource | None = None,
@@ -306,6 +311,16 @@ def check_photographs_have_cameras(options: EncodeOptions, cameras: bool) -> Non
     refit = options.stage(Refit)
     if refit.ground_truth is not None and not (cameras and refit.asked_for):
         raise UsageError("--photos needs --cameras, the views that the photographs show, and a re-fit")
+
+
+def photographs_of(options: EncodeOptions, cameras: Sequence[Camera] | None) -> GroundTruth | None:
+    """The photographs that options name, if they name any: those that are there, found and measured.
+
+    Raises:
+        As :class:`potr_cl.quality.ground_truth.GroundTruth`.
+    """
+    folder = options.stage(Refit).ground_truth
+    return None if folder is None or cameras is None else GroundTruth(folder, cameras, options.background)
 
 
 def by_photographs(

@@ -6,9 +6,10 @@ import os
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-from potr_cl.api.encoding import Judge, encode_options, output_choice, views_or_placed
+from potr_cl.api.choices import EncodeChoices, with_choices
+from potr_cl.api.encoding import Judge, encode_options, output_choice, photographs_of, views_or_placed
 from potr_cl.api.inputs import (
     CamerasSource,
     ColourSource,
@@ -38,7 +39,11 @@ from potr_cl.stages.stage import Progress
 from potr_cl.workers.opening import ClusterSource, DevicesSource, open_workers
 from potr_cl.workers.pool import Pool
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
+
+@with_choices(EncodeChoices)
 def encode_ladder(
     scene: SceneSource,
     output: str | os.PathLike[str],
@@ -60,7 +65,7 @@ def encode_ladder(
     antialiased: bool | None = None,
     cameras_anyway: bool | None = None,
     tell: Callable[[str], None] | None = None,
-    **choices: Any,
+    **choices: Unpack[EncodeChoices],
 ) -> Ladder:
     """Encode a scene at several qualities, and judge each, as the command ``encode --ladder`` does.
 
@@ -87,6 +92,7 @@ def encode_ladder(
         source_bytes=bytes_of_source(scene), cameras_anyway=cameras_anyway,
     )  # fmt: skip
     given = cameras_of(cameras, virtual_views)
+    photographs_of(settings, given)
     with bounded(settings.memory):
         what = scene_of(scene, trust, antialiased)
     looks = settings.look_at_views(what)

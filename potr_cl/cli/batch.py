@@ -134,7 +134,7 @@ def for_each_scene(works: Sequence[argparse.Namespace], work: Work, tells_json: 
             failed.append(str(one.scene))
             said = _said(error)
             rows.append((one.output.name, f"failed: {said}"))
-            note(f"potr-cl: {said}" if str(one.scene) in said else f"potr-cl: '{one.scene}': {said}")
+            note(f"potr-cl: {said}" if str(one.scene) in said else f"potr-cl: '{one.scene}': {said}", "error")
             if tells_json:
                 say_line({"source": {"file": str(one.scene)}, "file": str(one.output), "error": said})
     if any(len(row) > 2 for row in rows) and not tells_json:

@@ -16,7 +16,7 @@ def _devices(args: argparse.Namespace) -> None:
         say_document(report)
     else:
         say(format_devices(report))
-    # A device that does not work is no harm while another is taken.
+    # A device that does not work is no harm: it is passed over where another does.
     if args.check and not any(entry["chosen"] and works(entry) for entry in report):
         able = [str(entry["index"]) for entry in report if works(entry)]
         advice = f"choose another with --device: {', '.join(able)}" if able else "none works"
@@ -30,7 +30,8 @@ def add_devices(commands: Commands) -> None:
     p.add_argument(
         "--check",
         action="store_true",
-        help="prove that each computes right; takes seconds. Fails if the one that is taken by default does not",
+        help="run every kernel of encodes on each device, in a process of its own; takes seconds or, the first time, "
+        "minutes. Devices that fail are passed over from now on. Fails if none is left",
     )
     p.add_argument("--json", action="store_true", help="for programs")
     p.set_defaults(run=_devices)

@@ -145,7 +145,7 @@ def _refit(args: argparse.Namespace) -> None:
     if args.photos is not None and cameras is not None:
         missing = GroundTruth(args.photos, within_photographs(cameras), background).missing
         if missing is not None:
-            note(missing)
+            note(f"warning: {missing}", "warning")
     scene, reference = read_scene(args, args.scene), read_scene(args, args.reference)
     check_rendered_alike((str(args.scene), scene), (str(args.reference), reference))
     device = Device(args.device)

@@ -282,10 +282,10 @@ def _photographs(
             parse_colour(args.background), pool,
         )  # fmt: skip
     except DeviceError as error:
-        note(f"not judged by photographs: {error}")
+        note(f"warning: not judged by photographs: {error}", "warning")
         return None
     if found["missing"] is not None:
-        note(found["missing"])
+        note(f"warning: {found['missing']}", "warning")
     if found["file"] < found["uncompressed"] and encoded.photographs is not None and encoded.photographs.kept:
         lost = found["uncompressed"] - found["file"]
         note(

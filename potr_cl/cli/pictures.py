@@ -135,7 +135,7 @@ def _compare(args: argparse.Namespace) -> None:
         # Sizes need no device, and may be all that is wanted of a machine without one.
         files = [named(path, read_scene(args, path)) for path in (args.a, args.b)]
         _tell(args, size_report(*files), format_sizes(*files))
-        note("sizes only: there is no OpenCL device to compare pictures on")
+        note("warning: sizes only: there is no OpenCL device to compare pictures on", "warning")
         return
     comparison: SceneComparison | None = None
     try:
@@ -163,7 +163,8 @@ def _compare(args: argparse.Namespace) -> None:
             progress = stack.enter_context(Progress())
             comparison = compare_scenes(
                 (named(args.a, a), a), (named(args.b, b), b), views,
-                workers=workers, rules=RULES[args.rules], background=background, truth=args.truth, progress=progress,
+                workers=workers, rules=RULES[args.rules], background=background, truth=args.truth, lpips=args.lpips,
+                progress=progress,
                 coded=coded,
             )  # fmt: skip
             if picture is not None:
@@ -203,6 +204,7 @@ def add_compare(commands: Commands) -> None:
     p.add_argument(
         "--truth", type=ReadPhotographs, metavar="DIR", help="photographs, named after the views: judge A and B by them"
     )
+    p.add_argument("--lpips", action="store_true", help="tell LPIPS too; needs the extra lpips and its weights")
     add_view_options(p, "test views if there are any, else all")
     p.add_argument(
         "-o",

@@ -46,7 +46,7 @@ def speak(loudness: Loudness) -> None:
         if isinstance(handler, _Notes):
             logger.removeHandler(handler)
     logger.addHandler(_Notes())
-    logger.setLevel(logging.DEBUG if loudness == "verbose" else logging.WARNING)
+    logger.setLevel(logging.DEBUG if loudness == "verbose" else logging.INFO)
 
 
 def is_quiet() -> bool:
@@ -146,8 +146,8 @@ class _Notes(logging.Handler):
     """What the package logs, as notes."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        kind: Kind = "warning" if record.levelno >= logging.WARNING else "detail"
-        note(self.format(record), kind)
+        kinds: dict[int, Kind] = {logging.DEBUG: "detail", logging.INFO: "news"}
+        note(self.format(record), kinds.get(record.levelno, "warning"))
 
 
 def _takes_colours(stream: TextIO) -> bool:

@@ -19,6 +19,7 @@ from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import describe
 from potr_cl.opencl.device import Device
 from potr_cl.placement.virtual import place_cameras
+from potr_cl.quality.evidence import evidence_of
 from potr_cl.stages.stage import Progress
 
 #: What ``--cameras`` takes in the place of a path.
@@ -86,7 +87,7 @@ def read_cameras(args: argparse.Namespace) -> list[Camera]:
 
 def warn_of_frame(path: Path, scene: Scene, views: Sequence[Camera]) -> None:
     """Say so if the views of a file do not seem to be in a scene's frame; for commands that throw nothing away."""
-    judged = judge_cameras(scene, views)
+    judged = judge_cameras(scene, views, evidence_of(scene, views))
     said = judged.finding if judged.suspicious else judged.doubt
     if said is not None:
         note(f"warning: {path}: {said}", "warning")

@@ -157,6 +157,31 @@ def read_ground_truth(path: Path, background: Colour = (0.0, 0.0, 0.0)) -> Float
     return pixels[..., :3] * alpha + np.asarray(background, np.float32) * (1 - alpha)
 
 
+def read_thumbnail(path: Path, width: int, height: int, shape: float, tolerance: float) -> NDArray[np.float64]:
+    """Read an image in few pixels, over black.
+
+    Args:
+        path: of the file.
+        width, height: in pixels.
+        shape: its width over its height, and tolerance: by how much of that it may differ.
+
+    Returns:
+        (height, width, 3), 0 to 1.
+
+    Raises:
+        As :func:`read_ground_truth`; and DataError if it has another shape.
+    """
+    with _opened_photograph(path) as image:
+        if image.mode in _DEEP_MODES:
+            raise DataError(f"'{path}' has more than 8 bits a channel: convert it to an 8-bit image")
+        if abs(image.width / image.height / shape - 1) > tolerance:
+            raise DataError(f"'{path}' has another shape than its view")
+        image.draft("RGB", (2 * width, 2 * height))  # a JPEG is decoded no finer than that
+        small = image.convert("RGBA").resize((width, height), 4)  # Pillow's BOX: the mean
+        pixels = np.asarray(small, dtype=np.float64) / 255
+    return pixels[..., :3] * pixels[..., 3:]
+
+
 def to_8_bits(image: NDArray[Any]) -> NDArray[np.uint8]:
     """Colours of any shape, clamped to [0, 1] and rounded to 0 … 255, uint8 of the same shape."""
     pixels = np.empty(image.shape, np.uint8)

@@ -20,6 +20,11 @@ from potr_cl.formats.declaration import CameraFormat, SceneFormat, SceneLoader, 
 from potr_cl.formats.levels import without_level
 from potr_cl.formats.scenes import compressed_ply, gltf, ksplat, ply, potr, sog, sog_levels, splat, spz
 
+_GSPLAT = "export it as PLY, by gsplat's simple_trainer.py with --save-ply or by gsplat.export_splats"
+_NERFSTUDIO = "export it as PLY, by nerfstudio's `ns-export gaussian-splat --load-config CONFIG.yml --output-dir DIR`"
+#: How checkpoints of trainings, by their suffixes, become scenes.
+_CHECKPOINTS = {".pt": _GSPLAT, ".pth": _GSPLAT, ".ckpt": _NERFSTUDIO}
+
 #: In the order in which people are told of them.
 SCENE_FORMATS: tuple[SceneFormat, ...] = (
     ply.FORMAT,
@@ -82,12 +87,19 @@ def format_of(path: Path) -> SceneFormat:
     for entry in having_it:
         if entry.recognises is None:
             return entry
+    if extension in _CHECKPOINTS:
+        raise UsageError(f"'{path}' is a checkpoint of a training, not a scene: {_CHECKPOINTS[extension]}")
     names = listed([name for entry in SCENE_FORMATS for name in entry.names])
     if os.path.isdir(path):
         inside = _scene_in(path)
         found = f"; give the file in it: '{inside}'" if inside is not None else ""
         raise UsageError(f"the folder '{path}' holds no scene that can be read as a folder: it has no {names}{found}")
     raise UsageError(f"'{path}': unknown kind of scene, expected a {suffixes_read()} file, or a folder with {names}")
+
+
+def is_checkpoint(path: Path) -> bool:
+    """Whether a file's name is that of a training's checkpoint, which only the program that trained can read."""
+    return path.suffix.lower() in _CHECKPOINTS
 
 
 def _scene_in(folder: Path) -> Path | None:

@@ -3,6 +3,9 @@
 A scene that was turned, shifted or scaled after training, or cameras of another scene: whoever removes what no such
 camera misses removes the scene. So both are looked at before anything is thrown away:
 
+Photographs or points of a reconstruction beside the cameras decide (:mod:`potr_cl.quality.evidence`). Where there are
+none, little can be told:
+
 - what part of the splats a view shows, and what part of its picture is not background;
 - how large a splat is in the picture, as a part of it: far from usual where units differ;
 - how much the colours vary towards the view (:mod:`potr_cl.model.sightings`): little, if they were never trained from
@@ -11,7 +14,7 @@ camera misses removes the scene. So both are looked at before anything is thrown
 None of these is wrong in itself: a view may see a corner only, an excerpt fills few pixels, and a scene of degree 0
 remembers nothing. So what counts is whether the cameras fit *much better* if the scene is moved in one of the ways in
 which scenes are moved (:mod:`potr_cl.model.motions`). Cameras for which no such way is better are taken as they are,
-unless they see nothing at all. docs/benchmarks/frames.md has what this finds, and by which margin.
+unless they see nothing at all, and that is said. docs/benchmarks/frames.md has what this finds, and by which margin.
 """
 
 from __future__ import annotations
@@ -26,13 +29,13 @@ from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera
-from potr_cl.model.motions import LOOKING_BACK, WRONG_WAY_ROUND, Motion, likely_motions
+from potr_cl.model.motions import LIKELY_MOTIONS, LOOKING_BACK, WRONG_WAY_ROUND, Motion
 from potr_cl.model.scene import Scene
 from potr_cl.model.sightings import Poses, Sample, Sights, look, poses, sample, show_nothing
 
 _log = logging.getLogger("potr_cl")
 
-#: Views that are looked at; those of them by which motions are chosen, and how many of each kind (once by how well they
+#: Views that are looked at; those of them by which motions are chosen, and how many of these (once by how well they
 #: fit, once by how usual they are) are then looked at in all.
 _VIEWS, _FEW, _CHOSEN = 16, 4, 3
 #: A fit of this or more cannot be surpassed by much: nothing else is tried.
@@ -40,9 +43,9 @@ _FINE = -0.9
 #: A motion must fit at least so well to be believed in. (Poses written the wrong way round must fit as well as if
 #: nothing was wrong: views that look all around from within a scene fit many a reading half as well.)
 _PLAUSIBLE = -2.1
-#: By how much a motion must fit better: with many views, if people know its size, and if it was fitted to the cameras;
-#: and what one view needs on top, which falls with this power of their number. (One view may look at a bare wall.)
-_BETTER, _FITTED = 0.42, 1.2
+#: By how much a motion must fit better with many views, and poses in another convention; and what one view needs on
+#: top, which falls with this power of their number. (One view may look at a bare wall.)
+_BETTER, _BETTER_MISREAD = 0.42, 1.2
 _ALONE, _FALL = 5.0, 1.5
 #: Cameras that see no more of the splats may look the wrong way. In rooms they see as much behind them: none can tell.
 _TURNED_AWAY = 0.05
@@ -83,10 +86,26 @@ class Fit:
 
 
 @dataclass(frozen=True)
+class Evidence:
+    """What photographs or points of a reconstruction say (:mod:`potr_cl.quality.evidence`).
+
+    Attributes:
+        agrees: whether the cameras are in the scene's frame; None if that remains open.
+        measured: what that was decided by: the higher, the more speaks for them.
+        text: what speaks against it, in a clause; empty if nothing does.
+    """
+
+    agrees: bool | None
+    measured: float
+    text: str = ""
+
+
+@dataclass(frozen=True)
 class Judgement:
     """Whether cameras belong to a scene.
 
     Attributes:
+        evidence: what lies beside the cameras and decides, if it does; None if there is nothing.
         views: that were looked at.
         fit: of the cameras as they are.
         motion: what was done to the scene, most likely, if the cameras are not in its frame; None if no motion that was
@@ -102,6 +121,7 @@ class Judgement:
     moved: Fit | None = None
     needed: float = math.inf
     empty: tuple[str, ...] = ()
+    evidence: Evidence | None = None
 
     @property
     def gain(self) -> float:
@@ -116,7 +136,14 @@ class Judgement:
     @property
     def suspicious(self) -> bool:
         """Whether the cameras are probably not in the scene's frame."""
+        if self.evidence is not None and self.evidence.agrees is not None:
+            return not self.evidence.agrees
         return self.blind or self.gain >= self.needed
+
+    @property
+    def taken_as_they_are(self) -> bool:
+        """Whether there is nothing that could confirm the cameras, and nothing that speaks against them."""
+        return self.evidence is None and not self.suspicious
 
     @property
     def finding(self) -> str:
@@ -125,6 +152,8 @@ class Judgement:
         facts = [f"{self.views} views see {_percent(fit.seen)} of the splats, {_percent(fit.covered)} of the pictures"]
         if fit.known is not None and fit.known < 1:
             facts.append(f"the colours know {_percent(fit.known)} of the views")
+        if self.evidence is not None and self.evidence.agrees is False:
+            facts = [self.evidence.text]
         text = f"the cameras do not seem to be in the scene's frame: {', '.join(facts)}"
         if self.motion is None or self.moved is None or self.gain < self.needed:
             return text
@@ -137,7 +166,11 @@ class Judgement:
     @property
     def doubt(self) -> str | None:
         """What is odd about cameras that are taken, in a sentence without a full stop; None if nothing is."""
-        if self.suspicious or not self.empty:
+        if self.suspicious:
+            return None
+        if self.evidence is not None and self.evidence.agrees is None and self.evidence.text:
+            return f"the cameras may not be in the scene's frame: {self.evidence.text}"
+        if not self.empty:
             return None
         which = f"'{self.empty[0]}'" if len(self.empty) == 1 else f"'{self.empty[0]}' and others"
         return (
@@ -155,10 +188,12 @@ class Judgement:
             if self.motion.misread is not None:
                 return self.motion.misread.remedy
             return "give the cameras of this scene, or undo what moved it"
+        if self.evidence is not None and self.evidence.agrees is False:
+            return "undo what moved the scene, or give its own cameras"
         return "give the cameras of this scene"
 
 
-def judge_cameras(scene: Scene, cameras: Sequence[Camera]) -> Judgement:
+def judge_cameras(scene: Scene, cameras: Sequence[Camera], evidence: Evidence | None = None) -> Judgement:
     """Judge whether cameras and scene belong together.
 
     It looks at a sample of the scene through some of the views, on the processor: a tenth of a second, or one where
@@ -167,6 +202,7 @@ def judge_cameras(scene: Scene, cameras: Sequence[Camera]) -> Judgement:
     Args:
         scene: clean, at least one splat.
         cameras: at least one; the training views if only these will be looked at.
+        evidence: of what lies beside the cameras. It has the last word: motions only explain it.
 
     Raises:
         UsageError: there is no camera.
@@ -189,28 +225,28 @@ def judge_cameras(scene: Scene, cameras: Sequence[Camera]) -> Judgement:
     # A few stray views among good ones are no sign that the scene was moved.
     others = np.setdiff1d(np.arange(views), blank)
     fine = fit.total >= _FINE or (bool(empty) and len(others) > 0 and _fit(sights.some(others)).total >= _FINE)
-    found = None if fine else _best_motion(at, some, fit)
-    if found is None:
-        return Judgement(views, fit, empty=empty)
+    agreed = evidence is not None and evidence.agrees is True
+    found = None if fine or agreed else _best_motion(at, some, fit)
+    if found is None or (_looked_at(fit) and found[0].scale == 1):
+        return Judgement(views, fit, empty=empty, evidence=evidence)
     motion, moved = found
-    if _looked_at(fit) and (motion.fitted or motion.scale == 1):
-        return Judgement(views, fit, empty=empty)
-    return Judgement(views, fit, motion, moved, _needed(motion, views), empty)
+    return Judgement(views, fit, motion, moved, _needed(motion, views), empty, evidence)
 
 
-def require_agreement(scene: Scene, cameras: Sequence[Camera]) -> None:
+def require_agreement(scene: Scene, cameras: Sequence[Camera], evidence: Evidence | None = None) -> None:
     """Refuse cameras that are probably not in the scene's frame.
 
-    What is odd about others is told to the logger "potr_cl".
+    What is odd about others, or could not be found out, is told to the logger "potr_cl".
 
     Args:
         scene: clean, at least one splat.
         cameras: at least one.
+        evidence: as of :func:`judge_cameras`.
 
     Raises:
         UsageError: they are not, with what was found and what can be done.
     """
-    judged = judge_cameras(scene, cameras)
+    judged = judge_cameras(scene, cameras, evidence)
     if judged.suspicious:
         raise UsageError(
             f"{judged.finding}: {judged.remedy}, leave --cameras out (virtual ones are placed), or, if they are right, "
@@ -218,6 +254,11 @@ def require_agreement(scene: Scene, cameras: Sequence[Camera]) -> None:
         )
     if judged.doubt is not None:
         _log.warning("%s", judged.doubt)
+    elif judged.taken_as_they_are:
+        _log.info(
+            "no photographs or reconstruction points were found to check the cameras against: the cameras were taken "
+            "as they are"
+        )
 
 
 def _fit(sights: Sights) -> Fit:
@@ -244,7 +285,7 @@ def _empty(scene: Scene, cameras: Poses, sights: Sights) -> NDArray[np.int64]:
 
 
 def _looked_at(fit: Fit) -> bool:
-    """Whether the cameras see the whole scene and nothing speaks against them: other axes or places prove nothing then.
+    """Whether the cameras see the whole scene and nothing speaks against them: other axes prove nothing then.
 
     So it is with a part that was cut out of a scene: seen from the middle it would fill more of the pictures.
     """
@@ -255,41 +296,28 @@ def _looked_at(fit: Fit) -> bool:
 def _best_motion(at: Sample, cameras: Poses, fit: Fit) -> tuple[Motion, Fit] | None:
     """The motion after which the cameras fit best, and how well; None if it is not plausible."""
     views = len(cameras.centres)
-    motions = [*likely_motions(cameras, at), *WRONG_WAY_ROUND]
+    motions = [*LIKELY_MOTIONS, *WRONG_WAY_ROUND]
     if fit.seen < _TURNED_AWAY:
         motions.append(LOOKING_BACK)
     rough = cameras.some(_spread(views, _FEW))
     totals = np.array([_fit(look(at, motion.of(rough))).total for motion in motions])
-    numbers = _promising(totals, np.array([motion.fitted for motion in motions]))
+    # The best ones are looked at closely, and the most usual of those that are as good.
+    best = np.argsort(-totals, kind="stable")[:_CHOSEN]
+    numbers = np.union1d(best, np.flatnonzero(totals >= totals.max() - _AS_WELL)[:_CHOSEN])
     tried = [(motions[number], _fit(look(at, motions[number].of(cameras)))) for number in numbers]
     gains = [(each.total - fit.total - _needed(motion, views), motion, each) for motion, each in tried]
     gains = [gain for gain in gains if gain[2].total >= (_FINE if gain[1] in WRONG_WAY_ROUND else _PLAUSIBLE)]
     if not gains:
         return None
-    # What people do to scenes explains more than what could be fitted to any cameras.
-    enough = [gain for gain in gains if gain[0] >= 0]
-    gains = [gain for gain in enough if not gain[1].fitted] or enough or gains
+    gains = [gain for gain in gains if gain[0] >= 0] or gains
     most = max(gains, key=lambda gain: gain[2].total)
     as_well = [gain for gain in gains if gain[1].misread is None and gain[2].total >= most[2].total - _AS_WELL]
     _, motion, moved = as_well[0] if as_well else most
     return motion, moved
 
 
-def _promising(totals: NDArray[np.float64], fitted: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Numbers of the motions to look at closely: of either kind the best ones, and the most usual of the good ones."""
-    chosen: list[int] = []
-    for kind in (False, True):
-        own = np.flatnonzero(fitted == kind)
-        if len(own):
-            chosen += own[np.argsort(-totals[own], kind="stable")[:_CHOSEN]].tolist()
-            chosen += own[totals[own] >= totals[own].max() - _AS_WELL][:_CHOSEN].tolist()
-    return np.unique(chosen)
-
-
 def _needed(motion: Motion, views: int) -> float:
-    return (_FITTED if motion.fitted or motion.misread is not None else _BETTER) + _ALONE * math.exp(
-        -_FALL * math.log(views)
-    )
+    return (_BETTER if motion.misread is None else _BETTER_MISREAD) + _ALONE * math.exp(-_FALL * math.log(views))
 
 
 def _spread(count: int, wanted: int) -> NDArray[np.int64]:

@@ -33,6 +33,7 @@ class Camera:
         translation: (3,) float64, world to camera, world units.
         split: "train" (the encoder may look at it) or "test" (for judging only).
         image_path: the photograph, if the camera file names one.
+        points_path: points of the reconstruction that the pose comes from, in the same frame, if they lie beside it.
         lens: how the photograph was bent, if it was; None: the photograph is what the pinhole sees.
     """
 
@@ -48,6 +49,7 @@ class Camera:
     split: Split = "train"
     image_path: Path | None = None
     lens: Lens | None = None
+    points_path: Path | None = None
 
     def __post_init__(self) -> None:
         where = f"camera '{self.name}'"

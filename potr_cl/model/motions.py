@@ -1,24 +1,20 @@
-"""Ways in which a scene may have been moved away from its cameras: :func:`likely_motions`."""
+"""Ways in which a scene may have been moved away from its cameras: :data:`LIKELY_MOTIONS`."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.model.sightings import Poses, Sample
+from potr_cl.model.sightings import Poses
 
 F64 = NDArray[np.float64]
 
 #: Factors by which units are mistaken: metres, decimetres, centimetres, millimetres.
 _FACTORS = (0.1, 10.0, 0.01, 100.0, 0.001, 1000.0)
-#: Where a scene is shifted at will, how far from its centre the cameras may stand: its own units, and in the scene's.
-_DISTANCES = (None, 1.5, 4.0)
-#: Cameras that it takes to know what they look at.
-_ENOUGH = 3
 
 
 @dataclass(frozen=True)
@@ -40,27 +36,21 @@ class Misreading:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """What may have happened to a scene after it was trained: x became ``scale · axes x + shift``.
+    """What may have happened to a scene after it was trained: x became ``scale · axes x``.
 
     Attributes:
         axes: (3, 3) of 0, 1 and -1: a rotation by right angles, or with a mirror.
         scale: a factor.
-        shift: (3,) world units of the scene as it is now.
-        fitted: whether shift and scale were fitted to the cameras, which then need not be this scene's at all.
         misread: it was not the scene: the cameras' poses were meant in another way.
     """
 
     axes: F64
     scale: float
-    shift: F64
-    fitted: bool
     misread: Misreading | None = None
 
     def of(self, cameras: Poses) -> Poses:
         """Cameras that are moved along with the scene, all in world units."""
-        return (
-            cameras.moved(self.axes, self.scale, self.shift) if self.misread is None else self.misread.mended(cameras)
-        )
+        return cameras.moved(self.axes, self.scale) if self.misread is None else self.misread.mended(cameras)
 
     @property
     def condition(self) -> str:
@@ -73,8 +63,6 @@ class Motion:
         if self.misread is not None:
             return self.misread.name
         said = [_turn(self.axes)] if not np.array_equal(self.axes, np.eye(3)) else []
-        if self.fitted:
-            return " and ".join([*said, "moved"])
         if self.scale != 1:
             said.append(f"scaled by {self.scale:g}")
         return " and ".join(said) or "left as it was"
@@ -82,7 +70,7 @@ class Motion:
     @property
     def undone(self) -> str:
         """What brings it back, to stand behind "bring the scene back:"; empty if that is not known."""
-        if self.fitted or self.misread is not None:
+        if self.misread is not None:
             return ""
         said = [_turn(self.axes.T)] if not np.array_equal(self.axes, np.eye(3)) else []
         if self.scale != 1:
@@ -91,7 +79,7 @@ class Motion:
 
 
 def _misread(misreading: Misreading) -> Motion:
-    return Motion(np.eye(3), 1.0, np.zeros(3), fitted=False, misread=misreading)
+    return Motion(np.eye(3), 1.0, misread=misreading)
 
 
 #: What is wrong where cameras were exported with the axes of another convention: OpenGL's y up and z back.
@@ -132,30 +120,6 @@ WRONG_WAY_ROUND = (
 )
 
 
-def likely_motions(world: Poses, at: Sample) -> Iterator[Motion]:
-    """What people and programs do to scenes, the usual first; but for leaving them as they are.
-
-    Axes of OpenGL and of COLMAP differ by half a turn about x, "z up" and "y up" by a quarter; units by powers of ten.
-    Then scenes that lie elsewhere altogether: such as have their middle where the cameras look.
-
-    Args:
-        world: of the cameras, in world units.
-        at: the scene.
-    """
-    nowhere = np.zeros(3)
-    for axes in _AXES[1:]:
-        yield Motion(axes, 1.0, nowhere, False)
-    for factor in _FACTORS:
-        yield Motion(np.eye(3), factor, nowhere, False)
-    if len(world.centres) < _ENOUGH:
-        return
-    focus, distance = _focus(world)
-    for axes in _AXES[: len(_AXES) // 2]:
-        for wanted in _DISTANCES:
-            scale = 1.0 if wanted is None else wanted * at.unit / max(distance, 1e-9)
-            yield Motion(axes, scale, at.centre - scale * axes @ focus, True)
-
-
 def _all_axes() -> list[F64]:
     """The 48 ways to exchange and turn round axes: the identity, other rotations from simple ones on, mirrored ones."""
     found = []
@@ -174,9 +138,6 @@ def _order(axes: F64) -> int:
     if np.array_equal(axes, np.eye(3)):
         return 0
     return 1 if np.any(np.abs(np.diag(axes)) == 1) and (np.diag(axes) == 1).any() else 2
-
-
-_AXES = _all_axes()
 
 
 def _turn(axes: F64) -> str:
@@ -198,11 +159,9 @@ def _turn(axes: F64) -> str:
     return f"given other axes, x, y, z = {to} of before"
 
 
-def _focus(world: Poses) -> tuple[F64, float]:
-    """The point that the cameras' lines of sight come nearest to, and their median distance from it."""
-    forward = world.rotations[:, 2]
-    across = np.eye(3) - np.einsum("ni,nj->nij", forward, forward)
-    focus: F64 = np.linalg.lstsq(
-        across.sum(axis=0), np.einsum("nij,nj->i", across, world.centres), rcond=1e-6
-    )[0]  # fmt: skip
-    return focus, float(np.median(np.linalg.norm(world.centres - focus, axis=1)))
+#: What people and programs do to scenes, the usual first. Axes of OpenGL and of COLMAP differ by half a turn about x,
+#: "z up" and "y up" by a quarter; units by powers of ten.
+LIKELY_MOTIONS = (
+    *(Motion(axes, 1.0) for axes in _all_axes()[1:]),
+    *(Motion(np.eye(3), factor) for factor in _FACTORS),
+)

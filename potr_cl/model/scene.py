@@ -6,7 +6,7 @@ import dataclasses
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,25 @@ def most_coefficients(own_degree: int, degree: int | None) -> int:
     return SH_COEFFICIENTS[own_degree if degree is None else min(degree, own_degree)]
 
 
+_ARRAYS = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
+
+
+def _cast(values: Any, name: str) -> FloatArray:
+    if isinstance(values, np.ndarray) and values.dtype == np.float32:
+        return values
+    try:
+        array = np.asarray(values)
+        if array.dtype.kind not in "fiub":
+            raise TypeError(f"{array.dtype} is no kind of real number")
+        with np.errstate(over="ignore"):
+            return array.astype(np.float32)
+    except (TypeError, ValueError, RuntimeError) as error:
+        said = " ".join(str(error).split())
+        raise DataError(
+            f"scene: {name} is {type(values).__name__}, of which no array of float32 can be made: {said}"
+        ) from None
+
+
 @dataclass(frozen=True)
 class CleanReport:
     """What :meth:`Scene.cleaned` had to mend.
@@ -61,12 +80,13 @@ class CleanReport:
     infinite_opacities: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scene:
     """A trained scene, in the parametrisation that 3DGS files hold (Kerbl et al. 2023).
 
     All arrays are float32, N splats long, and may have any strides (the decoder returns ``sh`` with each
-    coefficient contiguous in memory; nothing may assume otherwise of it).
+    coefficient contiguous in memory; nothing may assume otherwise of it). Other arrays of numbers, lists and tensors
+    of the CPU are cast. ``scene[mask]`` selects splats, ``==`` compares all values.
 
     Attributes:
         means: (N, 3) centres in world units.
@@ -93,10 +113,8 @@ class Scene:
     low_pass: float = LOW_PASS
 
     def __post_init__(self) -> None:
-        for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
-            if not isinstance(getattr(self, name), np.ndarray):
-                kind = type(getattr(self, name)).__name__
-                raise DataError(f"scene: {name} is of type {kind}, expected a NumPy array of float32")
+        for name in _ARRAYS:
+            object.__setattr__(self, name, _cast(getattr(self, name), name))
         n = len(self.means) if self.means.ndim else 0
         wanted = {
             "means": (n, 3),
@@ -112,9 +130,6 @@ class Scene:
             raise DataError(f"scene: sh has shape {self.sh.shape}, expected ({n}, M, 3)")
         if self.sh.shape[1] not in SH_COEFFICIENTS:
             raise DataError(f"scene: {self.sh.shape[1]} SH coefficients a channel, expected one of {SH_COEFFICIENTS}")
-        for name in (*wanted, "sh"):
-            if getattr(self, name).dtype != np.float32:
-                raise DataError(f"scene: {name} is {getattr(self, name).dtype}, expected float32 (astype)")
         if self.low_pass != LOW_PASS and not (self.antialiased and self.low_pass == MIP_SPLATTING_LOW_PASS):
             raise DataError(
                 f"scene: a low-pass filter of {self.low_pass:g} square pixels, expected {LOW_PASS:g}, or for an "
@@ -123,6 +138,25 @@ class Scene:
 
     def __len__(self) -> int:
         return len(self.means)
+
+    def __getitem__(self, index: Any) -> Scene:
+        """The splats of a boolean mask, of numbers or of a slice; of one number, a scene of one splat."""
+        if isinstance(index, (int, np.integer)):
+            index = [index]
+        if not isinstance(index, slice):
+            index = np.asarray(index)
+            # Of an empty list NumPy makes floats.
+            index = index if index.size else index.astype(np.intp)
+        return self.subset(np.arange(len(self))[index])
+
+    def __iter__(self) -> NoReturn:
+        raise TypeError("a scene is no sequence of splats: look at its arrays, such as scene.means")
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Scene):
+            return NotImplemented
+        same = (self.antialiased, self.low_pass) == (other.antialiased, other.low_pass)
+        return same and all(np.array_equal(getattr(self, name), getattr(other, name)) for name in _ARRAYS)
 
     @property
     def sh_degree(self) -> int:

@@ -24,7 +24,7 @@ F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 #: Nothing nearer than this, in world units, is seen: the renderer's near plane.
-_NEAR = 0.2
+NEAR = 0.2
 #: Splats that a scene is thinned to, splats that are looked at, points that hide what is behind them.
 _THINNED, _TARGETS, _POINTS = 60_000, 1_500, 6_000
 #: A splat's opacity above which it counts as matter.
@@ -102,10 +102,10 @@ class Poses:
         """Those of some of the cameras, by their numbers."""
         return Poses(self.centres[views], self.rotations[views], self.windows[views], self.near)
 
-    def moved(self, axes: F64, scale: float, shift: F64) -> Poses:
-        """The same cameras after the world was moved: x became scale · axes x + shift, axes (3, 3), shift (3,)."""
+    def moved(self, axes: F64, scale: float) -> Poses:
+        """The same cameras after the world was moved: x became scale · axes x, axes (3, 3)."""
         with np.errstate(over="ignore", invalid="ignore"):
-            centres = scale * self.centres @ axes.T + shift
+            centres = scale * self.centres @ axes.T
         return Poses(centres, self.rotations @ axes.T, self.windows, self.near * scale)
 
     def turned_round(self) -> Poses:
@@ -216,7 +216,7 @@ def poses(cameras: Sequence[Camera]) -> Poses:
     """Where cameras stand, in world units."""
     windows = [(-c.cx / c.fx, (c.width - c.cx) / c.fx, -c.cy / c.fy, (c.height - c.cy) / c.fy) for c in cameras]
     rotations = np.array([camera.rotation for camera in cameras])
-    return Poses(camera_centres(cameras), rotations, np.array(windows), _NEAR)
+    return Poses(camera_centres(cameras), rotations, np.array(windows), NEAR)
 
 
 def look(at: Sample, world: Poses) -> Sights:

@@ -21,7 +21,7 @@ from potr_cl.host.threads import in_background, thread_pool
 from potr_cl.opencl import compiler, program_cache, quirks
 from potr_cl.opencl.ahead import context_of
 from potr_cl.opencl.building import building
-from potr_cl.opencl.discovery import DeviceInfo, Family, choose_device, compiler_fault, compiles_nothing
+from potr_cl.opencl.discovery import DeviceInfo, Family, choose_device, compiler_fault, not_to_be_taken
 from potr_cl.opencl.foresight import Foresight, Wanted
 from potr_cl.opencl.kernel import Kernel, declared_parameters
 from potr_cl.opencl.source import kernel_source
@@ -81,8 +81,8 @@ class Device:
         macros: Mapping[str, str | int | float] | None = None,
     ) -> None:
         self.info = info if isinstance(info, DeviceInfo) else choose_device(info)
-        if compiler_fault(self.info) is not None:
-            raise DeviceError(compiles_nothing([self.info]))
+        if (fault := compiler_fault(self.info)) is not None:
+            raise DeviceError(not_to_be_taken([self.info], f"cannot compile even an empty program ({fault})"))
         self.family: Family = family or self.info.family
         self.timings: list[tuple[str, cl.Event]] = []
         self._lock = threading.RLock()  # of the two that follow

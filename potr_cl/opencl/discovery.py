@@ -15,7 +15,7 @@ from typing import Literal
 import pyopencl as cl
 
 from potr_cl.errors import DeviceError
-from potr_cl.opencl import compiler, loader, quirks
+from potr_cl.opencl import compiler, loader, quirks, verdict
 
 Family = Literal["cpu", "gpu"]
 
@@ -168,47 +168,58 @@ def _cpu_runtime_advice() -> str:
     return pocl
 
 
-def compiles_nothing(infos: Sequence[DeviceInfo]) -> str:
-    """One line that says so of these devices, and how to mend it."""
-    names = ", ".join(map(str, infos))
-    return (
-        f"device {names} cannot compile even an empty program ({compiler_fault(infos[0])}): mend it by "
-        f"{_cpu_runtime_advice()}"
-    )
+def fault_of(info: DeviceInfo) -> str | None:
+    """Why a device is not to be taken, in a clause; None if it is.
+
+    What crashes encodes has a verdict (:mod:`potr_cl.opencl.verdict`). Of runtimes that
+    :data:`potr_cl.opencl.quirks.CRASHES` concerns it is made here, the first time: seconds.
+    """
+    if (said := compiler_fault(info)) is not None:
+        return f"cannot compile even an empty program ({said})"
+    known, said = verdict.kept(info)
+    if not known and verdict.TRUST_VARIABLE not in os.environ and quirks.CRASHES.concerns(info.platform, info.version):
+        logger.info("trying %s in a process of its own, once, since this runtime has crashed elsewhere …", info)
+        said = verdict.tried(info)
+    return None if said is None else f"failed its self-check, which `devices --check` repeats ({said})"
+
+
+def not_to_be_taken(infos: Sequence[DeviceInfo], fault: str | None) -> str:
+    """One line that says so of these devices, why, and how to mend it."""
+    return f"device {', '.join(map(str, infos))} {fault}: mend it by {_cpu_runtime_advice()}"
 
 
 _passed_over: set[DeviceInfo] = set()
 
 
 def choose_device(spec: str | None = None) -> DeviceInfo:
-    """The best of the devices that ``spec`` fits and that can compile (see :func:`compiler_fault`).
+    """The best of the devices that ``spec`` fits and that work, as far as is known (see :func:`fault_of`).
 
-    Better ones that cannot are passed over with a warning, one a process.
+    Better ones that do not are passed over with a warning, one a process.
 
     Args:
         spec: as for :func:`fitting_devices`.
 
     Raises:
-        DeviceError: there is no device, none that ``spec`` fits, or none of those can compile.
+        DeviceError: there is no device, none that ``spec`` fits, or none of those works.
     """
     return _first_able(fitting_devices(spec))
 
 
 def _first_able(infos: Sequence[DeviceInfo]) -> DeviceInfo:
-    """The first of these devices that can compile.
+    """The first of these devices that works.
 
     Raises:
-        DeviceError: none can.
+        DeviceError: none does.
     """
-    unable: list[DeviceInfo] = []
+    unable: dict[DeviceInfo, str] = {}
     for info in infos:
-        if compiler_fault(info) is None:
+        if (fault := fault_of(info)) is None:
             if not _passed_over.issuperset(unable):
                 _passed_over.update(unable)
-                logger.warning("%s; going on with %s", compiles_nothing(unable), info)
+                logger.warning("%s; going on with %s", not_to_be_taken(list(unable), next(iter(unable.values()))), info)
             return info
-        unable.append(info)
-    raise DeviceError(compiles_nothing(unable))
+        unable[info] = fault
+    raise DeviceError(not_to_be_taken(list(unable), next(iter(unable.values()))))
 
 
 def several_are_named() -> bool:
@@ -247,7 +258,7 @@ def choose_devices(spec: str | None = None) -> list[DeviceInfo]:
         every = _by_preference()
         best = _first_able(every)
         alike = [info for info in every if (info.kind, info.platform) == (best.kind, best.platform)]
-        return [best, *(info for info in alike if info != best and compiler_fault(info) is None)]
+        return [best, *(info for info in alike if info != best and fault_of(info) is None)]
     if len(parts) > 1 and all(part.isdecimal() and len(part) < 9 for part in parts):
         if len(set(map(int, parts))) < len(parts):
             raise DeviceError(f"'{spec}' names a device twice: name each once")

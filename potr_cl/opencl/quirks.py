@@ -73,6 +73,15 @@ UNKNOWN_CPU = Quirk(
     test=lambda platform, version: is_pocl(platform),
 )
 
+#: It is tried in another process before it is taken (opencl/verdict.py).
+CRASHES = Quirk(
+    vendor="PoCL",
+    versions="3.0 (the PyPI wheel), on an AMD EPYC of family 25, model 17",
+    reason="a kernel of the re-fit ends the process with SIGSEGV, though each that was probed computed right",
+    still_needed="`python -m potr_cl devices --check` with that runtime on such a CPU",
+    test=lambda platform, version: is_pocl(platform),
+)
+
 #: The device runs the GPU kernels, which need no long loops. It asks for scalars, by which it is known; nothing else
 #: has to ask this quirk.
 SHORT_LOOPS = Quirk(

@@ -10,6 +10,7 @@ from potr_cl.model.agreement import require_agreement
 from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import is_virtual
+from potr_cl.quality.evidence import evidence_of
 
 
 def check_frame(scene: Scene, cameras: Sequence[Camera] | None, anyway: bool) -> None:
@@ -19,7 +20,8 @@ def check_frame(scene: Scene, cameras: Sequence[Camera] | None, anyway: bool) ->
         UsageError: they are not in it, or there is no training view among them.
     """
     if cameras and not anyway and not is_virtual(cameras):
-        require_agreement(scene, train_views(cameras))
+        views = train_views(cameras)
+        require_agreement(scene, views, evidence_of(scene, views))
 
 
 @contextmanager

@@ -101,18 +101,18 @@ class Lpips:
 
             torchvision = importlib.import_module("torchvision")
         except (ImportError, OSError):  # OSError: a library of torch's is missing
-            raise UsageError(f"LPIPS is left out: it needs {install_command('lpips')}") from None
+            raise UsageError(f"LPIPS needs {install_command('lpips')}") from None
         folder = Path(torch.hub.get_dir()) / "checkpoints"
         weights = folder / torchvision.models.VGG16_Weights.IMAGENET1K_V1.url.rsplit("/", 1)[-1]
         if not weights.is_file():
-            raise UsageError(f"LPIPS is left out: put torchvision's weights '{weights.name}' into '{folder}'")
+            raise UsageError(f"LPIPS needs its weights: put torchvision's weights '{weights.name}' into '{folder}'")
         self._torch = torch
         with without_warnings():  # lpips calls torchvision in a deprecated way
             try:
                 self._network = lpips.LPIPS(net="vgg", verbose=False)
             except Exception as error:
                 reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-                raise UsageError(f"LPIPS is left out: '{weights}' cannot be loaded: {reason}") from None
+                raise UsageError(f"LPIPS needs its weights: '{weights}' cannot be loaded: {reason}") from None
 
     def __call__(self, image: NDArray[Any], reference: NDArray[Any]) -> float | None:
         """The distance, 0 for identical pictures; None if they are smaller than 16 pixels on a side."""

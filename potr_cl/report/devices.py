@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from potr_cl.errors import DeviceError
-from potr_cl.opencl.device import Device
+from potr_cl.opencl import verdict
 from potr_cl.opencl.discovery import DeviceInfo, compiler_fault, fitting_devices, list_devices
 
 
@@ -14,16 +13,26 @@ def device_report(check: bool) -> list[dict[str, Any]]:
     """One entry a device, in the order of their indices; "fault" says why a device can compile nothing, or is None.
 
     Args:
-        check: run each device's self-check; the entry's "check" is then "passed" or says what failed.
+        check: run each device's self-check anew, in a process of its own; the entry's "check" is then "passed" or says
+            what failed. Without it "check" stands only where that was done before.
 
     Raises:
         DeviceError: there is no device at all, or the environment variable names one that there is not.
     """
-    chosen = next((info.index for info in fitting_devices() if compiler_fault(info) is None), None)
-    return [_entry(info, info.index == chosen, check) for info in list_devices()]
+    checks = {info.index: _checked(info, check) for info in list_devices()}
+    able = (i.index for i in fitting_devices() if compiler_fault(i) is None and checks[i.index] in (None, "passed"))
+    chosen = next(able, None)
+    return [_entry(info, info.index == chosen, checks[info.index]) for info in list_devices()]
 
 
-def _entry(info: DeviceInfo, chosen: bool, check: bool) -> dict[str, Any]:
+def _checked(info: DeviceInfo, anew: bool) -> str | None:
+    if compiler_fault(info) is not None:
+        return None
+    known, said = (True, verdict.tried(info)) if anew else verdict.kept(info)
+    return (said or "passed") if known else None
+
+
+def _entry(info: DeviceInfo, chosen: bool, check: str | None) -> dict[str, Any]:
     entry = {
         "index": info.index,
         "chosen": chosen,
@@ -40,13 +49,7 @@ def _entry(info: DeviceInfo, chosen: bool, check: bool) -> dict[str, Any]:
         "kernels": info.family,
         "fault": compiler_fault(info),
     }
-    if check:
-        try:
-            Device(info).self_check()
-            entry["check"] = "passed"
-        except DeviceError as error:
-            entry["check"] = str(error)
-    return entry
+    return entry if check is None else entry | {"check": check}
 
 
 def format_devices(report: Sequence[dict[str, Any]]) -> str:

@@ -116,7 +116,7 @@ def _headline(report: dict[str, Any]) -> str:
 
 
 def _megabytes(nbytes: int) -> str:
-    return f"{nbytes / 1e6:.2f} MB" if nbytes >= 1e5 else f"{nbytes / 1e3:.2f} kB"
+    return f"{nbytes / 1e6:.2f} MB" if nbytes >= 1e6 else f"{nbytes / 1e3:.2f} kB"
 
 
 def _sizes(report: dict[str, Any]) -> str:
@@ -297,9 +297,11 @@ def _search(search: dict[str, Any]) -> str:
 def _settings(report: dict[str, Any]) -> str:
     rows = [[_text(name), f"{value:.6g}"] for name, value in report["parameters"].items()]
     others = {
-        name: {field: each for field, each in value.items() if field not in report["parameters"]}
-        if isinstance(value, dict)
-        else value
+        name: value
+        if not isinstance(value, dict)
+        else "off"
+        if value.get("on") is False or value.get("steps") == 0
+        else {field: each for field, each in value.items() if field not in report["parameters"]}
         for name, value in report["options"].items()
     }
     return (

@@ -370,7 +370,7 @@ def _middle(ladder: Ladder) -> int:
 
 
 def _size(nbytes: int) -> str:
-    return f"{nbytes / 1e6:.2f} MB" if nbytes >= 1e5 else f"{nbytes / 1e3:.2f} kB"
+    return f"{nbytes / 1e6:.2f} MB" if nbytes >= 1e6 else f"{nbytes / 1e3:.2f} kB"
 
 
 def _shown(host: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -52,10 +53,11 @@ def test_info_tells_of_a_scene_what_is_wrong_with_it(plush_excerpt):
 
 @pytest.mark.parametrize("name", ["means", "sh", "opacity_logits"])
 def test_a_scene_of_what_is_no_array(name, plush_excerpt):
-    with pytest.raises(DataError, match=rf"scene: {name} is of type list, expected a NumPy array of float32"):
-        dataclasses.replace(plush_excerpt, **{name: getattr(plush_excerpt, name).tolist()})
-    with pytest.raises(DataError, match=rf"scene: {name} is float64, expected float32"):
-        dataclasses.replace(plush_excerpt, **{name: getattr(plush_excerpt, name).astype(float)})
+    for cast in (np.ndarray.tolist, lambda array: array.astype(float)):
+        assert dataclasses.replace(plush_excerpt, **{name: cast(getattr(plush_excerpt, name))}) == plush_excerpt
+    for wrong in ("red", [[1, 2], [3]], None, np.array([1j])):
+        with pytest.raises(DataError, match=rf"scene: {name} is \w+, of which no array of float32 can be made: "):
+            dataclasses.replace(plush_excerpt, **{name: wrong})
 
 
 def test_a_camera_of_lists_and_of_other_numbers(plush_excerpt_cameras):
@@ -138,10 +140,12 @@ def test_options_of_numpys_numbers_are_ready_for_json():
     assert type(EncodeOptions(q=np.float32(0.5)).q) is float
 
 
-def test_a_tensor_is_no_array(plush_excerpt):
+def test_a_tensor_is_taken_as_an_array(plush_excerpt):
     torch = pytest.importorskip("torch")
-    with pytest.raises(DataError, match="scene: means is of type Tensor, expected a NumPy array of float32"):
-        dataclasses.replace(plush_excerpt, means=torch.from_numpy(plush_excerpt.means))
+    means = torch.from_numpy(plush_excerpt.means)
+    assert dataclasses.replace(plush_excerpt, means=means) == plush_excerpt
+    with pytest.raises(DataError, match=r"scene: means is Tensor, .* requires grad"):
+        dataclasses.replace(plush_excerpt, means=means.clone().requires_grad_())
     camera = Camera("a", 10, 10, 10.0, 10.0, 5.0, 5.0, torch.eye(3), torch.zeros(3))  # type: ignore[arg-type]
     assert (camera.rotation == np.eye(3)).all()
 
@@ -156,3 +160,14 @@ def test_no_view_at_all(size, plush_excerpt, plush_excerpt_cameras, monkeypatch)
         for none in ([], (), np.array([], str)):
             with pytest.raises(UsageError, match="the list of views is empty: name at least one, or leave it out"):
                 call(plush_excerpt, plush_excerpt_cameras, views=none)
+
+
+def test_photographs_are_looked_for_before_the_work(plush_excerpt, plush_excerpt_cameras, tmp_path):
+    def progress(stage, done):
+        raise AssertionError(f"{stage} has begun")
+
+    for folder in (tmp_path, tmp_path / "nowhere"):
+        with pytest.raises(UsageError, match=re.escape(str(folder))):
+            potr_cl.encode(plush_excerpt, plush_excerpt_cameras, progress=progress, photos=folder)
+        with pytest.raises(UsageError, match=re.escape(str(folder))):
+            potr_cl.encode_ladder(plush_excerpt, tmp_path / "out", "0.5", plush_excerpt_cameras, photos=folder)

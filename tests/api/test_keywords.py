@@ -32,6 +32,7 @@ from potr_cl.stages.stage import State
 COMMANDS = ("encode", "prune", "compact", "refit", "fit", "decode", "info", "convert", "render", "compare")
 #: Options that have no keyword, and why.
 COMMAND_LINE_ONLY = {
+    "--lpips": "a keyword too, of an extra that few have installed",
     "--help": "Python has its own",
     "--json": "results are objects; SceneComparison.report() and SceneInfo.facts are what it prints",
     "--quiet": "what a program is told it asks for by progress; warnings are log messages",

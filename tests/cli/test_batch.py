@@ -59,6 +59,8 @@ def test_one_bad_scene_does_not_lose_the_others(folder: Path, capsys: pytest.Cap
     assert "'b.ply' is truncated" in said[0]
     assert said[2] == "potr-cl: 2 of 4 scenes failed: 'b.ply', 'none.ply'"
     assert "Traceback" not in told.err
+    assert cli.main([*call, "--quiet"]) == 2
+    assert [line for line in capsys.readouterr().err.splitlines() if line.startswith("potr-cl: ")] == said
 
 
 def test_a_damaged_one_alone_exits_with_1(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -337,3 +338,12 @@ def test_training_views_that_judge_themselves_are_said_to_be_few(tmp_path, data,
         text = run(capsys, "encode", scene, "--cameras", path, "--iterations", "2", "-o", tmp_path / "a.potr")
         said.append("is shown by no more than 3 of them" in text)
     assert said == [True, False]
+
+
+def test_every_key_of_the_json_is_documented(tmp_path, scene_path, cameras_path, capsys):
+    encode = ["encode", scene_path, "-o", tmp_path / "a.potr", "--cameras", cameras_path, *KEEP, "--json"]
+    report = json.loads(run(capsys, *encode))
+    page = (Path(__file__).parents[2] / "docs" / "python.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (`.*?) \|", page.split("## What `encode --json` prints")[1].split("\n## ")[0], re.MULTILINE)
+    heads = re.findall(r"`(\w+)`", " ".join(rows))
+    assert sorted(heads) == sorted(report)

@@ -101,7 +101,8 @@ def test_one_training_view_is_too_few(paths, capsys):
 
 
 def test_encode_with_a_fit(paths, capsys):
-    words = ["encode", paths / "scene.ply", "--cameras", paths / "cameras.json", "--keep", "0.5", "--json"]
+    # Of so few splats a fit mends half of the error, far more than the third that it has to.
+    words = ["encode", paths / "scene.ply", "--cameras", paths / "cameras.json", "--keep", "0.3", "--json"]
     reports = []
     for steps in ("off", "400"):
         out = paths / f"{steps}.potr"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -90,7 +91,7 @@ def test_render_bad_calls(tmp_path, scene_path, cameras_path, capsys):
     fails(capsys, [*render, "--split", "test"], 2, "--split all")
 
 
-def test_compare_from_cameras(tmp_path, scene_path, potr_path, cameras_path, capsys):
+def test_compare_from_cameras(tmp_path, scene_path, potr_path, cameras_path, capsys, monkeypatch):
     both = [scene_path, potr_path, "--cameras", cameras_path]
     report = json.loads(run(capsys, "compare", *both, "--json"))
     assert [view["name"] for view in report["views"]] == ["view_0", "view_4"]  # the test views
@@ -103,7 +104,10 @@ def test_compare_from_cameras(tmp_path, scene_path, potr_path, cameras_path, cap
     assert min(psnrs) > 30
     text = run(capsys, "compare", *both)
     assert f"{np.mean(psnrs):.2f}" in text
-    assert "LPIPS" in text  # its column, or that it is left out
+    assert "LPIPS" not in text
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "lpips", None)
+        fails(capsys, ["compare", *both, "--lpips"], 2, "LPIPS needs", "pip install")
     assert len(json.loads(run(capsys, "compare", *both, "--json", "--split", "all"))["views"]) == 8
     assert json.loads(run(capsys, "compare", *both, "--json", "--views", "2"))["worst_view"] == "view_2"
 

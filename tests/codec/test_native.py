@@ -17,6 +17,7 @@ from potr_cl.codec import bundled_scene, encoder, octree
 from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import PotrFile, decode
 from potr_cl.codec.encoder import code_scene
+from potr_cl.codec.native import library
 from potr_cl.codec.native.functions import Functions
 from potr_cl.codec.native.library import LIBRARY_VARIABLE, VARIABLE, native
 from potr_cl.codec.quantize import HyperParameters
@@ -289,12 +290,15 @@ def test_another_word_than_0_and_1_is_refused(monkeypatch):
         decode(GOLDEN[0])
 
 
-def test_without_the_library(monkeypatch, tmp_path):
-    """NumPy decodes, unless the user insists."""
+def test_without_the_library(monkeypatch, tmp_path, caplog):
+    """NumPy decodes, unless the user insists, and that it takes longer is said once."""
+    library._tell_once.cache_clear()
     monkeypatch.setenv(LIBRARY_VARIABLE, str(tmp_path / "nowhere.so"))
     monkeypatch.delenv(VARIABLE, raising=False)
     assert native() is None
     assert len(decode(GOLDEN[0]))
+    (said,) = (record.getMessage() for record in caplog.records)
+    assert "python -m tools.make.native" in said
     monkeypatch.setenv(VARIABLE, "1")
     with pytest.raises(UsageError, match="compiled library is missing"):
         decode(GOLDEN[0])

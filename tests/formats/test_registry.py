@@ -318,3 +318,12 @@ def test_the_folder_of_a_training_is_refused_with_the_name_of_its_scene(tmp_path
         load_scene(tmp_path)
     inside = [file for file in files if f"give the file in it: '{tmp_path / file}'" in str(caught.value)]
     assert inside == ([] if named is None else [files[named]])
+
+
+@pytest.mark.parametrize(
+    ("file", "export"), [("ckpt_29999_rank0.pt", "gsplat"), ("a.pth", "gsplat"), ("step-000029999.ckpt", "ns-export")]
+)
+def test_checkpoints_of_trainings_are_refused_with_the_way_to_export_them(tmp_path, file, export):
+    (tmp_path / file).write_bytes(b"PK\x03\x04")
+    with pytest.raises(UsageError, match=f"is a checkpoint of a training, not a scene: export it as PLY, .*{export}"):
+        info(tmp_path / file)

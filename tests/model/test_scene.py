@@ -28,7 +28,6 @@ def test_degrees_and_sizes():
         ("opacity_logits", np.zeros((7, 1), np.float32)),
         ("sh", np.zeros((7, 5, 3), np.float32)),
         ("sh", np.zeros((7, 16, 4), np.float32)),
-        ("means", np.zeros((7, 3), np.float64)),
     ],
 )
 def test_arrays_that_do_not_belong_together(name, array):
@@ -143,3 +142,19 @@ def test_without_colours_a_part_of_a_scene_takes_no_memory_for_them():
     assert part.sh.shape == (len(some), 1, 3)
     assert not part.sh.any()
     assert taken < scene.nbytes / 6  # the half of all but the colours, and little else
+
+
+def test_splats_are_selected_and_scenes_compared(plush_excerpt):
+    opaque = plush_excerpt.opacities > 0.5
+    numbers = np.flatnonzero(opaque)
+    assert plush_excerpt[opaque] == plush_excerpt[numbers] == plush_excerpt[numbers.tolist()]
+    assert plush_excerpt[opaque] == plush_excerpt.subset(opaque) != plush_excerpt
+    assert plush_excerpt[:7] == plush_excerpt.subset(np.arange(7))
+    assert plush_excerpt[-1] == plush_excerpt.subset(np.array([len(plush_excerpt) - 1]))
+    assert len(plush_excerpt[[]]) == 0
+    assert plush_excerpt != dataclasses.replace(plush_excerpt, antialiased=True)
+    assert plush_excerpt != "a scene"
+    with pytest.raises(IndexError):
+        plush_excerpt[opaque[:-1]]
+    with pytest.raises(TypeError, match="no sequence of splats"):
+        list(plush_excerpt)

@@ -22,6 +22,7 @@ CONCERNED = {
     "ONE_QUEUE": {"rusticl"},
     "NO_WIDE_VECTORS": {"PoCL 3"},
     "UNKNOWN_CPU": {"PoCL 3", "PoCL 4"},
+    "CRASHES": {"PoCL 3", "PoCL 4"},
     "SHORT_LOOPS": {"rusticl"},
     "SIMULATOR": {"Oclgrind", "FPGA emulation"},
     "SMALL_GROUPS": {"PoCL 3", "PoCL 4"},

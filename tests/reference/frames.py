@@ -8,9 +8,11 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from potr_cl.model.camera import Camera, camera_centres
 from potr_cl.model.quaternions import quaternions_of
@@ -33,6 +35,28 @@ MOTIONS: dict[str, tuple[F64, float, tuple[float, float, float]]] = {
     "shifted by 8 along y": (np.eye(3), 1.0, (0, 8, 0)),
     "scaled by 10": (np.eye(3), 10.0, (0, 0, 0)),
     "scaled by 0.1": (np.eye(3), 0.1, (0, 0, 0)),
+}
+
+
+def _turn(axis: int, degrees: float) -> F64:
+    turn, (i, j) = np.eye(3), [(axis + 1) % 3, (axis + 2) % 3]
+    turn[i, i] = turn[j, j] = math.cos(math.radians(degrees))
+    turn[j, i] = math.sin(math.radians(degrees))
+    turn[i, j] = -turn[j, i]
+    return turn
+
+
+#: What they do by ordinary amounts: photographs and points of a reconstruction find that, and nothing else.
+ORDINARY: dict[str, tuple[F64, float, tuple[float, float, float]]] = {
+    **{f"scaled by {factor:g}": (np.eye(3), factor, (0, 0, 0)) for factor in (0.5, 0.7, 1.5, 2.0, 5.0)},
+    "shifted by 1 along x": (np.eye(3), 1.0, (1, 0, 0)),
+    "shifted by 1 along y": (np.eye(3), 1.0, (0, 1, 0)),
+    "shifted by 3 along x": (np.eye(3), 1.0, (3, 0, 0)),
+    "shifted by 3 along z": (np.eye(3), 1.0, (0, 0, 3)),
+    **{
+        f"turned by {degrees} degrees about {'xyz'[axis]}": (_turn(axis, degrees), 1.0, (0, 0, 0))
+        for axis, degrees in ((2, 10), (0, 10), (1, 20), (2, 30), (0, 45))
+    },
 }
 
 
@@ -79,6 +103,40 @@ def right(scene: Scene, cameras: Sequence[Camera], others: bool = True) -> Itera
         return
     yield "views from inside", from_inside(scene)
     yield "virtual cameras", place_cameras(scene, 40)
+
+
+#: What may have become of photographs whose cameras are right: a function of (H, W, 4) pixels, 0 to 1.
+PHOTOGRAPHS: dict[str, Callable[[F64], F64]] = {
+    "half as bright": lambda pixels: pixels * (0.5, 0.5, 0.5, 1),
+    "overexposed": lambda pixels: np.minimum(pixels * (1.8, 1.8, 1.8, 1), 1),
+    "in warmer light": lambda pixels: np.minimum(pixels * (1.3, 1, 0.7, 1), 1),
+    "over white": lambda pixels: np.dstack([1 - (1 - pixels[..., :3]) * pixels[..., 3:], pixels[..., 3:] ** 0]),
+    "a quarter as large": lambda pixels: pixels[2::4, 2::4],
+    "missing but for three": lambda pixels: pixels,
+}
+
+
+def changed(cameras: Sequence[Camera], which: str, folder: Path) -> list[Camera]:
+    """Cameras whose photographs are those that :data:`PHOTOGRAPHS` makes of their own, written into a folder."""
+    every = max(len(cameras) // 3, 2)
+    result = []
+    for number, camera in enumerate(cameras):
+        path = folder / f"{number}.png"
+        if camera.image_path is None or ("three" in which and number % every != 1):
+            result.append(dataclasses.replace(camera, image_path=None))
+            continue
+        with Image.open(camera.image_path) as image:
+            pixels = np.asarray(image.convert("RGBA"), np.float64) / 255
+        Image.fromarray(np.rint(255 * PHOTOGRAPHS[which](pixels)).astype(np.uint8)).save(path, compress_level=1)
+        result.append(dataclasses.replace(camera, image_path=path))
+    return result
+
+
+def parts(scene: Scene, splats: int, count: int) -> list[Scene]:
+    """Parts that were cut out of a scene: spheres of so many splats around random ones of it."""
+    rng = np.random.default_rng(0)
+    distances = (np.linalg.norm(scene.means - scene.means[rng.integers(len(scene))], axis=1) for _ in range(count))
+    return [scene.subset(np.sort(np.argsort(each, kind="stable")[:splats])) for each in distances]
 
 
 def from_inside(scene: Scene, count: int = 12) -> list[Camera]:

@@ -186,6 +186,14 @@ def test_parts_that_may_be_missing(change):
             assert value in page.text
 
 
+def test_sizes_and_stages_as_people_say_them():
+    report = copy.deepcopy(REPORT) | {"bytes": 196_123}
+    report["options"]["fit"] = {"on": True, "steps": 0, "cycles": 2}
+    text = " ".join(Tags(html_report(report, PAIRS)).text)
+    assert "196.12 kB" in text
+    assert "cycles" not in text
+
+
 def test_views_to_show():
     shown = views_to_show(REPORT["quality"], "right")
     assert [(title, entry["name"]) for title, entry in shown] == [

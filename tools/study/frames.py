@@ -1,13 +1,12 @@
 """Cameras that are not in the scene's frame: which are found, by which margin, and what keeping unseen splats costs.
 
     python -m tools.study.frames judge SCENE SCENE … [--json FILE]
-    python -m tools.study.frames made [--json FILE]
     python -m tools.study.frames unseen SCENE … [--json FILE] [--device DEVICE] [--preset fast]
 
-``judge`` takes two scenes or more (point_cloud.ply and cameras.json in each), moves each in the ways in which scenes
-are moved, and gives it the cameras of the next. It writes by how much the best motion fits better, and how much is
-needed: found is what has more. Right cameras must have less. ``made`` does the same with scenes made by rule
-(:mod:`tests.reference.captures`), for kinds of which no real one is at hand.
+``judge`` takes two scenes or more (point_cloud.ply, cameras.json and images in each, perhaps a COLMAP model in
+sparse/0). It moves each as people do, and judges it by its photographs, by its points, and by neither; then it leaves
+the scenes where they are, and changes photographs and parts of the scene. Last it counts what is found by neither,
+of the same scenes and of such that are made by rule (:mod:`tests.reference.captures`).
 
 ``unseen`` encodes each scene with and without the splats that no training view sees, with all its training views and
 with half of them, those of one side.
@@ -16,83 +15,107 @@ with half of them, those of one side.
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from potr_cl.codec.decoder import decode
+from potr_cl.formats.cameras.points import points_beside
 from potr_cl.model.agreement import judge_cameras
 from potr_cl.model.camera import Camera, camera_centres, test_views, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.quality.evidence import by_photographs, evidence_of
 from potr_cl.quality.metrics import psnr
 from tests.reference.captures import CAPTURES
-from tests.reference.frames import right, without_directions, wrong
-from tools.results import Column, Results, Table
+from tests.reference.frames import ORDINARY, PHOTOGRAPHS, changed, moved, parts, right, without_directions, wrong
+from tools.results import Column, Results
 from tools.workloads import pictures, read
+
+_COLUMNS = (
+    Column("correlation", format=".2f"),
+    Column("by photographs"),
+    Column("contrast", format=".1f"),
+    Column("by points"),
+    Column("by neither"),
+    Column("time", "s", ".2f"),
+)
 
 
 def judge(args: argparse.Namespace) -> None:
-    """Right and wrong cameras of real scenes."""
-    _judge(
-        Results(None, args.json), "real", "Scenes of captures", {folder.name: read(folder) for folder in args.scenes}
-    )
-
-
-def made(args: argparse.Namespace) -> None:
-    """Right and wrong cameras of scenes made by rule."""
-    _judge(Results(None, args.json), "made", "Scenes made by rule", {name: make() for name, make in CAPTURES.items()})
-
-
-def _judge(results: Results, name: str, what: str, scenes: dict[str, tuple[Scene, list[Camera]]]) -> None:
-    columns = (
+    """Scenes that were moved and scenes that were not, by what lies beside their cameras."""
+    results = Results(None, args.json)
+    scenes = {folder: read(folder) for folder in args.scenes}
+    views = {folder: _with_points(folder, train_views(cameras)) for folder, (_, cameras) in scenes.items()}
+    table = results.table("moved", "Scenes that were moved", Column("scene"), Column("motion"), *_COLUMNS)
+    for folder, (scene, _) in scenes.items():
+        for what, motion in ORDINARY.items():
+            table.add(folder.name, what, *_verdicts(moved(scene, *motion), views[folder]))
+    table = results.table("right", "Scenes that were not moved", Column("scene"), Column("what"), *_COLUMNS)
+    for folder, (scene, _) in scenes.items():
+        for what, cameras in right(scene, views[folder], others=False):
+            table.add(folder.name, what, *_verdicts(scene, cameras))
+        table.add(folder.name, "SH degree 0", *_verdicts(without_directions(scene), views[folder]))
+        smooth = dataclasses.replace(scene, antialiased=True)
+        table.add(folder.name, "said to be antialiased", *_verdicts(smooth, views[folder]))
+        for what in PHOTOGRAPHS:
+            with tempfile.TemporaryDirectory() as place:
+                table.add(
+                    folder.name, f"photographs {what}", *_verdicts(scene, changed(views[folder], what, Path(place)))
+                )
+        for splats in (50_000, 10_000, 1_500):
+            for number, part in enumerate(parts(scene, splats, 6)):
+                table.add(folder.name, f"{splats:,} splats of it ({number})", *_verdicts(part, views[folder]))
+    table = results.table(
+        "blind",
+        "Without photographs and points: frames that are refused",
         Column("scene"),
         Column("SH degree"),
-        Column("cameras"),
-        Column("gain", format="+.2f"),
-        Column("needed", format=".2f"),
-        Column("time", "s", ".2f"),
-        Column("verdict"),
-        Column("said"),
+        Column("wrong ones"),
+        Column("of them taken"),
+        Column("right ones"),
     )
-    views = {folder: train_views(cameras) for folder, (_, cameras) in scenes.items()}
-    names = list(scenes)
-    table = results.table(f"{name}_right", f"{what}: cameras in the scene's frame", *columns)
-    for folder, scene in _of_both_degrees(scenes):
-        for which, cameras in right(scene, views[folder], others=name == "real"):
-            _add(table, folder, which, scene, cameras)
-    table = results.table(f"{name}_wrong", f"{what}: cameras in another frame", *columns)
-    for folder, scene in _of_both_degrees(scenes):
-        other = names[(names.index(folder) + 1) % len(names)]
-        for which, moved, cameras in wrong(scene, views[folder], views[other]):
-            _add(table, folder, which, moved, cameras)
+    blind = {folder.name: (scene, _bare(views[folder])) for folder, (scene, _) in scenes.items()}
+    blind |= {name: (scene, train_views(cameras)) for name, (scene, cameras) in ((n, m()) for n, m in CAPTURES.items())}
+    names = list(blind)
+    for name, (scene, cameras) in blind.items():
+        other = blind[names[(names.index(name) + 1) % len(names)]][1]
+        for one in (scene, without_directions(scene)):
+            bad = {what: judge_cameras(each, seen).suspicious for what, each, seen in wrong(one, cameras, other)}
+            good = [judge_cameras(one, each).suspicious for _, each in right(one, cameras, others=False)]
+            taken = ", ".join(what for what, refused in bad.items() if not refused)
+            table.add(name, one.sh_degree, f"{sum(bad.values())} of {len(bad)}", taken, f"{sum(good)} of {len(good)}")
 
 
-def _of_both_degrees(scenes: dict[str, tuple[Scene, list[Camera]]]) -> Iterator[tuple[str, Scene]]:
-    for folder, (scene, _) in scenes.items():
-        yield folder, scene
-        yield folder, without_directions(scene)
+def _with_points(folder: Path, cameras: list[Camera]) -> list[Camera]:
+    points = points_beside(folder / "sparse" / "0", "points3D.bin")
+    return [dataclasses.replace(camera, points_path=points) for camera in cameras]
 
 
-def _add(table: Table, name: str, what: str, scene: Scene, cameras: list[Camera]) -> None:
+def _bare(cameras: Sequence[Camera]) -> list[Camera]:
+    return [dataclasses.replace(camera, image_path=None, points_path=None) for camera in cameras]
+
+
+def _verdicts(scene: Scene, cameras: Sequence[Camera]) -> list[float | str | None]:
+    """What is measured and decided by photographs, by points, and by neither, and the time that an encode takes."""
     began = time.process_time()
-    judged = judge_cameras(scene, cameras)
+    judge_cameras(scene, cameras, evidence_of(scene, cameras))
     seconds = time.process_time() - began
-    tried = judged.motion is not None
-    table.add(
-        name,
-        scene.sh_degree,
-        what,
-        judged.gain if tried else None,
-        judged.needed if tried else None,
-        seconds,
-        "refused" if judged.suspicious else "taken",
-        judged.motion.name if judged.motion is not None and judged.suspicious else "",
-    )
+    cells: list[float | str | None] = []
+    without = [dataclasses.replace(camera, image_path=None) for camera in cameras]
+    for found in (by_photographs(scene, [c for c in cameras if c.image_path]), evidence_of(scene, without)):
+        agreed = judge_cameras(scene, cameras, found)
+        verdict = "refused" if agreed.suspicious else "taken"
+        if found is not None and found.agrees is None and found.text:
+            verdict = "warned of"
+        cells += [None, None] if found is None else [found.measured, verdict]
+    return [*cells, "refused" if judge_cameras(scene, cameras).suspicious else "taken", seconds]
 
 
 def unseen(args: argparse.Namespace) -> None:
@@ -134,10 +157,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
-    for name, work in (("judge", judge), ("made", made), ("unseen", unseen)):
+    for name, work in (("judge", judge), ("unseen", unseen)):
         command = commands.add_parser(name)
-        if work is not made:
-            command.add_argument("scenes", nargs="+", type=Path, metavar="SCENE")
+        command.add_argument("scenes", nargs="+", type=Path, metavar="SCENE")
         command.add_argument("--json", type=Path, help="also keep the results here")
         command.set_defaults(run=work)
     command.add_argument("--device", help="as for potr-cl")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.machinery
+import logging
 import os
 import sys
 from functools import lru_cache
@@ -10,6 +11,8 @@ from pathlib import Path
 
 from potr_cl.codec.native.functions import Functions
 from potr_cl.errors import UsageError
+
+_log = logging.getLogger("potr_cl")
 
 #: The environment variable: "0" takes NumPy always, "1" refuses to go on without the library.
 VARIABLE = "POTR_CL_NATIVE"
@@ -33,6 +36,8 @@ def native() -> Functions | None:
     if asked == "0":
         return None
     functions = _loaded(os.environ.get(LIBRARY_VARIABLE) or _found())
+    if functions is None and not asked:
+        _tell_once()
     if functions is None and asked == "1":
         raise UsageError(
             f"{VARIABLE} is 1, but the compiled library is missing: unset it, or install potr_cl with a C compiler"
@@ -43,6 +48,15 @@ def native() -> Functions | None:
 def vectors() -> bool:
     """Whether the library may use vectors of 512 bits, where the processor has them."""
     return os.environ.get(VECTORS_VARIABLE) != "0"
+
+
+@lru_cache(maxsize=1)
+def _tell_once() -> None:
+    _log.warning(
+        "the compiled codec is missing, so NumPy does its work, several times slower: in a clone run `python -m "
+        "tools.make.native`, else install potr_cl with a C compiler; %s=0 says that this is wanted",
+        VARIABLE,
+    )
 
 
 _paths: list[str] = []

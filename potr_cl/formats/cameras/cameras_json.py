@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from potr_cl.errors import DataError
+from potr_cl.formats.cameras.points import points_beside
 from potr_cl.formats.cameras.view_files import (
     IMAGE_SUFFIXES,
     camera_of,
@@ -60,9 +61,10 @@ def parse(content: Any, path: Path) -> list[Camera]:
         raise DataError(f"'{path}' holds no view")
     files = [image_name(view.get("img_name"), f"'{path}', view {i}: 'img_name'") for i, view in enumerate(content)]
     ground_truth = {stem(image.name): image for image in _images_beside(path)}
+    points = points_beside(path.parent, "input.ply")
     marked = any("split" in view for view in content)
     return [
-        _camera(view, name, path, ground_truth.get(Path(stem(file)).name), marked)
+        _camera(view, name, path, ground_truth.get(Path(stem(file)).name), points, marked)
         for view, name, file in zip(content, _names(files, path), files, strict=True)
     ]
 
@@ -79,7 +81,9 @@ FORMAT = CameraFormat(
 )
 
 
-def _camera(view: dict[str, Any], name: str, path: Path, ground_truth: Path | None, marked: bool) -> Camera:
+def _camera(
+    view: dict[str, Any], name: str, path: Path, ground_truth: Path | None, points: Path | None, marked: bool
+) -> Camera:
     where = f"'{path}', view '{name}'"
     for key in ("width", "height", "fx", "fy", "rotation", "position", *(["split"] if marked else [])):
         if key not in view:
@@ -103,6 +107,7 @@ def _camera(view: dict[str, Any], name: str, path: Path, ground_truth: Path | No
         translation=-rotation @ matrix(view["position"], [(3,)], f"{where}: 'position'"),
         split=split,
         image_path=ground_truth,
+        points_path=points,
     )
 
 

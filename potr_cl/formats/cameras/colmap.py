@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import DataError
+from potr_cl.formats.cameras.points import points_beside
 from potr_cl.formats.cameras.view_files import (
     camera_of,
     every_eighth,
@@ -130,9 +131,9 @@ def load(folder: Path) -> list[Camera]:
         if image.lens not in lenses:
             raise DataError(f"'{folder}' is a damaged COLMAP model: image {image.number} has an unknown camera")
     files = [image_name(image.name, f"'{path}': the name of image {image.number}") for image in images]
-    ground_truth = _ground_truth(folder)
+    ground_truth, points = _ground_truth(folder), points_beside(folder, "points3D.bin", "points3D.txt")
     cameras = [
-        _camera(path, image, lenses[image.lens], name, split, ground_truth / file if ground_truth else None)
+        _camera(path, image, lenses[image.lens], name, split, ground_truth / file if ground_truth else None, points)
         for image, name, file, split in zip(images, view_names(files, path), files, every_eighth(files), strict=True)
     ]
     tell_of_lenses(folder, cameras)
@@ -152,7 +153,9 @@ FORMAT = CameraFormat(
 )
 
 
-def _camera(path: Path, image: _Image, lens: _Lens, name: str, split: str, ground_truth: Path | None) -> Camera:
+def _camera(
+    path: Path, image: _Image, lens: _Lens, name: str, split: str, ground_truth: Path | None, points: Path | None
+) -> Camera:
     if not abs(math.hypot(*image.rotation) - 1) < 1e-3:
         raise DataError(f"'{path}', view '{name}': its rotation is not a unit quaternion")
     return camera_of(
@@ -163,6 +166,7 @@ def _camera(path: Path, image: _Image, lens: _Lens, name: str, split: str, groun
         translation=np.array(image.translation),
         split=split,
         image_path=ground_truth if ground_truth and os.path.isfile(ground_truth) else None,
+        points_path=points,
     )
 
 
