@@ -19,7 +19,6 @@ from potr_cl.api.inputs import (
     on_device,
     scene_of,
 )
-from potr_cl.codec.blocks.file import BlockedFile
 from potr_cl.codec.decoder import decode as decode_file
 from potr_cl.codec.decoder import open_file
 from potr_cl.errors import DataError, UsageError
@@ -171,13 +170,13 @@ def decode_block_by_block(
     if suffix_of_name(Path(output)) != ".ply":
         return None
     opened = open_file(file, trust)
-    if not isinstance(opened, BlockedFile):
+    if len(opened.blocks) == 1:
         return None
     try:
-        ply.save_parts(output, opened.parts(sh_degree=sh_degree), opened.table.splats)
+        ply.save_parts(output, opened.parts(sh_degree=sh_degree), opened.header.splats)
     except DataError as error:
         raise DataError(f"'{os.fspath(file)}': {error}") from None
-    return opened.table.splats
+    return opened.header.splats
 
 
 def decode_to_device(

@@ -31,8 +31,7 @@ class Code(Stage):
         EntropyCoder.name,
         Flag(
             "--entropy",
-            "context: smallest, not for preset paper; zstd: decodes fastest; npz: deflate, as NumPy's compressed files "
-            "use",
+            "bundles: smallest, not for preset paper; zstd: for readers that have nothing but a zstd library",
             choices=ENTROPY_CODERS,
             default="the preset's",
         ),

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from potr_cl.codec import quantize
 from potr_cl.codec.blocks.splitting import MOST_WHOLE, blocks_of
 from potr_cl.codec.geometry import Geometry, distances_to_views, quantise_geometry, quantise_in_world_units, undecoded
+from potr_cl.codec.quantisers import QUANTISERS
 from potr_cl.codec.steps.fitting import fit_steps_of_blocks
-from potr_cl.codec.versions import VERSIONS
 from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
@@ -92,17 +92,17 @@ def quantise(
     Raises:
         As :func:`potr_cl.codec.geometry.quantise_geometry`.
     """
-    if rows is None and in_blocks(len(scene), parameters):
+    if rows is None and in_blocks(len(scene)):
         rows = blocks_of(scene.means, run=run)
     if rows is None:
         return quantise_geometry(scene, parameters, views, run)
     nearest = distances_to_views(scene.means, views, run)
-    world = VERSIONS[parameters.version].in_world_units(parameters, scene, nearest, run)
+    world = QUANTISERS[parameters.quantiser].in_world_units(parameters, scene, nearest, run)
 
     blocks = quantise_in_world_units(scene, rows, parameters, world, nearest, run)
     return GeometryOfBlocks(parameters, world, tuple(rows), tuple(blocks))
 
 
-def in_blocks(splats: int, parameters: quantize.HyperParameters) -> bool:
+def in_blocks(splats: int) -> bool:
     """Whether a scene of so many splats is cut into blocks."""
-    return VERSIONS[parameters.version].in_blocks and splats > MOST_WHOLE
+    return splats > MOST_WHOLE

@@ -1,6 +1,6 @@
-"""The values of files of coder BUNDLES, bundle by bundle: :class:`BundledScene`.
+"""The values of a block, bundle by bundle: :class:`BlockValues`.
 
-Threads share the bundles out. Integers of a bundle become values while they are in a cache.
+Threads share the bundles out. By the native path integers of a bundle become values while they are in a cache.
 """
 
 from __future__ import annotations
@@ -14,31 +14,25 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec import container
+from potr_cl.codec import container, dequantizer
 from potr_cl.codec.bundles.decoder import Reader, Wanted, check_said
 from potr_cl.codec.bundles.layout import BUNDLE
-from potr_cl.codec.bundles.levels import joined
-from potr_cl.codec.bundles.sections import MAIN, Key
-from potr_cl.codec.colour_factors import ColourFactors
-from potr_cl.codec.container import Header
-from potr_cl.codec.context.tokens import largest_integer
-from potr_cl.codec.dequantizer import Dequantizer
+from potr_cl.codec.bundles.sections import MAIN
+from potr_cl.codec.bundles.tokens import largest_integer
+from potr_cl.codec.container import Block
 from potr_cl.codec.native.bundles import BEYOND_TABLE
 from potr_cl.codec.native.library import native
-from potr_cl.codec.native.values import PackedValues, Tables, ValueArrays
+from potr_cl.codec.native.values import Tables, ValueArrays
+from potr_cl.codec.sections import Property
 from potr_cl.codec.steps import prediction
 from potr_cl.codec.steps.rule import CLASSES, ColourSteps, factors
-from potr_cl.codec.versions import VERSIONS
 from potr_cl.errors import DataError
-from potr_cl.host.threads import thread_pool
 
 if TYPE_CHECKING:
-    from potr_cl.codec.destination import Activation, BundleTaker, Destination
+    from potr_cl.codec.destination import Activation, BundleTaker
 
 #: Bundles that NumPy decodes side by side.
 _SIDE_BY_SIDE = 32
-#: Bundles whose integers a thread joins at a time.
-_HANDED = 4
 #: Bundles for each thread, so that one more pays.
 _BUNDLES_A_THREAD = 2
 #: Bundles that may wait to be taken, beside those that threads are packing.
@@ -50,19 +44,19 @@ _TABLE = 1 << 16
 
 
 @dataclass(frozen=True)
-class BundledScene:
-    """A file's splats.
+class BlockValues:
+    """A block's splats but for their centres.
 
     Attributes:
-        header: verified.
-        data: the whole file.
+        block: verified.
+        data: its bytes, of those sections at least that are asked for.
         open_steps: gives the steps of its colours.
         activation: what is stored instead of logarithms of scales and logits of opacities; None: these.
         checked: whether sections are compared with their checksums when they are opened.
     """
 
-    header: Header
-    data: bytes
+    block: Block
+    data: bytes | memoryview
     open_steps: Callable[[], ColourSteps | None]
     activation: Activation | None = None
     checked: bool = True
@@ -70,12 +64,12 @@ class BundledScene:
     @cached_property
     def reader(self) -> Reader:
         """Of the integers."""
-        return Reader(self.header.splats, self._stored, self.open_steps)
+        return Reader(self.block.splats, self._stored, self.open_steps)
 
-    def _stored(self, key: Key) -> tuple[memoryview, str] | None:
-        section = self.header.find(*key)
+    def _stored(self, key: Property) -> tuple[memoryview, str] | None:
+        section = self.block.find(key)
         open_bytes = container.stored_bytes if self.checked else container.unchecked_bytes
-        return None if section is None else (open_bytes(self.data, section), section.name)
+        return None if section is None else (open_bytes(self.data, section), section.title)
 
     def fill(self, arrays: ValueArrays, threads: int = 1, beside: Callable[[], None] | None = None) -> None:
         """Fill some arrays; sections of others are not looked at.
@@ -89,10 +83,10 @@ class BundledScene:
             DataError: damaged; and what ``beside`` raises.
         """
         wanted = self._wanted(arrays)
-        number = -(-self.header.splats // BUNDLE)
+        number = -(-self.block.splats // BUNDLE)
         helpers = min(threads, max(number // _BUNDLES_A_THREAD, 2)) - 1
 
-        def work(scene: BundledScene, helpers: _Helpers) -> None:
+        def work(scene: BlockValues, helpers: _Helpers) -> None:
             file, share = scene.reader.bundled_file(wanted), helpers.share
             if file is None or share is None:
                 scene._side_by_side(lambda bundles: scene._by_numpy(bundles, wanted, arrays))
@@ -123,11 +117,11 @@ class BundledScene:
             DataError: damaged; what ``means`` and the destination raise.
         """
         wanted = self._wanted_of(sh_count, True)
-        number = -(-self.header.splats // BUNDLE)
+        number = -(-self.block.splats // BUNDLE)
         threads = max(1, min(threads, -(-number // _BUNDLES_A_THREAD)))
         destination.expect_bundles()
 
-        def work(scene: BundledScene, helpers: _Helpers) -> None:
+        def work(scene: BlockValues, helpers: _Helpers) -> None:
             file, share = scene.reader.bundled_file(wanted), helpers.share
             taken = False
             if file is None or share is None:
@@ -155,15 +149,15 @@ class BundledScene:
         threads: int,
         wanted: Wanted,
         beside: Callable[[], Any] | None,
-        work: Callable[[BundledScene, _Helpers], None],
+        work: Callable[[BlockValues, _Helpers], None],
     ) -> None:
         """Do a work with the help of threads, of which some look after the checksums of large files meanwhile."""
-        bundles = -(-self.header.splats // BUNDLE)
+        bundles = -(-self.block.splats // BUNDLE)
         if threads < 2 or len(self.data) < _LARGE or native() is None:
             with _Helpers(bundles, threads, beside) as helpers:
                 work(self, helpers)
             return
-        found = [section for key in wanted.keys if (section := self.header.find(*key)) is not None]
+        found = [section for key in wanted.keys if (section := self.block.find(key)) is not None]
         checks = [partial(container.is_sound, self.data, section) for section in found]
         try:
             with _Helpers(bundles, threads, beside, checks) as helpers:
@@ -181,52 +175,25 @@ class BundledScene:
         for first in range(0, number, _SIDE_BY_SIDE):
             do(range(first, min(first + _SIDE_BY_SIDE, number)))
 
-    def hand_to(self, destination: Destination, sh_count: int, threads: int) -> None:
-        """Hand all integers but those of the centres to a destination, with so many SH coefficients of a channel.
-
-        Raises:
-            DataError: damaged.
-        """
-        wanted = self._wanted_of(sh_count, True)
-        native = self.reader.bundled_file(wanted) is not None
-        number, at_once = self.reader.bundles.number, _HANDED if native else _SIDE_BY_SIDE
-        with thread_pool(threads if native else 1) as pool:
-            parts = pool.map(
-                lambda first: self.reader.levels(first, min(first + at_once, number), wanted),
-                range(0, number, at_once),
-            )
-            levels = joined(list(parts))
-        scales = [LevelStream(level, False) for level in levels.scales or []]
-        opacities = LevelStream(levels.opacities if levels.opacities is not None else np.zeros(0), False)
-        fitting = ColourFactors.of(self.header, self.reader.steps, lambda: [*scales], lambda: opacities)
-        destination.take_scales(scales)
-        destination.take_rotations([LevelStream(level, True) for level in levels.rotations or []], scales)
-        destination.take_opacities(opacities)
-        destination.take_colours([LevelStream(level, True) for level in levels.dc or []], 0, False, fitting)
-        for coefficient in range(1, sh_count):
-            planes = levels.coefficient(coefficient)
-            destination.take_colours([LevelStream(level, True) for level in planes], coefficient, False, fitting)
-
     @cached_property
     def tables(self) -> Tables:
         """What makes values of levels."""
-        header, activation = self.header, self.activation
-        version = VERSIONS[header.version]
+        block, activation = self.block, self.activation
         levels = np.arange(self._largest_level(MAIN[1]) + 1)
         classes = np.arange(-CLASSES, CLASSES).astype(np.int8)
-        scales = version.dequantize_scales(levels, header.sf_scale)
-        opacities = version.dequantize_opacities(np.arange(self._largest_level(MAIN[0]) + 1), header.sf_opacity)
+        scales = block.rules.dequantize_scales(levels, block.sf_scale)
+        opacities = block.rules.dequantize_opacities(np.arange(self._largest_level(MAIN[0]) + 1), block.sf_opacity)
         return Tables(
             scales if activation is None else activation.scales(scales),
             opacities if activation is None else activation.opacities(opacities),
-            factors(header.sf_dc, classes),
-            factors(header.sf_ac, classes),
+            factors(block.sf_dc, classes),
+            factors(block.sf_ac, classes),
             *prediction.tables(),
-            header.sf_rotation,
+            block.sf_rotation,
             activation is not None,
         )
 
-    def _largest_level(self, key: Key) -> int:
+    def _largest_level(self, key: Property) -> int:
         """Of a section, or the largest that is looked up."""
         section = self.reader.section(key)
         alphabets = [fitted.alphabet for fitted in section.streams] if section is not None else [1]
@@ -244,20 +211,9 @@ class BundledScene:
         return False
 
     def _pack_by_numpy(self, destination: BundleTaker, sh_count: int, wanted: Wanted, bundles: range) -> None:
-        start, stop = bundles.start * BUNDLE, min(bundles.stop * BUNDLE, self.header.splats)
-        n = stop - start
-        arrays = ValueArrays(
-            np.empty((n, 3), np.float32),
-            np.empty((n, 4), np.float32),
-            np.empty(n, np.float32),
-            np.empty((sh_count, 3, n), np.float32),
-            begin=start,
+        dequantizer.pack(
+            destination, self.block, sh_count, bundles, lambda arrays: self._by_numpy(bundles, wanted, arrays)
         )
-        self._by_numpy(bundles, wanted, arrays)
-        packed = PackedValues()
-        for first in range(start, stop, BUNDLE):
-            items = packed.take(arrays.part(first, min(first + BUNDLE, stop)))
-            destination.take_bundle(first, packed, items)
 
     def _by_numpy(self, bundles: range, wanted: Wanted, arrays: ValueArrays) -> None:
         """Fill arrays with the values of some bundles, which are decoded side by side.
@@ -265,18 +221,8 @@ class BundledScene:
         Raises:
             DataError: damaged.
         """
-        header, activation = self.header, self.activation
         levels = self.reader.levels(bundles.start, bundles.stop, wanted)
-        Dequantizer(header, VERSIONS[header.version]).of_levels(levels, self.reader.steps, arrays)
-        own = arrays.part(levels.start, levels.stop)
-        if activation is None:
-            return
-        if own.log_scales is not None:
-            own.log_scales[...] = activation.scales(own.log_scales)
-        if own.logits is not None:
-            own.logits[...] = activation.opacities(own.logits)
-        if own.quaternions is not None:
-            own.quaternions[...] = activation.rotations(own.quaternions)
+        dequantizer.fill(arrays, self.block, levels, self.reader.steps, self.activation)
 
     def _wanted(self, arrays: ValueArrays) -> Wanted:
         rotations = arrays.quaternions is not None
@@ -287,39 +233,7 @@ class BundledScene:
     def _wanted_of(self, sh_count: int, rotations: bool) -> Wanted:
         degree = round(sh_count**0.5) - 1
         # To the end of the chain where all is asked for: so its end is checked.
-        return Wanted(len(MAIN) if degree == self.header.sh_degree else 3 + degree, rotations)
-
-
-@dataclass(frozen=True)
-class LevelStream:
-    """Levels as a stream of integers.
-
-    Attributes:
-        levels: (n,) of any type.
-        signed: whether they may be negative.
-    """
-
-    levels: NDArray[Any]
-    signed: bool
-
-    def part(self, start: int, stop: int) -> NDArray[np.integer]:
-        """Those from one splat to another."""
-        return self.levels[start:stop]
-
-    @cached_property
-    def joined(self) -> NDArray[Any]:
-        """All of them: uint8, mapped to unsigned, where they are that small; else 32 or 64 bits each."""
-        least, largest = int(self.levels.min()), int(self.levels.max())
-        if not self.signed:
-            return self.levels.astype(np.uint8 if largest < 1 << 8 else _wide(largest), copy=False)
-        if least >= -(1 << 7) and largest < 1 << 7:
-            narrow = self.levels.astype(np.int8)
-            return ((narrow << 1) ^ (narrow >> 7)).view(np.uint8)
-        return self.levels.astype(_wide(max(largest, -least)), copy=False)
-
-
-def _wide(largest: int) -> type[np.generic]:
-    return np.int32 if largest < 1 << 29 else np.int64
+        return Wanted(len(MAIN) if degree == self.block.sh_degree else 3 + degree, rotations)
 
 
 class _Helpers:

@@ -1,11 +1,9 @@
-"""The versions of the file format, one class each: :data:`VERSIONS`.
+"""The quantisers that a file can have been made with, one class each: :data:`QUANTISERS`.
 
-A version says what integers are made of a scene's values and what values are made of the integers again: widths of
-steps, rotations, opacities, the octree's leaf levels; and what its files may hold. Everything else that reads or writes
-files asks the version and never compares its number. docs/format.md is the normative description.
-
-To add a version: a subclass of :class:`FormatVersion` with what differs, and a line in :data:`VERSIONS`. Which version
-is written follows from the hyper-parameters (:class:`potr_cl.codec.quantize.HyperParameters`).
+A quantiser says what integers are made of a scene's values and what values are made of the integers again: widths of
+steps, rotations, opacities, the octree's leaf levels. Everything else that reads or writes files asks it and never
+compares its number. docs/format.md is the normative description. Which one is taken follows from the hyper-parameters
+(:class:`potr_cl.codec.quantize.HyperParameters`).
 """
 
 from __future__ import annotations
@@ -21,63 +19,29 @@ from numpy.typing import NDArray
 from potr_cl.codec import quantize
 from potr_cl.codec.median import median
 from potr_cl.codec.quantize import F32, F64, HyperParameters, Integers
-from potr_cl.codec.sections import Coder
-from potr_cl.errors import UsageError
 from potr_cl.host.threads import Run
 from potr_cl.model.scene import Scene
 
 Levels = NDArray[np.integer]
 
-#: How many times as many steps the scales of antialiased scenes have, in version 2 and after.
+#: How many times as many steps the scales of antialiased scenes have, with :class:`Balanced`.
 ANTIALIASED_SCALE_STEPS = 2
 
 
-class FormatVersion(abc.ABC):
-    """What sets a version of the format apart. Defaults are what all versions have in common so far.
+class Quantiser(abc.ABC):
+    """What sets a quantiser apart.
 
     Attributes:
         number: that stands in the file.
-        coders: that its sections may be stored by; the entropy coder "context" means the one of streams that there is,
-            zstd where there is none.
-        separate_ac_factor: whether the header has a scale factor of AC coefficients beside that of DC.
-        absolute_leaf_levels: whether tail lengths are levels of the octree, chosen by the tolerance alone
-            (``absolute`` of :func:`potr_cl.codec.octree.build`).
-        rotations_need_scales: whether rotations can be dequantised only with the levels of the scales at hand.
-        colour_steps: whether a file may give each splat the steps of its colours (:mod:`potr_cl.codec.steps`), so that
-            colours are dequantised with the levels of scales and opacities at hand, and predicted as values.
-        in_blocks: whether scenes of many splats are cut into blocks, and the blocks of a file of blocks are of it
-            (:mod:`potr_cl.codec.blocks`).
+        absolute_leaf_levels: whether the levels of leaves are chosen by the tolerance alone (``absolute`` of
+            :func:`potr_cl.codec.octree.build`).
+        colour_steps: whether a file may give each splat the steps of its colours (:mod:`potr_cl.codec.steps`); and
+            whether coder BUNDLES is for it.
     """
 
     number: ClassVar[int]
-    coders: ClassVar[frozenset[Coder]]
-    separate_ac_factor: ClassVar[bool]
     absolute_leaf_levels: ClassVar[bool]
-    rotations_need_scales: ClassVar[bool]
-    colour_steps: ClassVar[bool] = False
-    in_blocks: ClassVar[bool] = False
-
-    @property
-    def coder_of_streams(self) -> Coder | None:
-        """What the entropy coder "context" means."""
-        return next((coder for coder in self.coders if coder.of_streams), None)
-
-    def check(self, parameters: HyperParameters) -> None:
-        """Refuse hyper-parameters that a file of this version cannot tell its decoder.
-
-        Raises:
-            UsageError: there are such.
-        """
-        if not self.separate_ac_factor and parameters.sf_dc != parameters.sf_sh:
-            raise UsageError(
-                f"the scale factors of DC and AC are {parameters.sf_dc:g} and {parameters.sf_sh:g}, but files of "
-                f"version {self.number} (preset paper) have one for both: set both alike or choose another preset"
-            )
-
-    def quantises_splats_as(self, other: type[FormatVersion]) -> bool:
-        """Whether scales, rotations and opacities become the same levels as in another version."""
-        names = ("quantize_scales", "quantize_rotations", "quantize_opacities")
-        return all(getattr(type(self), name) is getattr(other, name) for name in names)
+    colour_steps: ClassVar[bool]
 
     @abc.abstractmethod
     def in_world_units(
@@ -111,7 +75,7 @@ class FormatVersion(abc.ABC):
         """Scale factors of the rotations of some splats, for :func:`potr_cl.codec.quantize.dequantize_rotations`.
 
         Args:
-            scales: levels of the scales, (N,) for each axis; may be empty unless ``rotations_need_scales``.
+            scales: levels of the scales, (N,) for each axis.
             sf_rotation: scale factor.
 
         Returns:
@@ -127,14 +91,12 @@ class FormatVersion(abc.ABC):
         """(N,) levels to logits of opacities."""
 
 
-class Version1(FormatVersion):
-    """The paper's quantiser: uniform steps of every activated value, lengths in world units."""
+class Paper(Quantiser):
+    """The paper's: uniform steps of every activated value, lengths in world units."""
 
-    number = 1
-    coders = frozenset({Coder.RAW, Coder.ZSTD, Coder.DEFLATE})
-    separate_ac_factor = False
+    number = 0
     absolute_leaf_levels = False
-    rotations_need_scales = False
+    colour_steps = False
 
     def in_world_units(
         self, parameters: HyperParameters, scene: Scene, nearest: F64, run: Run = map
@@ -156,14 +118,12 @@ class Version1(FormatVersion):
         return quantize.dequantize_opacities(levels, sf_opacity)
 
 
-class Version2(FormatVersion):
+class Balanced(Quantiser):
     """Steps of equal worth: finer rotations for longer splats, opacities as logits, lengths in sizes of a splat."""
 
-    number = 2
-    coders = frozenset({Coder.RAW, Coder.ZSTD, Coder.DEFLATE, Coder.CONTEXT})
-    separate_ac_factor = True
+    number = 1
     absolute_leaf_levels = True
-    rotations_need_scales = True
+    colour_steps = True
 
     def in_world_units(
         self, parameters: HyperParameters, scene: Scene, nearest: F64, run: Run = map
@@ -214,25 +174,9 @@ class Version2(FormatVersion):
         return quantize.dequantize_logits(levels, sf_opacity)
 
 
-class Version3(Version2):
-    """Bundles of splats that are decoded side by side, and steps of colours that fit each splat.
-
-    Geometry is quantised as in version 2.
-    """
-
-    number = 3
-    coders = frozenset({Coder.RAW, Coder.ZSTD, Coder.DEFLATE, Coder.BUNDLES})
-    colour_steps = True
-    in_blocks = True
-
-
 #: Splats worked on at a time.
 _ROWS = 1 << 15
 
 
-#: All versions that are read, by their number.
-VERSIONS: dict[int, FormatVersion] = {
-    1: Version1(),
-    2: Version2(),
-    3: Version3(),
-}
+#: All of them, by their number.
+QUANTISERS: dict[int, Quantiser] = {quantiser.number: quantiser for quantiser in (Paper(), Balanced())}
