@@ -62,12 +62,17 @@ class Body:
             tails=self._raw(Property.TAIL),
         )
         means = octree.parse(tree, block.splats, run, parts)
-        low, high = np.array(block.box.low, np.float32), np.array(block.box.high, np.float32)
-        for start in range(0, len(means), _ROWS):
-            some = means[start : start + _ROWS]
-            if not ((some >= low).all() and (some <= high).all()):
-                raise DataError("centres lie outside of the block's box: get the file again")
+        self._check_box(means)
         return means
+
+    def _check_box(self, means: NDArray[np.float32]) -> None:
+        # As one row of numbers: of rows of three each would cost a call.
+        box, flat = self.block.box, means.reshape(-1)
+        low, high = (np.tile(np.array(corner, np.float32), _ROWS) for corner in (box.low, box.high))
+        for start in range(0, len(flat), len(low)):
+            some = flat[start : start + len(low)]
+            if not ((some >= low[: len(some)]).all() and (some <= high[: len(some)]).all()):
+                raise DataError("centres lie outside of the block's box: get the file again")
 
     def log_scales(self) -> NDArray[np.float32]:
         """(N, 3) float32 natural logarithms of standard deviations. Raises DataError if damaged."""
