@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from potr_cl.codec.bundles.model import (
     KNOWN_RECENT,
+    KNOWN_TOKENS,
     MOST_CONTEXTS,
     Model,
     inflate,
@@ -52,7 +53,7 @@ class Fitted:
         """What a stream has of which nothing is stored."""
         numbers = np.zeros(stream.weights, np.int64)
         numbers[len(stream.terms)] = KNOWN_RECENT
-        return Fitted(stream, numbers, known_model(stream.most_tokens), known=True)
+        return Fitted(stream, numbers, known_model(min(stream.most_tokens, KNOWN_TOKENS)), known=True)
 
     @property
     def terms(self) -> I64:

@@ -44,7 +44,7 @@ def encode(
         The stored bytes of each section; None if an integer is too large.
     """
     functions = native()
-    arrays = None if functions is None else narrow(values, run)
+    arrays = narrow(values, run)
 
     def coded(known: frozenset[Property]) -> dict[Property, bytes] | None:
         if functions is not None and arrays is not None:
@@ -52,7 +52,7 @@ def encode(
         return _encode(values, classes, known)
 
     fitted = coded(frozenset())
-    if fitted is None or len(classes) >= _FEW:
+    if fitted is None or arrays is None or len(classes) >= _FEW:
         return fitted
     # What is fitted to few splats may weigh more than it saves.
     without = coded(frozenset(values))

@@ -23,9 +23,9 @@ LARGEST_SIZE = 255
 #: A stream has at most so many contexts.
 MOST_CONTEXTS = 32
 
-#: Of what decoders know: the weight of the recent sizes; expected sizes of a context; 64 times what the first two
-#: contexts have for c; the largest integer that counts.
-KNOWN_RECENT = 28
+#: Of what decoders know: the weight of the recent sizes, and the most tokens, those of integers below 2^29; expected
+#: sizes of a context; 64 times what the first two contexts have for c; the largest integer that counts.
+KNOWN_RECENT, KNOWN_TOKENS = 28, 216
 _KNOWN_SIZES, _KNOWN_ROOTS, _FARTHEST = 8, (4096, 5793), 1 << 20
 
 
