@@ -25,7 +25,7 @@ import numpy as np
 
 from potr_cl.codec import octree
 from potr_cl.codec.container import EntropyCoder
-from potr_cl.codec.decoder import PotrFile
+from potr_cl.codec.decoder import open_file
 from potr_cl.codec.quantize import Preset
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.formats.scenes import ply
@@ -81,17 +81,17 @@ def _child(part: str, *arguments: object) -> dict[str, Any]:
 def _child_decode(path: str) -> dict[str, Any]:
     """Peak memory of one decode, and decode times with one and all threads."""
     peak = _Peak()
-    scene = PotrFile.open(path).scene()
+    scene = open_file(path).scene()
     growth = peak.growth()
     arrays = scene.nbytes
     del scene
-    file = PotrFile.open(path)
+    file = open_file(path)
     return {
         "growth": growth,
         "arrays": arrays,
         "splats": file.header.splats,
-        "all": _times(lambda: PotrFile.open(path).scene(), 9),
-        "one": _times(lambda: PotrFile.open(path).scene(threads=1), 5),
+        "all": _times(lambda: open_file(path).scene(), 9),
+        "one": _times(lambda: open_file(path).scene(threads=1), 5),
         "parts": {
             name: statistics.median(_times(getattr(file, name), 5))
             for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh")
@@ -101,7 +101,7 @@ def _child_decode(path: str) -> dict[str, Any]:
 
 def _child_write(path: str, output: str) -> dict[str, Any]:
     """Decode and write a PLY; and the same number of bytes written plainly."""
-    scene = PotrFile.open(path).scene()
+    scene = open_file(path).scene()
     block = bytes(1 << 20)
 
     def plain() -> None:
@@ -238,7 +238,7 @@ def bench_sizes(_: int, __: Path) -> None:
         ):
             options = as_it_is("best" if coder is None else "paper", coder)
             encoded = encode(scene, cameras, options)
-            columns[label] = file_report(PotrFile.from_bytes(b"".join(encoded.pieces)))
+            columns[label] = file_report(open_file(b"".join(encoded.pieces)))
         first = columns["zstd 9"]
         print("| | serialised | " + " | ".join(columns) + " |\n|---|---|" + "---|" * len(columns))
         for section in first["sections"]:

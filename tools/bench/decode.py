@@ -34,7 +34,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from potr_cl.codec.decoder import PotrFile
+from potr_cl.codec.decoder import open_file
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.native.library import VARIABLE
 from potr_cl.codec.quantize import HyperParameters
@@ -112,7 +112,7 @@ def _processor_time() -> float:
 
 def _decode(path: Path, way: str, threads: int) -> None:
     os.environ[VARIABLE] = PATHS[way]
-    PotrFile.open(path).scene(threads=threads)
+    open_file(path).scene(threads=threads)
 
 
 def speed(results: Results, files: Iterable[Path], args: argparse.Namespace) -> None:
@@ -132,7 +132,7 @@ def speed(results: Results, files: Iterable[Path], args: argparse.Namespace) -> 
         Column("native, rate of a processor at work", "million splats/s", ".2f"),
     )
     for path in files:
-        splats = PotrFile.open(path).header.splats
+        splats = open_file(path).header.splats
         for threads in args.threads or _threads():
             works = {way: partial(_decode, path, way, threads) for way in PATHS}
             in_turn(works, 1)
@@ -169,7 +169,7 @@ def versions(results: Results, files: Iterable[Path], args: argparse.Namespace) 
     )
     os.environ[VARIABLE] = PATHS["native"]
     for path in files:
-        scene = PotrFile.open(path).scene()
+        scene = open_file(path).scene()
         coded: dict[int, bytes] = {}
         for threads in args.threads or _threads():
             coding = {version: partial(_coded, scene, version, threads, coded) for version in (2, 3)}
@@ -192,7 +192,7 @@ def _coded(scene: Scene, version: int, threads: int, coded: dict[int, bytes]) ->
 
 
 def _decode_bytes(data: bytes, threads: int) -> None:
-    PotrFile.from_bytes(data).scene(threads=threads)
+    open_file(data).scene(threads=threads)
 
 
 def memory(results: Results, files: Iterable[Path], _: argparse.Namespace) -> None:
@@ -213,14 +213,14 @@ def memory(results: Results, files: Iterable[Path], _: argparse.Namespace) -> No
                 environment = {**os.environ, VARIABLE: value, "PYTHONPATH": str(ROOT)}
                 output = subprocess.run(command, check=True, capture_output=True, text=True, env=environment).stdout
                 found[way] = json.loads(output)
-            table.add(path.stem, PotrFile.open(path).header.splats, threads, *(round(found[w], 3) for w in PATHS))
+            table.add(path.stem, open_file(path).header.splats, threads, *(round(found[w], 3) for w in PATHS))
 
 
 def _growth(path: Path, threads: int) -> float:
     """In a process of its own: by how much memory grows at most, in sizes of what a decode makes."""
     reset_peak()
     before = resident("VmRSS")
-    scene = PotrFile.open(path).scene(threads=threads)
+    scene = open_file(path).scene(threads=threads)
     return 1e9 * (resident("VmHWM") - before) / scene.nbytes
 
 
@@ -242,7 +242,7 @@ def command(results: Results, files: Iterable[Path], args: argparse.Namespace) -
             times = in_turn(works, args.runs)
         wall, used = ({way: statistics.median(times[way][k]) for way in PATHS} for k in (0, 1))
         table.add(
-            path.stem, PotrFile.open(path).header.splats, *(round(wall[way], 3) for way in PATHS),
+            path.stem, open_file(path).header.splats, *(round(wall[way], 3) for way in PATHS),
             *(round(used[way], 3) for way in PATHS),
         )  # fmt: skip
 
@@ -259,7 +259,7 @@ def _whole_command(path: Path, way: str, folder: Path) -> None:
 def roads(results: Results, files: Iterable[Path], args: argparse.Namespace) -> None:
     from tools.study import decoder_roads
 
-    of_version_2 = [path for path in files if PotrFile.open(path).header.version == 2]
+    of_version_2 = [path for path in files if open_file(path).header.version == 2]
     if not of_version_2:
         sys.exit("the context coder is in files of version 2 only: give some")
     decoder_roads.compare(results, of_version_2, args.devices, args.runs)
@@ -295,7 +295,7 @@ def device(results: Results, files: Iterable[Path], args: argparse.Namespace) ->
             timed.stage_times()
             _straight(data, timed)
             table.add(
-                path.stem, PotrFile.from_bytes(data, True).header.splats, opened.info.name,
+                path.stem, open_file(data, True).header.splats, opened.info.name,
                 *(round(each, 2) for each in (medians["host"], medians["both"] - medians["host"], medians["both"])),
                 round(medians["straight"], 2), round(1e3 * min(walls["straight"]), 2),
                 round(1e3 * sum(timed.stage_times().values()), 3),
@@ -303,16 +303,16 @@ def device(results: Results, files: Iterable[Path], args: argparse.Namespace) ->
 
 
 def _on_host(data: bytes) -> None:
-    PotrFile.from_bytes(data, trust=True).scene()
+    open_file(data, trust=True).scene()
 
 
 def _by_way_of_the_host(data: bytes, opened: Device) -> None:
-    with uploaded(opened, PotrFile.from_bytes(data, trust=True).scene()):
+    with uploaded(opened, open_file(data, trust=True).scene()):
         opened.queue.finish()
 
 
 def _straight(data: bytes, opened: Device) -> None:
-    decode_to_device(PotrFile.from_bytes(data, trust=True), opened).close()
+    decode_to_device(open_file(data, trust=True), opened).close()
 
 
 PARTS: dict[str, Callable[[Results, Iterable[Path], argparse.Namespace], None]] = {

@@ -24,7 +24,7 @@ import numpy as np
 from potr_cl.codec import bundled_scene, container, decoder
 from potr_cl.codec.bundles import sections
 from potr_cl.codec.bundles.decoder import Wanted
-from potr_cl.codec.decoder import PotrFile
+from potr_cl.codec.decoder import open_file
 from potr_cl.codec.destination import SceneArrays
 from potr_cl.codec.native.bundles import BundledFile
 from potr_cl.codec.native.functions import Functions
@@ -81,7 +81,7 @@ def parts(results: Results, files: list[Path], runs: int) -> None:
     )
     for path in files:
         data = path.read_bytes()
-        splats = PotrFile.from_bytes(data, trust=True).header.splats
+        splats = open_file(data, trust=True).header.splats
         found = {**_clocked(data, runs), **_of_bundles(data, runs)}
         for part, seconds in found.items():
             table.add(path.stem, part, round(1e3 * seconds, 3), round(1e9 * seconds / splats, 2))
@@ -94,13 +94,13 @@ def _clocked(data: bytes, runs: int) -> dict[str, float]:
         times: dict[str, float] = {}
         with _clocks(times):
             began = time.perf_counter()
-            PotrFile.from_bytes(data, trust=True).scene(threads=1)
+            open_file(data, trust=True).scene(threads=1)
             times["the whole, with clocks"] = time.perf_counter() - began
         times["all else"] = times["the whole, with clocks"] - sum(
             seconds for part, seconds in times.items() if part != "the whole, with clocks"
         )
         least = {part: min(seconds, least.get(part, seconds)) for part, seconds in times.items()}
-    bare = _least(lambda: PotrFile.from_bytes(data, trust=True).scene(threads=1), runs)
+    bare = _least(lambda: open_file(data, trust=True).scene(threads=1), runs)
     return {**least, "the whole": bare}
 
 
@@ -133,9 +133,9 @@ def _clocks(times: dict[str, float]) -> Iterator[None]:
 
 def _of_bundles(data: bytes, runs: int) -> dict[str, float]:
     """Parts of the bundles of a file; nothing for files of other coders."""
-    file = PotrFile.from_bytes(data, trust=True)
+    file = open_file(data, trust=True)
     scene = bundled_scene.BundledScene(file.header, data, file.colour_steps)
-    if file.header.version < 3 or not any(section.coder.name == "BUNDLES" for section in file.header.sections):
+    if file.header.version < 3 or not any(section.coder.name == "BUNDLES" for section in file.blocks[0].sections):
         return {}
     count = file.sh_count()
     destination = SceneArrays(file.header, file.rules, count)

@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from potr_cl.codec.decoder import PotrFile
+from potr_cl.codec.decoder import open_file
 from potr_cl.codec.quantize import PRESETS
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
@@ -81,7 +81,7 @@ def main() -> None:
                 rehearsals = int(number == 0)
                 with EvaluatedScene(scene, device) as evaluator:
                     encoded, seconds = _fastest(evaluator, preset, device, args.runs, rehearsals)
-                    judged = evaluator(PotrFile.from_bytes(b"".join(encoded.pieces)).scene())
+                    judged = evaluator(open_file(b"".join(encoded.pieces)).scene())
                     facts = (evaluator.name, preset, evaluator.source_bytes, len(encoded.order), encoded.nbytes)
                 whole, told = _whole_command(scene, preset, args.device, Path(folder), args.runs, rehearsals)
                 by_stage = [sum(seconds.get(part, 0.0) for part in parts) for parts in STAGES.values()]

@@ -4,8 +4,13 @@
     python -m tools.bench.refit report OUT.json [--images DIR]
 
 A SCENE is a folder with point_cloud.ply, cameras.json with test views and, if it has any, photographs in images.
-``measure`` looks at bytes and PSNR after removing a part of the splats, for each way to treat the colours of those that
-are left (WAYS); every re-fit is on the geometry and the opacities that a decoder sees.
+``measure`` looks at
+
+curves   bytes and PSNR after removing a part of the splats, for each way to treat the colours of those that are left
+         (WAYS); every re-fit is on the geometry and the opacities that a decoder sees
+steps    squared error on training views and PSNR on test views after 0 to 32 conjugate-gradient steps
+cuts     the same number of steps, with a new look at which colours are cut at 0 more or less often
+times    a step's time against a removal sweep's over the same views
 
 ``--every N`` looks at every N-th view only, for machines that are slow. ``report`` prints Markdown and draws
 DIR/refit_SCENE.png from such a file.
@@ -61,6 +66,9 @@ WAYS = {
 PAPER = "splat by splat"
 REMOVED = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 DROPS = (1e-11, 1e-10, 1e-9)
+STEPS = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
+#: Where in the schedule the parts on steps, cuts and times look.
+PART = 0.5
 CODER = EntropyCoder("zstd", 9)
 
 
@@ -174,6 +182,67 @@ class Bench(Owner):
                 add(f"joint, drop {drop:g}", *self.refitted(scenes[False], self.targets, options, None))
             note({name: curve for name, curve in curves.items() if curve})
 
+    # -------------------------------------------------------------------------------------- the solver
+
+    def options_of(self, steps: int) -> RefitOptions:
+        """So many steps, however little they gain."""
+        return dataclasses.replace(self.refit, gain=0, steps=steps)
+
+    def steps(self, scene: Scene, most: int) -> list[dict[str, Any]]:
+        """Errors after so many steps, before the quantiser."""
+        active, rows = self.active(scene), []
+        with ColourRefit(self.device, scene, self.train) as refit:
+            for steps in (s for s in STEPS if s <= most):
+                result = refit.solve(scene.sh, self.targets, self.options_of(steps), active)
+                rows.append(self._row(scene, result.sh, result.errors[1], steps=result.steps))
+                log(f"{self.name} {rows[-1]}")
+        return rows
+
+    def cuts(self, scene: Scene, most: int) -> list[dict[str, Any]]:
+        """The same number of steps in runs of different lengths: each run begins with a new linearisation."""
+        active, rows = self.active(scene), []
+        with ColourRefit(self.device, scene, self.train) as refit:
+            for runs in (1, 2, 4, 8):
+                options, sh = self.options_of(max(most // runs, 1)), scene.sh
+                for _ in range(runs):
+                    result = refit.solve(sh, self.targets, options, active)
+                    sh = result.sh
+                rows.append(self._row(scene, sh, result.errors[1], runs=runs, steps=options.steps))
+                log(f"{self.name} {rows[-1]}")
+        return rows
+
+    def _row(self, scene: Scene, sh: FloatArray, error: float, **facts: Any) -> dict[str, Any]:
+        return {**facts, "train_error": error, **self.evaluator(dataclasses.replace(scene, sh=sh))}
+
+    def times(self, scene: Scene) -> dict[str, float]:
+        """Seconds of a step and of a removal sweep of every tile; the shortest of three."""
+        with (
+            Rasterizer(self.device, scene) as rasterizer,
+            RemovalSweep(rasterizer, self.train, SweepOptions(tolerance=-1)) as removal,
+        ):
+            removal.measure()
+            sweeps = [_seconds(removal.measure) for _ in range(3)]
+        began = time.perf_counter()
+        with ColourRefit(self.device, scene, self.train) as refit:
+            prepared = time.perf_counter() - began
+            active, solves = self.active(scene), {}
+            for steps in (2, 6):
+                solve = functools.partial(refit.solve, scene.sh, self.targets, self.options_of(steps), active)
+                solves[steps] = min(_seconds(solve) for _ in range(3))
+        step = (solves[6] - solves[2]) / 4
+        return {
+            "sweep": min(sweeps),
+            "step": step,
+            "ratio": step / min(sweeps),
+            "prepare": prepared,
+            "solve_6": solves[6],
+        }
+
+
+def _seconds(work: Callable[[], Any]) -> float:
+    began = time.perf_counter()
+    work()
+    return time.perf_counter() - began
 
 
 def _measure(args: argparse.Namespace) -> None:
@@ -198,6 +267,11 @@ def _measure(args: argparse.Namespace) -> None:
                 entry["curves"] = curves
                 write_json(args.json, results)
 
+            scene = bench.on_decoded_geometry(bench.reduced(PART, True))
+            entry["times"] = bench.times(scene)
+            entry["step_rows"] = bench.steps(scene, args.most_steps)
+            entry["cut_rows"] = bench.cuts(scene, args.most_steps)
+            write_json(args.json, results)
             bench.curves(tuple(args.removed), tuple(args.drops), note)
 
 
@@ -292,6 +366,7 @@ def main() -> None:
     measure.add_argument("--iterations", type=int, default=48, help="of pruning")
     measure.add_argument("--steps", type=int, default=RefitOptions.steps, help="of the curves' re-fits")
     measure.add_argument("--prior", type=float, default=RefitOptions.prior)
+    measure.add_argument("--most-steps", type=int, default=max(STEPS), help="of the parts steps and cuts")
     measure.add_argument("--every", type=int, default=1, help="look at every N-th view only")
     report.add_argument("--images", type=Path)
     args = parser.parse_args()

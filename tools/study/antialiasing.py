@@ -18,7 +18,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from potr_cl.codec.decoder import PotrFile
+from potr_cl.codec.decoder import open_file
 from potr_cl.codec.versions import ANTIALIASED_SCALE_STEPS
 from potr_cl.model.camera import Camera, test_views, train_views
 from potr_cl.model.scene import Scene
@@ -45,7 +45,7 @@ class Judge:
     def encoded(self, scene: Scene, options: EncodeOptions) -> tuple[int, int, float]:
         """Splats, bytes and PSNR of the file."""
         encoded = encode(scene, self._views, options, device=self._device)
-        decoded = PotrFile.from_bytes(b"".join(encoded.pieces)).scene()
+        decoded = open_file(b"".join(encoded.pieces)).scene()
         return len(decoded), encoded.nbytes, self.psnr(decoded.rendered(True))
 
     def psnr(self, scene: Scene) -> float:

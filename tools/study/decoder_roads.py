@@ -23,7 +23,7 @@ from potr_cl.codec import container, sections
 from potr_cl.codec.context.lanes import Lanes
 from potr_cl.codec.context.model import CHANNELS, HEAD, read_description
 from potr_cl.codec.context.tokens import ALPHABET, SIZES
-from potr_cl.codec.decoder import PotrFile
+from potr_cl.codec.decoder import PotrFile, open_file
 from potr_cl.codec.native.functions import Functions
 from potr_cl.codec.native.library import native
 from potr_cl.codec.sections import Coder, Property
@@ -71,7 +71,7 @@ def compare(results: Results, files: list[Path], devices: list[str], runs: int) 
     if functions is None:
         raise SystemExit("the compiled library is not there: python -m tools.make.native")
     for path in files:
-        file = PotrFile.open(path)
+        file = open_file(path)
         lanes = Lanes(file.header.splats)
         parts = list(_sections(file, functions, lanes))
         tokens = file.header.splats * sum(part.streams for part in parts)
@@ -126,7 +126,7 @@ def _timed(
 
 
 def _sections(file: PotrFile, functions: Functions, lanes: Lanes) -> Iterator[Section]:
-    for section in sorted(file.header.sections, key=lambda section: (section.kind, section.index)):
+    for section in sorted(file.blocks[0].sections, key=lambda section: (section.kind, section.index)):
         if section.coder != Coder.CONTEXT:
             continue
         stored = container.stored_bytes(file.data, section)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl import EncodeOptions, encode, load_cameras, load_scene
-from potr_cl.codec.decoder import PotrFile
+from potr_cl.codec.decoder import open_file
 from potr_cl.model.camera import Camera, test_views
 from potr_cl.model.lens import Lens, Pinhole
 from potr_cl.model.scene import Scene
@@ -46,7 +46,7 @@ def main() -> None:
     for name, view in ways.items():
         looked = [replace(camera, **view._asdict()) for camera in cameras]
         encoded = encode(scene, looked, EncodeOptions.for_preset(args.preset), device=device)
-        decoded = PotrFile.from_bytes(b"".join(encoded.pieces)).scene()
+        decoded = open_file(b"".join(encoded.pieces)).scene()
         found = _pictures(device, decoded, tests)
         cells = [_psnr(wanted, found, where) for where in (shown, middle, shown & ~middle)]
         print(f"| {name} | {view.width} x {view.height} | {encoded.nbytes:,} | {' | '.join(cells)} |", flush=True)

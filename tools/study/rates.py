@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from potr_cl.codec import octree, quantize
 from potr_cl.codec.container import EntropyCoder
-from potr_cl.codec.decoder import PotrFile
+from potr_cl.codec.decoder import PotrFile, open_file
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.codec.sections import Property
@@ -81,7 +81,7 @@ class Bench:
 
     def coded(self, scene: Scene, parameters: HyperParameters, entropy: EntropyCoder | None = None) -> PotrFile:
         pieces = code_scene(scene, parameters, self.train, entropy=entropy or EntropyCoder()).pieces
-        return PotrFile.from_bytes(b"".join(pieces))
+        return open_file(b"".join(pieces))
 
 
 def _db(error: float) -> float:
@@ -263,7 +263,7 @@ def bench_sizes(bench: Bench) -> None:
 def bench_balance(bench: Bench, q: float, refit_steps: int) -> None:
     """Pruning and compaction of other qualities with steps around the preset's."""
     coded = encode(bench.source, bench.train, EncodeOptions.for_preset("paper", q=q), device=bench.device)
-    psnr = _db(bench.error(PotrFile.from_bytes(b"".join(coded.pieces)).scene()))
+    psnr = _db(bench.error(open_file(b"".join(coded.pieces)).scene()))
     print(f"\n#### {bench.name}: pruning and compaction against steps; paper: {coded.nbytes} bytes, {psnr:.2f} dB\n")
     print("| ΔMSE_MAX of q + | λ of q + | steps finer by | splats | bytes | PSNR |\n|---|---|---|---|---|---|")
     for more in (0.0, 0.15, 0.3):
