@@ -42,7 +42,7 @@ What a choice costs or brings, against the alternatives (``study``):
 study.rate_distortion      size against quality: the curves that other studies compare with
 study.ablation             what does each part of the codec contribute?
 study.fit                  how far should a scene be pruned before a fit, and what does each part of the fit bring?
-study.colour_steps         what does version 3 of the format bring over version 2, part by part?
+study.colour_steps         what do steps of colours that fit each splat bring, part by part?
 study.compare_formats      what would people use instead?
 study.output_formats       how small are encodes to the formats that viewers open, and what do others read of them?
 study.elsewhere            what is left of a scene, with cameras and without, where nobody has photographed it?
@@ -56,7 +56,6 @@ study.compaction_curves    what does the compaction do to sparsity and pictures?
 study.removal_exactness    how far are predicted removal effects from removals in float64?
 study.removal_formulas     back to front or prefix sums: which formula of removal effects?
 study.frames               which cameras in another frame are found, and what do unseen splats cost?
-study.decoder_roads        which road to a quick decoder: compiled C or OpenCL kernels? (for bench.decode --part roads)
 study.composite_yardstick  the compositing kernel beside a loop in C
 study.lens_field           which pinhole view should stand for a distorted photograph?
 =========================  =============================================================================================

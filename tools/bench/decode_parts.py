@@ -21,17 +21,18 @@ from unittest.mock import patch
 
 import numpy as np
 
-from potr_cl.codec import bundled_scene, container, decoder
+from potr_cl.codec import container, dequantizer
+from potr_cl.codec.block_values import BlockValues
 from potr_cl.codec.bundles import sections
 from potr_cl.codec.bundles.decoder import Wanted
 from potr_cl.codec.decoder import open_file
 from potr_cl.codec.destination import SceneArrays
 from potr_cl.codec.native.bundles import BundledFile
-from potr_cl.codec.native.functions import Functions
 from potr_cl.codec.native.library import VARIABLE, native
 from potr_cl.codec.native.octree import OctreeFunctions, Walk
 from potr_cl.codec.native.share import BundleShare
 from potr_cl.codec.native.values import ValueArrays
+from potr_cl.codec.sections import Coder
 from tools.results import Column, Results
 
 #: What a clock is put around: where it is, its name there, what the table calls it.
@@ -42,18 +43,11 @@ _CLOCKS: tuple[tuple[Any, str, str], ...] = (
     (sections, "read_description", "descriptions of contexts"),
     (BundledFile, "__init__", "tables of contexts"),
     (BundleShare, "do", "bundles to values"),
-    (bundled_scene.BundledScene, "tables", "tables of values"),
-    (decoder, "unpack_integers", "multiplicities"),
     (OctreeFunctions, "tree", "octree: levels"),
     (Walk, "__init__", "octree: parts"),
     (Walk, "leaves", "octree: leaves"),
     (Walk, "centres", "octree: centres"),
-    (Functions, "join_planes", "byte planes"),
-    (Functions, "widened", "byte planes"),
-    (Functions, "look_up", "scales, opacities"),
-    (Functions, "rotations", "rotations"),
-    (Functions, "colours", "colours"),
-    (Functions, "dc_colours", "DC from its prediction"),
+    (dequantizer, "fill", "values by NumPy"),
 )
 #: Of bundles: parts of the chain, by the section that they end with.
 _CHAIN = ("opacities", "scales", "steps and DC", "AC of degree 1", "AC of degree 2", "AC of degree 3")
@@ -133,12 +127,13 @@ def _clocks(times: dict[str, float]) -> Iterator[None]:
 
 def _of_bundles(data: bytes, runs: int) -> dict[str, float]:
     """Parts of the bundles of a file; nothing for files of other coders."""
-    file = open_file(data, trust=True)
-    scene = bundled_scene.BundledScene(file.header, data, file.colour_steps)
-    if file.header.version < 3 or not any(section.coder.name == "BUNDLES" for section in file.blocks[0].sections):
+    body = open_file(data, trust=True).body(0)
+    block = body.block
+    if block.coder != Coder.BUNDLES:
         return {}
-    count = file.sh_count()
-    destination = SceneArrays(file.header, file.rules, count)
+    scene = BlockValues(block, body.data, body.colour_steps)
+    count = body.sh_count()
+    destination = SceneArrays(block, count)
     tables, bundles, functions = scene.tables, scene.reader.bundles.number, native()
     assert functions is not None
 
@@ -169,7 +164,7 @@ def _of_bundles(data: bytes, runs: int) -> dict[str, float]:
     of["values, to memory that was written to before"] = written - before - of["integers: rotations"]
 
     def fresh() -> None:
-        arrays = SceneArrays(file.header, file.rules, count)
+        arrays = SceneArrays(block, count)
         decoded(last, True, arrays.values)()
 
     of["memory that was not"] = _least(fresh, runs) - written

@@ -201,7 +201,7 @@ def _outcome_packed(file: PotrFile) -> str | dict[str, bytes] | None:
         return str(error)
 
 
-class _Unpacked(BundleTaker, SceneArrays):  # type: ignore[misc]
+class _Unpacked(BundleTaker, SceneArrays):
     """The arrays of a scene that takes packed bundles."""
 
     def expect_bundles(self) -> None:

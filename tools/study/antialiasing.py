@@ -19,7 +19,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from potr_cl.codec.decoder import open_file
-from potr_cl.codec.versions import ANTIALIASED_SCALE_STEPS
+from potr_cl.codec.quantisers import ANTIALIASED_SCALE_STEPS
 from potr_cl.model.camera import Camera, test_views, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device

@@ -58,11 +58,10 @@ class Way:
         steps: whether each splat has its own steps of colours.
         rounded: whether AC coefficients are rounded before the last solution for DC.
         rounds: whether colours are rounded in rounds, between which the others are solved for again.
-        former: whether with the constants of version 2.
+        former: whether with the constants of before.
     """
 
     name: str
-    version: int
     steps: bool = False
     rounded: bool = False
     rounds: bool = False
@@ -70,12 +69,11 @@ class Way:
 
 
 WAYS = (
-    Way("version 2", 2),
-    Way("+ coder of version 3", 3),
-    Way("+ steps that fit each splat", 3, steps=True),
-    Way("+ AC coefficients rounded before the last solution for DC", 3, steps=True, rounded=True),
-    Way("+ coarser AC coefficients and opacities", 3, steps=True, rounded=True, former=False),
-    Way("+ colours rounded in rounds (preset best)", 3, steps=True, rounds=True, former=False),
+    Way("steps that are the same for all splats"),
+    Way("+ steps that fit each splat", steps=True),
+    Way("+ AC coefficients rounded before the last solution for DC", steps=True, rounded=True),
+    Way("+ coarser AC coefficients and opacities", steps=True, rounded=True, former=False),
+    Way("+ colours rounded in rounds (preset best)", steps=True, rounds=True, former=False),
 )
 
 
@@ -84,7 +82,7 @@ def coded(
 ) -> bytes:
     """The file that a way makes of a pruned scene."""
     constants = {name: value * 10 ** (q - 0.5) for name, value in _FORMER.items()} if way.former else {}
-    parameters = dataclasses.replace(parameters, version=way.version, **constants)
+    parameters = dataclasses.replace(parameters, **constants)  # type: ignore[arg-type]
     geometry = quantise_geometry(state.scene, parameters, state.views)
 
     def colour_grid(effects: FloatArray) -> ColourGrid:

@@ -161,8 +161,8 @@ def _quantisers(scene: Scene, train: Sequence[Camera]) -> Iterator[tuple[str, fl
         for name, absolute in (("centre near enough", False), ("foreseeable level", True)):
             tree, order = octree.build(scene.means, part * wide * nearest, absolute)
             found = replace(scene.subset(order), means=octree.parse(tree, len(scene)))
-            streams = (tree.occupancy, tree.several, tree.tail_lengths, tree.tails)
-            stored = [EntropyCoder().section(Property.TAIL, 0, stream.tobytes(), 1)[1] for stream in streams]
+            streams = (tree.occupancy, tree.several, tree.leaf_levels, tree.tails)
+            stored = [EntropyCoder().section(Property.TAIL, stream.tobytes())[1] for stream in streams]
             nbytes = sum(map(len, stored))
             yield f"position, {part:g} of a size, {name}", 8 * nbytes / len(scene), found
 
@@ -185,7 +185,7 @@ def bench_margins(bench: Bench) -> None:
 
     def at(parameters: HyperParameters) -> tuple[int, float]:
         file = bench.coded(left, parameters)
-        return len(file.data), _db(bench.error(file.scene()))
+        return file.header.file_bytes, _db(bench.error(file.scene()))
 
     nbytes, psnr = at(base)
     print(f"\n#### {bench.name}: one property a third coarser, from {nbytes} bytes, {psnr:.3f} dB\n")
@@ -203,17 +203,17 @@ def bench_margins(bench: Bench) -> None:
 def bench_streams(bench: Bench) -> None:
     left = bench.reduced()
     parameters = HyperParameters.from_quality(0.5, "best", **COMPACTED)
-    coders = {"zstd 19": EntropyCoder("zstd"), "context": EntropyCoder("context")}
+    coders = {"zstd 19": EntropyCoder("zstd"), "bundles": EntropyCoder()}
     files = {name: bench.coded(left, parameters, coder) for name, coder in coders.items()}
     sections = {name: file_report(file)["sections"] for name, file in files.items()}
     print(f"\n#### {bench.name}: {len(left)} splats, the same integers in two coders\n")
-    print("| | zstd 19, B a splat | context, B a splat | |\n|---|---|---|---|")
+    print("| | zstd 19, B a splat | bundles, B a splat | |\n|---|---|---|---|")
     for section in sections["zstd 19"]:
         plain, context = (sections[name][section]["bytes"] / len(left) for name in coders)
         print(f"| {section} | {plain:.3f} | {context:.3f} | {100 * (context / plain - 1):+.1f} % |")
-    plain, context = (len(file.data) / len(left) for file in files.values())
+    plain, context = (file.header.file_bytes / len(left) for file in files.values())
     print(f"| **all** | {plain:.3f} | {context:.3f} | {100 * (context / plain - 1):+.1f} % |")
-    print("\n| decode, one thread, ms | zstd 19 | context |\n|---|---|---|")
+    print("\n| decode, one thread, ms | zstd 19 | bundles |\n|---|---|---|")
     calls: dict[str, Callable[[PotrFile], Any]] = {
         part: lambda file, part=part: getattr(file, part)()  # type: ignore[misc]
         for part in ("means", "log_scales", "quaternions", "opacity_logits", "sh")
@@ -241,16 +241,16 @@ def bench_sizes(bench: Bench) -> None:
     left = bench.reduced()
     paper = HyperParameters.from_quality(0.5)
     file = bench.coded(left, paper, EntropyCoder("zstd"))
-    size, psnr = len(file.data), _db(bench.error(file.scene()))
+    size, psnr = file.header.file_bytes, _db(bench.error(file.scene()))
     print(f"\n#### {bench.name}: at the PSNR of the paper's steps ({psnr:.2f} dB), {len(left)} splats\n")
     print("| | bytes | B a splat | |\n|---|---|---|---|")
     print(f"| paper's steps, zstd 19 | {size} | {size / len(left):.2f} | |")
     best = HyperParameters.from_quality(0.5, "best", **COMPACTED)
-    for name, coder in (("steps of equal worth, zstd 19", "zstd"), ("the same, context coder", "context")):
+    for name, coder in (("steps of equal worth, zstd 19", "zstd"), ("the same, bundles", "bundles")):
         curve = []
         for factor in (1.0, 1.25, 1.5625, 1.953):
             file = bench.coded(left, finer(best, factor), EntropyCoder(coder))
-            curve.append((_db(bench.error(file.scene())), math.log(len(file.data))))
+            curve.append((_db(bench.error(file.scene())), math.log(file.header.file_bytes)))
         at, logarithm = np.array(sorted(curve)).T
         equal = math.exp(float(np.interp(psnr, at, logarithm)))
         note = f"{100 * (equal / size - 1):+.1f} %"
@@ -279,7 +279,7 @@ def bench_balance(bench: Bench, q: float, refit_steps: int) -> None:
             for factor in (0.7, 0.85, 1.0, 1.25):
                 file = bench.coded(left, finer(options.parameters, factor))
                 psnr = _db(bench.error(file.scene()))
-                row = f"| {more:g} | {softer:g} | {factor:g} | {len(left)} | {len(file.data)} | {psnr:.2f} dB |"
+                row = f"| {more:g} | {softer:g} | {factor:g} | {len(left)} | {file.header.file_bytes} | {psnr:.2f} dB |"
                 print(row, flush=True)
 
 
