@@ -221,7 +221,13 @@ def open_file(source: bytes | str | os.PathLike[str], trust: bool = False) -> Po
             start = file.read(FIXED_BYTES)
             if stat.S_ISREG(status.st_mode):
                 start += file.read(max(min(header_bytes_of(start), status.st_size) - len(start), 0))
-                return _opened(start, status.st_size, trust, partial(_read, path, state))
+
+                def at_once(offset: int, nbytes: int) -> bytes:
+                    file.seek(offset)
+                    return file.read(nbytes)
+
+                opened = _opened(start, status.st_size, trust, at_once)
+                return replace(opened, read=partial(_read, path, state))
             if header_bytes_of(start):
                 start += file.read()
         return _opened(start, len(start), trust, _part_of(start))

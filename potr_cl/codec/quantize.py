@@ -42,6 +42,8 @@ _ROWS = 1 << 11
 #: Logarithms of levels are looked up in tables of two to the power of these: small ones are made in no time, large ones
 #: fit a second-level cache.
 _SMALLEST_TABLE, _LARGEST_TABLE = 8, 16
+#: Splats of a block that may be asked for: fewer would make more blocks than readers take.
+FEWEST_OF_A_BLOCK, MOST_OF_A_BLOCK = 1 << 14, 1 << 22
 #: Integers beyond this are not exact in float64; no sane scene comes near.
 _LARGEST = 2.0**53
 
@@ -64,6 +66,7 @@ class HyperParameters:
         sf_opacity: of opacities; balanced: of their logits.
         sf_rotation: of quaternions; balanced: times the root of the largest level of the splat's three scales.
         sf_scale: of standard deviations, world units; balanced: steps in a typical splat's size.
+        block_splats: most splats of a block of the file; 0: as suits a file on a disk.
     """
 
     quantiser: int
@@ -78,6 +81,7 @@ class HyperParameters:
     sf_opacity: float
     sf_rotation: float
     sf_scale: float
+    block_splats: float = 0
 
     @staticmethod
     def from_quality(q: float, preset: Preset = "paper", **replaced: float | None) -> HyperParameters:
@@ -102,6 +106,8 @@ class HyperParameters:
                 low, high = 1e-30, 1.0
             if field.name.startswith("sf_"):
                 low, high = 1e-3, 1e9
+            if field.name == "block_splats" and value:
+                low, high = FEWEST_OF_A_BLOCK, MOST_OF_A_BLOCK
             if not low <= value <= high:
                 raise UsageError(f"{field.name} is {value:g}, it must lie between {low:g} and {high:g}")
         return values

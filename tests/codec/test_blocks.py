@@ -14,7 +14,6 @@ import pytest
 import potr_cl
 from potr_cl import cli
 from potr_cl.codec.blocks import geometry as blocks_geometry
-from potr_cl.codec.blocks import splitting
 from potr_cl.codec.blocks.geometry import GeometryOfBlocks, quantise
 from potr_cl.codec.blocks.splitting import blocks_of
 from potr_cl.codec.container import EntropyCoder
@@ -32,6 +31,7 @@ from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.reference.file_parts import File
 from potr_cl.reference.scenes import random_scene, ring_of_cameras
+from tests.cases.options import as_it_is
 from tests.oracles.decoder import decode as decode_independently
 
 ARRAYS = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
@@ -149,7 +149,7 @@ def test_many_splats_are_written_in_blocks(monkeypatch, plush_excerpt, plush_exc
     few = encode(plush_excerpt, plush_excerpt_cameras, options)
     assert len(open_file(few.data).blocks) == 1
     monkeypatch.setattr(blocks_geometry, "MOST_WHOLE", 300)
-    monkeypatch.setattr(splitting.blocks_of, "__defaults__", (256, map))
+    monkeypatch.setattr(blocks_geometry, "MOST_A_BLOCK", 256)
     many = encode(plush_excerpt, plush_excerpt_cameras, options)
     file = open_file(many.data)
     assert len(file.blocks) == -(-len(many.order) // 256)
@@ -160,6 +160,14 @@ def test_many_splats_are_written_in_blocks(monkeypatch, plush_excerpt, plush_exc
     assert same(many.scene, decode(many.data))
     in_place = plush_excerpt.subset(many.order).means - many.scene.means
     assert np.abs(in_place).max() < 0.02
+
+
+def test_blocks_of_any_size_may_be_asked_for():
+    options = as_it_is("best").with_parameters(block_splats=1 << 14)
+    blocks = open_file(b"".join(encode(random_scene(40_000, 0), None, options).pieces)).blocks
+    assert [block.splats for block in blocks] == [13_333, 13_333, 13_334]
+    with pytest.raises(UsageError, match=r"block_splats is 100, it must lie between 16384 and 4\.1943e"):
+        _ = as_it_is("best").with_parameters(block_splats=100).parameters
 
 
 @pytest.mark.slow

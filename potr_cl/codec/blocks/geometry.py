@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import quantize
-from potr_cl.codec.blocks.splitting import MOST_WHOLE, blocks_of
+from potr_cl.codec.blocks.splitting import MOST_A_BLOCK, MOST_WHOLE, blocks_of
 from potr_cl.codec.geometry import Geometry, distances_to_views, quantise_geometry, quantise_in_world_units, undecoded
 from potr_cl.codec.quantisers import QUANTISERS
 from potr_cl.codec.steps.fitting import fit_steps_of_blocks
@@ -87,13 +87,15 @@ def quantise(
 
     Args:
         scene, parameters, views, run: as of :func:`potr_cl.codec.geometry.quantise_geometry`.
-        rows: of the blocks; None: as :func:`potr_cl.codec.blocks.splitting.blocks_of` has it, if there are many splats.
+        rows: of the blocks; None: as :func:`potr_cl.codec.blocks.splitting.blocks_of` has it, if there are more splats
+            than a block may have.
 
     Raises:
         As :func:`potr_cl.codec.geometry.quantise_geometry`.
     """
-    if rows is None and in_blocks(len(scene)):
-        rows = blocks_of(scene.means, run=run)
+    most = int(parameters.block_splats)
+    if rows is None and len(scene) > (most or MOST_WHOLE):
+        rows = blocks_of(scene.means, most or MOST_A_BLOCK, run)
     if rows is None:
         return quantise_geometry(scene, parameters, views, run)
     nearest = distances_to_views(scene.means, views, run)
@@ -101,8 +103,3 @@ def quantise(
 
     blocks = quantise_in_world_units(scene, rows, parameters, world, nearest, run)
     return GeometryOfBlocks(parameters, world, tuple(rows), tuple(blocks))
-
-
-def in_blocks(splats: int) -> bool:
-    """Whether a scene of so many splats is cut into blocks."""
-    return splats > MOST_WHOLE
