@@ -19,8 +19,8 @@ from potr_cl.host.threads import thread_pool
 if TYPE_CHECKING:
     from potr_cl.codec.destination import Activation, BundleTaker
 
-#: Bundles that a thread works on at a time.
-_AT_A_TIME = 4
+#: Bundles that a thread works on at a time, and threads that do: integers may be wide, and take memory.
+_AT_A_TIME, _MOST_THREADS = 2, 4
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class PlainValues:
 
     def fill(self, arrays: ValueArrays, threads: int = 1, beside: Callable[[], None] | None = None) -> None:
         """As :meth:`potr_cl.codec.block_values.BlockValues.fill`."""
-        with thread_pool(threads) as pool:
+        with thread_pool(min(threads, _MOST_THREADS)) as pool:
             other = None if beside is None else pool.submit(beside)
             reader = self._opened(arrays)
             list(pool.map(lambda first: self._fill(reader, self._bundles(first), arrays), self._starts))
