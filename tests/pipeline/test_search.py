@@ -176,7 +176,7 @@ def test_without_a_refit_only_the_steps_of_the_quantiser_may_be_of_another_q(dev
     found = next(run for run in runs if run.tries[-1].kind == "steps")
     pruned = encode(plush_excerpt, cameras, FEW.changed(q=found.options.q), device=device).pruned
     assert np.array_equal(pruned.survivors, found.encoded.pruned.survivors)
-    header = open_file(b"".join(found.encoded.pieces)).header
+    header = open_file(b"".join(found.encoded.pieces)).blocks[0]
     assert header.sf_ac == found.options.code.sf_sh == pytest.approx(1 + 100 * found.tries[-1].q)
     parameters = HyperParameters.from_quality(found.options.q)
     for name in ("lam", "alpha", "delta_mse_max"):

@@ -54,7 +54,7 @@ class Functions:
     def bundled_file(
         self, splats: int, sections: Mapping[int, SectionWords], steps: ColourSteps | None, vectors: bool = True
     ) -> BundledFile:
-        """Sections of coder 4, as :class:`potr_cl.codec.native.bundles.BundledFile` takes them."""
+        """Sections of bundles, as :class:`potr_cl.codec.native.bundles.BundledFile` takes them."""
         return BundledFile(self._c, splats, sections, steps, vectors)
 
     def bundle_share(self, bundles: int) -> BundleShare:
