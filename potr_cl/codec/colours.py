@@ -65,7 +65,7 @@ def colour_levels(
             else np.ascontiguousarray(sh[rows].transpose(1, 2, 0))
         )
         of_dc, of_ac = (
-            # A factor that is the same for all is not rounded: so versions without steps have always been written.
+            # A factor that is the same for all is not rounded: so it is for files without steps.
             factors(scale_factor, part[block]) if part.any() else scale_factor
             for scale_factor, part in zip((parameters.sf_dc, parameters.sf_sh), classes, strict=True)
         )

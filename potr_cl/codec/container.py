@@ -312,7 +312,7 @@ def read_header(data: bytes | memoryview, file_bytes: int, trust: bool = False) 
     if degree >= len(SH_COEFFICIENTS) or count < 1 or own > MOST_SECTIONS:
         raise DataError(f"the header makes no sense: {count} blocks, SH degree {degree}")
     if not trust:  # before a long table is looked at
-        _check_number(count, FREE_SPLATS + MOST_A_BYTE * file_bytes)
+        _check_number(count, FREE_SPLATS + MOST_A_BYTE * file_bytes, f"a file of {file_bytes} bytes")
     table = _Table(data, _FIXED.size, size - _CRC.size, size, file_bytes)
     sections = table.sections(own, (Property.METADATA,), "the file")
     if any(section.kind is Property.METADATA and section.raw_bytes > MAX_METADATA for section in sections):
@@ -327,7 +327,7 @@ def read_header(data: bytes | memoryview, file_bytes: int, trust: bool = False) 
     if blocks[-1].level or not table.at_end:
         raise DataError("the sections do not fill the file, or the table its place, or the finest level is not there")
     splats = sum(block.splats for block in blocks)
-    _check_number(count, splats)
+    _check_number(count, splats, f"{splats} splats")
     check_claim(splats, file_bytes, MOST_A_BYTE, trust)
     return FileHeader(tuple(blocks), sections, size, file_bytes)
 
@@ -345,9 +345,9 @@ def _check_start(start: bytes, file_bytes: int) -> None:
         raise DataError(f"truncated: {file_bytes} bytes do not even hold the header")
 
 
-def _check_number(blocks: int, splats: int) -> None:
+def _check_number(blocks: int, splats: int, what: str) -> None:
     if blocks > FREE_BLOCKS + splats // SPLATS_A_BLOCK:
-        raise DataError(f"{blocks} blocks are too many for {splats} splats")
+        raise DataError(f"{blocks} blocks are too many for {what}")
 
 
 class _Table:

@@ -50,7 +50,7 @@ def known_model(tokens: int) -> Model:
     context to context, and each token a frequency of 1 besides.
     """
     starts = np.minimum(token_floors(), _FARTHEST)[:tokens]
-    classes = np.arange(LARGEST_SIZE + 1) // (_KNOWN_SIZES)
+    classes = np.arange(LARGEST_SIZE + 1) // _KNOWN_SIZES
     frequencies = np.empty((MOST_CONTEXTS, tokens), np.int64)
     for k, row in enumerate(frequencies):
         c = (_KNOWN_ROOTS[k % 2] << k // 2) >> 6
