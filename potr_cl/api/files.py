@@ -191,7 +191,8 @@ def decode_to_device(
     """Decode a .potr file into the memory of an OpenCL device, for a renderer that runs there.
 
     The host makes values of the file's integers while they are in a cache, and uploads those that are not 0, in the
-    layout and with the bits that :class:`potr_cl.raster.rasterizer.Rasterizer` has after it has uploaded the scene that :func:`decode` makes.
+    layout and with the bits that :class:`potr_cl.raster.rasterizer.Rasterizer` has after it has uploaded the scene that
+    :func:`decode` makes.
 
     Args:
         file: its path, its bytes, or the result of :func:`potr_cl.encode`.
