@@ -35,7 +35,7 @@ MOST_SPLATS, MOST_SECTIONS, MOST_LEVELS = 1 << 22, 32, 52
 #: There are no more blocks than the first number and one for each so many splats: each costs time of its own.
 FREE_BLOCKS, SPLATS_A_BLOCK = 16, 1 << 14
 #: Bytes of an integer of the plain coder, at most.
-MOST_PLANES = 5
+MOST_PLANES = 7
 #: A splat, and a crowded cell of the octree, takes a bit of a file at least; what packs more is no scene.
 MOST_A_BYTE = 8
 #: A zstd frame claims no more for each byte: beyond is a lie, found before memory is taken.

@@ -191,7 +191,7 @@ def _coded(
     if coded is None:
         kind, coded = Coder.PLAIN, plain.encode(values, coder, pool.map)
     if coded is None:
-        raise DataError("a splat's integers have more than 40 bits: lower the scale factors")
+        raise DataError("a splat's integers have more than 56 bits: lower the scale factors")
     coded += [future.result() for future in others]
     place = {prop.value: k for k, prop in enumerate(ORDER)}
     coded.sort(key=lambda pair: place[pair[0].name])

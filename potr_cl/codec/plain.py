@@ -29,7 +29,7 @@ def pack(streams: Sequence[Integers], signed: bool) -> bytes:
     """The content of a section: bytes an integer of each stream, then each one's integers, lowest bytes first.
 
     Args:
-        streams: (n,) each, below 2^40 once they are mapped to unsigned.
+        streams: (n,) each, below 2^56 once they are mapped to unsigned.
         signed: whether they may be negative, and so are zig-zag mapped: 0, −1, 1, −2, …
     """
     widths, planes = bytearray(), []

@@ -148,7 +148,7 @@ def test_the_worst_that_is_let_through(threads):
     splats = 160_000
     contents = one_leaf(splats, 52)
     for prop in (Property.SCALE, Property.ROTATION, *SH):
-        contents.append((prop, bytes([5] * prop.streams) + bytes(5 * splats * prop.streams)))
+        contents.append((prop, bytes([7] * prop.streams) + bytes(7 * splats * prop.streams)))
     file = File.of(made_of(contents, splats, 52, degree=3, coder=EntropyCoder("zstd", 1)))
     file.blocks[0].sections.append(Padding(b"junk", padding, len(padding)))
     data = file.bytes()
@@ -284,7 +284,7 @@ def test_a_scene_at_the_limits_of_single_precision_comes_back():
 def test_the_largest_integers_give_no_warning():
     """Squares and sums beyond single precision are none of the user's business."""
     contents = [
-        (prop, bytes([5] * prop.streams) + b"\377" * 5 * 2 * prop.streams)
+        (prop, bytes([7] * prop.streams) + b"\377" * 7 * 2 * prop.streams)
         for prop in (Property.OPACITY, Property.SCALE, Property.ROTATION, Property.SH0)
     ]
     for quantiser in (0, 1):

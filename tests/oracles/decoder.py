@@ -195,7 +195,7 @@ def largest(name: str, block: Block, occupancy: int) -> int:
         "LEAF": splats,
         "TAIL": 3 * deepest * bytes_for_bits(splats),
         "STEP": 50 + splats if block.quantiser == 1 else 0,
-    }.get(name, STREAMS.get(name, 0) * (1 + 5 * splats))
+    }.get(name, STREAMS.get(name, 0) * (1 + 7 * splats))
 
 
 def undo_zstandard(stored: bytes, size: int, name: str) -> bytes:
@@ -284,7 +284,7 @@ def plain_streams(name: str, content: bytes, splats: int) -> list[list[int]]:
     count = STREAMS[name]
     check(len(content) >= count, f"{name} is shorter than its streams' widths")
     widths = content[:count]
-    check(max(widths) <= 5, f"{name}: an integer of more than 5 bytes")
+    check(max(widths) <= 7, f"{name}: an integer of more than 7 bytes")
     check(len(content) == count + splats * sum(widths), f"{name} does not hold an integer of each splat")
     streams = []
     at = count
