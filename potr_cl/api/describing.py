@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from potr_cl.api.inputs import SceneSource, bytes_of_source, encoded_bytes, name_of, scene_of
-from potr_cl.codec.decoder import open_file, scene_of_file
+from potr_cl.codec.decoder import open_file
 from potr_cl.errors import UsageError
 from potr_cl.formats import load_scene, registry
 from potr_cl.formats.declaration import SceneFormat
@@ -84,7 +84,7 @@ def info(file: SceneSource, trust: bool = False) -> SceneInfo:
                 return SceneInfo({**own, "format": kind.name, **scene_report(scene, mends)})
             opened = open_file(path, trust)
     # Two reports of one file: what it says itself of counts and bounds is the same as what the scene says.
-    return SceneInfo({**own, "format": POTR.name, **file_report(opened), **scene_report(scene_of_file(opened))})
+    return SceneInfo({**own, "format": POTR.name, **file_report(opened), **scene_report(opened.scene())})
 
 
 def _as_it_would_be_read(scene: Scene) -> tuple[Scene, list[CleanReport]]:

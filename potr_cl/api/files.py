@@ -19,7 +19,6 @@ from potr_cl.api.inputs import (
     on_device,
     scene_of,
 )
-from potr_cl.codec.blocks.file import BlockedFile
 from potr_cl.codec.decoder import decode as decode_file
 from potr_cl.codec.decoder import open_file
 from potr_cl.errors import DataError, UsageError
@@ -170,13 +169,13 @@ def decode_block_by_block(
     if suffix_of_name(Path(output)) != ".ply":
         return None
     opened = open_file(file, trust)
-    if not isinstance(opened, BlockedFile):
+    if len(opened.blocks) == 1:
         return None
     try:
-        ply.save_parts(output, opened.parts(sh_degree=sh_degree), opened.table.splats)
+        ply.save_parts(output, opened.parts(sh_degree=sh_degree), opened.header.splats)
     except DataError as error:
         raise DataError(f"'{os.fspath(file)}': {error}") from None
-    return opened.table.splats
+    return opened.header.splats
 
 
 def decode_to_device(
@@ -190,8 +189,9 @@ def decode_to_device(
 ) -> SceneBuffers:
     """Decode a .potr file into the memory of an OpenCL device, for a renderer that runs there.
 
-    The integers of the file are uploaded as they are and become values on the device, in the layout and with the bits
-    that :class:`potr_cl.raster.rasterizer.Rasterizer` has after it has uploaded the scene that :func:`decode` makes.
+    The host makes values of the file's integers while they are in a cache, and uploads those that are not 0, in the
+    layout and with the bits that :class:`potr_cl.raster.rasterizer.Rasterizer` has after it has uploaded the scene that
+    :func:`decode` makes.
 
     Args:
         file: its path, its bytes, or the result of :func:`potr_cl.encode`.

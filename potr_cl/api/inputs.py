@@ -8,9 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from potr_cl.codec.blocks.file import BlockedFile
 from potr_cl.codec.container import MAGIC
-from potr_cl.codec.decoder import AnyFile, PotrFile, decode, open_file
+from potr_cl.codec.decoder import PotrFile, decode, open_file
 from potr_cl.errors import DataError, UsageError
 from potr_cl.host.unchanged import unchanged
 from potr_cl.model.camera import Camera, test_views, train_views
@@ -20,7 +19,6 @@ from potr_cl.model.scene import Scene, joined
 if TYPE_CHECKING:
     from potr_cl.api.editing import Edited
     from potr_cl.formats.images import Colour
-    from potr_cl.ondevice.decode import Beside
     from potr_cl.opencl.device import Device
     from potr_cl.opencl.discovery import DeviceInfo
     from potr_cl.outputs.coded_scene import CodedScene
@@ -122,27 +120,22 @@ def drawable_to_judge(
         scene = scene_of(source, trust, antialiased)
         yield scene, scene
         return
-    from potr_cl.codec.sampled import Sampled
     from potr_cl.model.sightings import looked_at
 
-    samples: list[Sampled] = []
+    samples: list[Scene] = []
 
-    def sampled(whole: AnyFile) -> Beside:
-        rows = looked_at(whole.table.splats if isinstance(whole, BlockedFile) else whole.header.splats)
-
-        def take(file: PotrFile, first: int) -> Sampled:
-            own = rows[(rows >= first) & (rows < first + file.header.splats)] - first
-            samples.append(Sampled(file.header, file.rules, file.sh_count(), own))
-            return samples[-1]
-
-        return take
+    def sampled(file: PotrFile) -> None:
+        rows, first = looked_at(file.header.splats), 0
+        for part in file.parts():
+            samples.append(part.subset(rows[(rows >= first) & (rows < first + len(part))] - first))
+            first += len(part)
 
     read = None if coded is None else coded.data
     with on_device(
         source,  # type: ignore[arg-type]
         device, trust, antialiased=antialiased, beside=sampled, read=read,
     ) as buffers:  # fmt: skip
-        yield buffers, joined([each.scene for each in samples])
+        yield buffers, joined(samples)
 
 
 def coded_scene(source: SceneSource, trust: bool = False) -> CodedScene | None:
@@ -181,13 +174,13 @@ def on_device(
     sh_degree: int | None = None,
     antialiased: bool | None = None,
     threads: int = 0,
-    beside: Callable[[AnyFile], Beside] | None = None,
+    beside: Callable[[PotrFile], None] | None = None,
     read: bytes | None = None,
 ) -> SceneBuffers:
     """The .potr file that a path, bytes or the result of an encode stand for, decoded into a device's memory.
 
     Args:
-        beside: makes of the opened file what makes what takes the same splats.
+        beside: is given the opened file, too.
         read: the content of the path, where it has been read already.
         source, device, trust, sh_degree, antialiased, threads: as of :func:`potr_cl.decode_to_device`.
 
@@ -196,9 +189,10 @@ def on_device(
     """
     from potr_cl.ondevice.decode import decode_to_device
 
-    def decoded(file: AnyFile) -> SceneBuffers:
-        also = None if beside is None else beside(file)
-        return decode_to_device(file, device, sh_degree, antialiased, threads, also)
+    def decoded(file: PotrFile) -> SceneBuffers:
+        if beside is not None:
+            beside(file)
+        return decode_to_device(file, device, sh_degree, antialiased, threads)
 
     data = encoded_bytes(source)
     if data is not None:

@@ -52,7 +52,9 @@ def colour_levels(
         block = slice(start, start + len(rows))
         if functions is not None and whole is not None and whole.dtype == np.float32:
             dc, ac = (
-                np.full(len(rows), scale_factor) if not part.any() else factors(scale_factor, part[block]).astype(float)
+                np.full(len(rows), scale_factor, np.float64)
+                if not part.any()
+                else factors(scale_factor, part[block]).astype(float)
                 for scale_factor, part in zip((parameters.sf_dc, parameters.sf_sh), classes, strict=True)
             )
             if functions.quantising.colour_levels(whole, whole is columns, rows, dc, ac, start, levels):
@@ -63,7 +65,7 @@ def colour_levels(
             else np.ascontiguousarray(sh[rows].transpose(1, 2, 0))
         )
         of_dc, of_ac = (
-            # A factor that is the same for all is not rounded: so versions without steps have always been written.
+            # A factor that is the same for all is not rounded: so it is for files without steps.
             factors(scale_factor, part[block]) if part.any() else scale_factor
             for scale_factor, part in zip((parameters.sf_dc, parameters.sf_sh), classes, strict=True)
         )

@@ -1,39 +1,54 @@
-"""The .potr container: :func:`assemble` makes a file of coded sections, :func:`read_header` verifies one.
+"""The .potr container: :func:`assemble` makes a file of coded sections, :func:`read_header` verifies header and table.
 
-Header, section table, entropy coding of sections and checksums. Knows bytes and integers only: what the integers mean
-is the business of a version of the format (:mod:`potr_cl.codec.versions`). docs/format.md is the normative description.
+Knows bytes and integers only. docs/format.md is the normative description.
 """
 
 from __future__ import annotations
 
+import math
+import re
 import struct
 import zlib
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
-from potr_cl.codec.sections import Coder, Property, Section, context_groups, is_bytes, is_per_splat, stream_count
-from potr_cl.codec.sound_header import CRC, require_sound_header
+from potr_cl.codec.quantisers import QUANTISERS, Quantiser
+from potr_cl.codec.sections import ORDER, Coder, Property, Section
 from potr_cl.codec.steps.rule import MOST_BESIDE_GROUPS
-from potr_cl.codec.versions import VERSIONS, FormatVersion
 from potr_cl.errors import DataError, UsageError
-from potr_cl.model.claims import check_claim
+from potr_cl.model.box import Box
+from potr_cl.model.claims import FREE_SPLATS, check_claim
 from potr_cl.model.scene import LOW_PASS, MIP_SPLATTING_LOW_PASS, SH_COEFFICIENTS
 
 MAGIC = b"POTR\r\n\x1a\n"
+VERSION = 1
 #: Longest metadata that a reader accepts, bytes.
 MAX_METADATA = 1 << 16
-#: Of files of blocks, each of which is a file of another version (:mod:`potr_cl.codec.blocks`).
-VERSION_OF_BLOCKS = 4
+#: A block holds no more splats, and has no more sections; it lies no deeper.
+MOST_SPLATS, MOST_SECTIONS, MOST_LEVELS = 1 << 22, 32, 52
+#: There are no more blocks than the first number and one for each so many splats: each costs time of its own.
+FREE_BLOCKS, SPLATS_A_BLOCK = 16, 1 << 14
+#: Bytes of an integer of the plain coder, at most.
+MOST_PLANES = 7
+#: A splat, and a crowded cell of the octree, takes a bit of a file at least; what packs more is no scene.
+MOST_A_BYTE = 8
+#: A zstd frame claims no more for each byte: beyond is a lie, found before memory is taken.
+_MOST_EXPANSION = 1 << 15
 
-_FIXED = struct.Struct("<8sHHIQQBBHI8d8s8s")
-_FACTOR = struct.Struct("<d")
-_ENTRY = struct.Struct("<BBBBIQQ")
-#: Of a section in the table.
-ENTRY_BYTES = _ENTRY.size
+_FIXED = struct.Struct("<8sHBBIQIBBH")
+_BLOCK = struct.Struct("<BBBBI6f3ffd5f")
+_ENTRY = struct.Struct("<4sIII")
+_CRC = struct.Struct("<I")
+#: Bytes that tell how long the header is.
+FIXED_BYTES = _FIXED.size
+_NAME = re.compile(rb"[A-Za-z][A-Za-z0-9]{3}")
+_LARGEST_FLOAT32 = float(np.finfo(np.float32).max)
 
 #: Bits of the header's flags. A reader that does not know one refuses the file: it would show another picture.
 _ANTIALIASED, _MIP_SPLATTING = 1, 2
@@ -44,35 +59,27 @@ FLAGS = {
 }
 OF_FLAGS = {flags: kind for kind, flags in FLAGS.items()}
 
-#: A splat, and a crowded cell of the octree, takes a bit of a file at least; what packs more is no scene.
-MOST_A_BYTE = 8
-#: Beyond single precision no centre can be told.
-_LARGEST_FLOAT32 = float(np.finfo(np.float32).max)
-
-#: The most that a coder's format can expand one stored byte to: a claim beyond is a lie, found before memory is taken.
-_MOST_EXPANSION = {
-    Coder.RAW: 1,
-    Coder.ZSTD: 1 << 15,
-    Coder.DEFLATE: 1032,
-    Coder.CONTEXT: 1 << 15,
-    Coder.BUNDLES: 1 << 16,
-}
-
 
 @dataclass(frozen=True)
-class Header:
-    """All that a file says of itself outside its sections.
+class Block:
+    """All that a file says of a block outside its sections, and what it says of all blocks.
 
     Attributes:
-        splats: number of splats, >= 1.
+        splats: number of splats, 1 to :data:`MOST_SPLATS`.
         sh_degree: 0 to 3.
         origin, side, depth: root cube and deepest level of the octree (:class:`potr_cl.codec.octree.OctreeStreams`).
-        sf_scale, sf_rotation, sf_opacity, sf_dc, sf_ac: scale factors; a version may have one for all of SH.
-        sections: in the order of their bytes.
+        sf_scale, sf_rotation, sf_opacity, sf_dc, sf_ac: scale factors, single precision numbers.
+        quantiser: number of the quantiser (:data:`potr_cl.codec.quantisers.QUANTISERS`).
+        coder: of the splats' integers.
+        box: in which all centres lie.
+        level: of detail; 0 is the finest.
+        error: by how far, world units, its splats may be off those of level 0.
         antialiased, low_pass: how the scene is to be rendered (:class:`potr_cl.model.scene.Scene`).
+        sections: in the order of their bytes.
+        first: the number of its first splat among those of its level.
+        offset: of its first byte in the file.
     """
 
-    version: int
     splats: int
     sh_degree: int
     origin: tuple[float, float, float]
@@ -83,38 +90,89 @@ class Header:
     sf_opacity: float
     sf_dc: float
     sf_ac: float
-    sections: tuple[Section, ...] = field(default=())
+    quantiser: int
+    coder: Coder
+    box: Box
+    level: int = 0
+    error: float = 0.0
     antialiased: bool = False
     low_pass: float = LOW_PASS
+    sections: tuple[Section, ...] = ()
+    first: int = 0
+    offset: int = 0
 
-    def find(self, prop: Property, index: int = 0) -> Section | None:
-        """The section of a property, None where the file has none (all of its integers are 0)."""
-        return self._by_key.get((prop, index))
+    def find(self, prop: Property) -> Section | None:
+        """The section of a property, None where the block has none (all of its integers are 0)."""
+        return self._by_kind.get(prop)
 
     @cached_property
-    def _by_key(self) -> dict[tuple[Property, int], Section]:
-        return {(section.kind, section.index): section for section in self.sections}
+    def _by_kind(self) -> dict[Property, Section]:
+        return {section.kind: section for section in self.sections if section.kind}
+
+    @property
+    def rules(self) -> Quantiser:
+        """Of its values."""
+        return QUANTISERS[self.quantiser]
+
+    @property
+    def nbytes(self) -> int:
+        """Of all sections together."""
+        return sum(section.stored_bytes for section in self.sections)
+
+    def bytes_to(self, degree: int) -> int:
+        """Of those that stand before the first of SH coefficients of a higher degree."""
+        degrees = ((s.offset, s.kind.degree) for s in self.sections if s.kind is not None)
+        return min((at for at, own in degrees if own is not None and own > degree), default=self.nbytes)
 
 
-# ------------------------------------------------------------------------------------------------ entropy coding
+@dataclass(frozen=True)
+class FileHeader:
+    """All that a file says outside its sections.
+
+    Attributes:
+        blocks: level by level, the finest last.
+        sections: of the file itself, which stand before all blocks.
+        start: offset of the first of them: the header's size.
+        file_bytes: size of the whole file.
+    """
+
+    blocks: tuple[Block, ...]
+    sections: tuple[Section, ...] = ()
+    start: int = 0
+    file_bytes: int = 0
+
+    def of_level(self, level: int = 0) -> list[int]:
+        """The numbers of a level's blocks."""
+        return [number for number, block in enumerate(self.blocks) if block.level == level]
+
+    @property
+    def splats(self) -> int:
+        """Of the finest level."""
+        return sum(block.splats for block in self.blocks if block.level == 0)
+
+    @property
+    def sh_degree(self) -> int:
+        return self.blocks[0].sh_degree
 
 
-ENTROPY_CODERS = ("context", "zstd", "npz")
+# ------------------------------------------------------------------------------------------------ sections
+
+ENTROPY_CODERS = ("bundles", "zstd")
 
 
 @dataclass(frozen=True)
 class EntropyCoder:
-    """The entropy stage.
+    """The entropy stage: "bundles" (:mod:`potr_cl.codec.bundles`), or "zstd" for all (:mod:`potr_cl.codec.plain`).
 
-    "context": :mod:`potr_cl.codec.context` for all that there is one of a splat, zstd for the rest; versions of the
-    format that do not have that coder take zstd. "zstd" at a level (1 to 22). "npz": deflate at zlib's default level,
-    which is what .npz holds.
+    Attributes:
+        name: of the coder of the splats' integers.
+        level: of zstd, 1 to 22, for all that is coded by it.
 
     Raises:
         UsageError: unknown name or level.
     """
 
-    name: str = "context"
+    name: str = "bundles"
     level: int = 19
 
     def __post_init__(self) -> None:
@@ -123,27 +181,15 @@ class EntropyCoder:
         if not 1 <= self.level <= 22:
             raise UsageError(f"zstd level {self.level} is unknown: choose 1 to 22")
 
-    def section(self, prop: Property, index: int, raw: bytes, planes: int) -> tuple[Section, bytes]:
-        """Code one stream: its integers as ``planes`` byte planes; stored as they are where no coding is smaller."""
-        if self.name != "npz":
-            coder, stored = Coder.ZSTD, zstandard.ZstdCompressor(level=self.level, write_checksum=False).compress(raw)
-        else:
-            coder, stored = Coder.DEFLATE, zlib.compress(raw)
-        if len(stored) >= len(raw):
-            coder, stored = Coder.RAW, raw
-        return Section(prop, index, coder, zlib.crc32(stored), 1, len(raw) // planes, planes, len(stored)), stored
+    def section(self, prop: Property, raw: bytes) -> tuple[Section, bytes]:
+        """A section's entry and stored bytes: a zstd frame, or the content as it is where that is no larger."""
+        stored = zstandard.ZstdCompressor(level=self.level, write_checksum=False).compress(raw)
+        return section_of(prop, raw, stored if len(stored) < len(raw) else raw)
 
 
-def stream_section(
-    coder: Coder, prop: Property, index: int, streams: int, integers: int, stored: bytes
-) -> tuple[Section, bytes]:
-    """A section of a coder of streams from its stored bytes; ``integers`` of all streams together."""
-    return Section(prop, index, coder, zlib.crc32(stored), streams, integers, 0, len(stored)), stored
-
-
-def most_integers(coder: Coder, stored: bytes) -> int:
-    """How many integers, or bytes, a section of so many stored bytes may hold."""
-    return _MOST_EXPANSION[coder] * len(stored)
+def section_of(prop: Property, raw: bytes, stored: bytes) -> tuple[Section, bytes]:
+    """A section's entry and stored bytes."""
+    return Section(prop.value, len(stored), len(raw), zlib.crc32(stored)), stored
 
 
 def unchecked_bytes(data: bytes | memoryview, section: Section) -> memoryview:
@@ -164,81 +210,82 @@ def stored_bytes(data: bytes | memoryview, section: Section) -> memoryview:
         DataError: they are damaged.
     """
     if not is_sound(data, section):
-        raise DataError(f"section '{section.name}' is damaged (its checksum does not match): get the file again")
+        raise DataError(f"section '{section.title}' is damaged (its checksum does not match): get the file again")
     return unchecked_bytes(data, section)
 
 
 def read_section(data: bytes | memoryview, section: Section) -> NDArray[np.uint8]:
-    """A section's bytes before coding, for every coder but those of streams: (raw_bytes,) uint8.
+    """A section's content: (raw_bytes,) uint8.
 
     Raises:
         DataError: the stored bytes are damaged.
     """
     stored, size = stored_bytes(data, section), section.raw_bytes
-    if size is None:
-        raise DataError(f"section '{section.name}' holds what only another coder can read")
-    raw: bytes | memoryview
+    return np.frombuffer(stored if len(stored) == size else inflated(stored, size, section.title), np.uint8)
+
+
+def inflated(stored: bytes | memoryview, size: int, what: str) -> bytes:
+    """The content of one zstd frame, of which nothing is trusted, which must have a size.
+
+    Raises:
+        DataError: damaged; ``what`` is the section, for the message.
+    """
     try:
-        if section.coder == Coder.RAW:
-            raw = stored
-        elif section.coder == Coder.ZSTD:
-            if zstandard.get_frame_parameters(stored).content_size != size:
-                raise DataError(f"section '{section.name}' decompresses to another size than the header says")
-            raw = zstandard.ZstdDecompressor().decompress(stored, allow_extra_data=False)
-        else:
-            inflater = zlib.decompressobj()
-            raw = inflater.decompress(stored, size + 1)
-            if not inflater.eof or inflater.unused_data:
-                raise DataError(f"section '{section.name}' does not end where the header says")
-    except (zstandard.ZstdError, zlib.error) as error:
-        raise DataError(f"section '{section.name}' does not decompress: {error}") from None
-    if len(raw) != size:
-        raise DataError(f"section '{section.name}' decompresses to another size than the header says")
-    return np.frombuffer(raw, np.uint8)
-
-
-def raw_bytes(header: Header, data: bytes | memoryview, prop: Property, index: int = 0) -> NDArray[np.uint8]:
-    """As :func:`read_section`, of the section of a property; empty where the file has none."""
-    section = header.find(prop, index)
-    return np.empty(0, np.uint8) if section is None else read_section(data, section)
+        if zstandard.get_frame_parameters(stored).content_size == size:
+            raw = zstandard.ZstdDecompressor(max_window_size=1 << 31).decompress(stored, allow_extra_data=False)
+            if len(raw) == size:
+                return raw
+    except zstandard.ZstdError as error:
+        raise DataError(f"section '{what}' does not decompress: {error}") from None
+    raise DataError(f"section '{what}' decompresses to another size than the header says")
 
 
 # ------------------------------------------------------------------------------------------------ container
 
-
-def assemble(header: Header, coded: list[tuple[Section, bytes]]) -> list[bytes]:
-    """The pieces of a file, in order: header with the table of the coded sections, then each section's bytes."""
-    header_bytes = _FIXED.size + _ENTRY.size * len(coded) + CRC.size
-    file_bytes = header_bytes + sum(len(stored) for _, stored in coded)
-    fixed = _FIXED.pack(
-        MAGIC,
-        header.version,
-        FLAGS[header.antialiased, header.low_pass],
-        header_bytes,
-        file_bytes,
-        header.splats,
-        header.sh_degree,
-        header.depth,
-        len(coded),
-        0,
-        *header.origin,
-        header.side,
-        header.sf_scale,
-        header.sf_rotation,
-        header.sf_opacity,
-        header.sf_dc,
-        _FACTOR.pack(header.sf_ac) if VERSIONS[header.version].separate_ac_factor else bytes(_FACTOR.size),
-        bytes(8),
-    )
-    table = b"".join(_pack_entry(section) for section, _ in coded)
-    return [fixed + table + CRC.pack(zlib.crc32(fixed + table)), *(stored for _, stored in coded)]
+#: A section's entry and its stored bytes.
+CodedSection = tuple[Section, bytes]
 
 
-def read_header(data: bytes | memoryview, file_bytes: int, trust: bool = False) -> Header:
-    """Parse and verify header and section table.
+def assemble(blocks: Sequence[tuple[Block, Sequence[CodedSection]]], own: Sequence[CodedSection] = ()) -> list[bytes]:
+    """The pieces of a file, in order: header with its table, the file's own sections, then each block's.
 
-    What passes is no larger, once it is unpacked, than the number of splats and the octree's depth allow, and these are
-    in proportion to the file.
+    Args:
+        blocks: each and its sections, in their order. Levels never rise, and end at 0.
+        own: the file's.
+    """
+    head = blocks[0][0]
+    table = b"".join(_entries(own))
+    for block, coded in blocks:
+        box, factors = block.box, (block.sf_scale, block.sf_rotation, block.sf_opacity, block.sf_dc, block.sf_ac)
+        table += _BLOCK.pack(
+            block.level, block.coder, block.depth, len(coded), block.splats, *box.low, *box.high, *block.origin,
+            block.error, block.side, *factors,
+        )  # fmt: skip
+        table += b"".join(_entries(coded))
+    pieces = [stored for coded in (own, *(coded for _, coded in blocks)) for _, stored in coded]
+    size = _FIXED.size + len(table) + _CRC.size
+    flags = FLAGS[head.antialiased, head.low_pass]
+    start = _FIXED.pack(
+        MAGIC, VERSION, flags, head.sh_degree, size, size + sum(map(len, pieces)), len(blocks), head.quantiser,
+        len(own), 0,
+    )  # fmt: skip
+    return [start + table + _CRC.pack(zlib.crc32(start + table)), *pieces]
+
+
+def _entries(coded: Sequence[CodedSection]) -> list[bytes]:
+    return [_ENTRY.pack(s.name.encode(), s.stored_bytes, s.raw_bytes, s.crc) for s, _ in coded]
+
+
+def header_bytes_of(start: bytes) -> int:
+    """How many bytes the header says it has, by the first :data:`FIXED_BYTES` of a file; 0 if it is no .potr file."""
+    return int(_FIXED.unpack_from(start)[4]) if len(start) >= FIXED_BYTES and start.startswith(MAGIC) else 0
+
+
+def read_header(data: bytes | memoryview, file_bytes: int, trust: bool = False) -> FileHeader:
+    """Parse and verify header and table.
+
+    What passes is no larger, once it is unpacked, than the number of splats and the octrees' depths allow, and these
+    are in proportion to the file.
 
     Args:
         data: the first bytes of the file, all of the header at least.
@@ -248,137 +295,172 @@ def read_header(data: bytes | memoryview, file_bytes: int, trust: bool = False) 
     Raises:
         DataError: not a .potr file, a future version, damaged, truncated, or sizes that cannot be true.
     """
-    start = bytes(data[: len(MAGIC)])
+    _check_start(bytes(data[:FIXED_BYTES]), file_bytes)
+    fields = _FIXED.unpack_from(data)
+    _, version, flags, degree, size, said_bytes, count, quantiser, own, reserved = fields
+    if version != VERSION:
+        raise DataError(f"format version {version}, this potr_cl reads version {VERSION}: update potr_cl")
+    if len(data) < size:
+        raise DataError(f"truncated: the header has {size} bytes, the file {file_bytes}")
+    if size < _FIXED.size + _CRC.size or zlib.crc32(data[: size - _CRC.size]) != _CRC.unpack_from(data, size - 4)[0]:
+        raise DataError("the header is damaged (its checksum does not match): get the file again")
+    if said_bytes != file_bytes:
+        how = "truncated" if file_bytes < said_bytes else "followed by something else"
+        raise DataError(f"{how}: the file has {file_bytes} bytes, its header says {said_bytes}")
+    if flags not in OF_FLAGS or quantiser not in QUANTISERS or reserved:
+        raise DataError(f"a file with flags {flags} and quantiser {quantiser} is unknown: update potr_cl")
+    if degree >= len(SH_COEFFICIENTS) or count < 1 or own > MOST_SECTIONS:
+        raise DataError(f"the header makes no sense: {count} blocks, SH degree {degree}")
+    if not trust:  # before a long table is looked at
+        _check_number(count, FREE_SPLATS + MOST_A_BYTE * file_bytes, f"a file of {file_bytes} bytes")
+    table = _Table(data, _FIXED.size, size - _CRC.size, size, file_bytes)
+    sections = table.sections(own, (Property.METADATA,), "the file")
+    if any(section.kind is Property.METADATA and section.raw_bytes > MAX_METADATA for section in sections):
+        raise DataError(f"section 'metadata' is longer than {MAX_METADATA} bytes")
+    alike = Block(
+        1, degree, (0, 0, 0), 0, 0, 1, 1, 1, 1, 1, quantiser, Coder.PLAIN, Box((0, 0, 0), (0, 0, 0)), 0, 0.0,
+        *OF_FLAGS[flags],
+    )  # fmt: skip
+    blocks: list[Block] = []
+    for number in range(count):
+        blocks.append(table.block(number, alike, blocks[-1] if blocks else None, trust))
+    if blocks[-1].level or not table.at_end:
+        raise DataError("the sections do not fill the file, or the table its place, or the finest level is not there")
+    splats = sum(block.splats for block in blocks)
+    _check_number(count, splats, f"{splats} splats")
+    check_claim(splats, file_bytes, MOST_A_BYTE, trust)
+    return FileHeader(tuple(blocks), sections, size, file_bytes)
+
+
+def _check_start(start: bytes, file_bytes: int) -> None:
     if file_bytes == 0:
         raise DataError("the file is empty")
-    if start != MAGIC:
+    if not start.startswith(MAGIC):
         if start[:4] == MAGIC[:4]:
             raise DataError("the file was changed in transfer (line ends were converted): copy it again as binary")
         raise DataError(
             "not a .potr file (its first bytes are not 'POTR'); scenes of other formats are read by convert"
         )
-    if len(data) < _FIXED.size:
+    if len(start) < _FIXED.size:
         raise DataError(f"truncated: {file_bytes} bytes do not even hold the header")
-    version = int.from_bytes(data[8:10], "little")
-    newest = max(*VERSIONS, VERSION_OF_BLOCKS)
-    if version > newest:
-        raise DataError(f"format version {version}, this potr_cl reads up to {newest}: update potr_cl")
-    if version == VERSION_OF_BLOCKS:
-        raise DataError("a file of blocks stands where one of another version must be")
-    fields = _FIXED.unpack_from(data)
-    _, _, flags, header_bytes, said_bytes, splats, degree, depth, count, reserved = fields[:10]
-    numbers = fields[10:18]
-    counted = _FIXED.size + _ENTRY.size * count + CRC.size
-    require_sound_header(data, header_bytes, counted, "sections", said_bytes, file_bytes)
-    rules = VERSIONS.get(version)
-    if rules is not None and rules.separate_ac_factor:
-        (sf_ac,) = _FACTOR.unpack(fields[18])
-    else:
-        sf_ac = numbers[7]
-        reserved = reserved or any(fields[18])
-    if rules is None or flags not in OF_FLAGS or reserved or any(fields[19]):
-        raise DataError(f"format version {version} with flags {flags} is unknown: update potr_cl")
-    if degree >= len(SH_COEFFICIENTS) or splats < 1 or depth > 52:
-        raise DataError(f"the header makes no sense: {splats} splats, SH degree {degree}, octree of {depth} levels")
-    if not all(abs(x) <= _LARGEST_FLOAT32 for x in numbers[:3]) or not 0 <= numbers[3] <= 2 * _LARGEST_FLOAT32:
-        raise DataError("the header makes no sense: its root cube is not finite")
-    if not all(1e-3 <= x <= 1e9 for x in (*numbers[4:], sf_ac)):
-        raise DataError("the header makes no sense: a scale factor outside 0.001 to 1e9")
-    sections = _read_table(data, count, header_bytes, file_bytes, rules, splats, degree)
-    _check_sizes(sections, splats, depth)
-    check_claim(splats, file_bytes, MOST_A_BYTE, trust)
-    cells = sum(section.integers for section in sections if section.kind == Property.OCCUPANCY)
-    check_claim(cells, file_bytes, MOST_A_BYTE, trust, "octree cells")
-    origin, side = (numbers[0], numbers[1], numbers[2]), numbers[3]
-    sf_scale, sf_rotation, sf_opacity, sf_dc = numbers[4:8]
-    return Header(
-        version, splats, degree, origin, side, depth, sf_scale, sf_rotation, sf_opacity, sf_dc, sf_ac, sections,
-        *OF_FLAGS[flags],
-    )  # fmt: skip
 
 
-def _pack_entry(section: Section) -> bytes:
-    """A table entry: one field is the number of streams or of planes, one that of integers or of bytes."""
-    of_streams = section.coder.of_streams
-    return _ENTRY.pack(
-        section.kind,
-        section.index,
-        section.coder,
-        section.streams if of_streams else section.planes,
-        section.crc,
-        section.integers if of_streams else section.planes * section.integers,
-        section.stored_bytes,
-    )
+def _check_number(blocks: int, splats: int, what: str) -> None:
+    if blocks > FREE_BLOCKS + splats // SPLATS_A_BLOCK:
+        raise DataError(f"{blocks} blocks are too many for {what}")
 
 
-def _read_table(
-    data: bytes | memoryview, count: int, offset: int, file_bytes: int, rules: FormatVersion, splats: int, degree: int
-) -> tuple[Section, ...]:
-    sections: list[Section] = []
-    seen: set[tuple[int, int]] = set()
-    for i in range(count):
-        # As in _pack_entry: streams or planes, integers or bytes.
-        prop, index, coder, number, crc, size, stored_bytes = _ENTRY.unpack_from(data, _FIXED.size + i * _ENTRY.size)
-        of_streams = coder in (Coder.CONTEXT, Coder.BUNDLES)
-        streams, planes = (number, 0) if of_streams else (1, number)
-        integers = size if of_streams else size // max(planes, 1)
-        try:
-            section = Section(Property(prop), index, Coder(coder), crc, streams, integers, planes, stored_bytes, offset)
-        except ValueError:
-            raise DataError(f"section {i} has an unknown kind ({prop}) or coder ({coder}): update potr_cl") from None
-        what = f"section '{section.name}'"
-        if index >= stream_count(section.kind) or any((prop, k) in seen for k in section.indices):
-            raise DataError(f"{what} has an impossible index or stands twice")
-        if section.kind == Property.SH and index >= 3 * SH_COEFFICIENTS[degree]:
-            raise DataError(f"{what} does not belong to SH degree {degree}")
-        if section.kind == Property.STEPS and not rules.colour_steps:
-            raise DataError(f"{what} does not belong to format version {rules.number}")
-        if section.coder not in rules.coders:
-            raise DataError(f"{what} is of coder {coder}, which format version {rules.number} does not have")
-        if of_streams and (index, streams) not in context_groups(section.kind, degree):
-            raise DataError(f"{what} cannot hold {streams} streams of coder {coder}")
-        if not of_streams and not 1 <= planes <= (1 if is_bytes(section.kind) else 8):
-            raise DataError(f"{what} holds integers of {planes} bytes")
-        if size != integers * max(planes, 1) or (is_per_splat(section.kind) and integers != splats * streams):
-            units = "integers" if of_streams else "bytes"
-            raise DataError(f"{what} holds {size} {units}, which does not fit {splats} splats of {number} {units} each")
-        if stored_bytes > file_bytes - offset:
-            raise DataError(f"{what} reaches beyond the end of the file")
-        if size > stored_bytes * _MOST_EXPANSION[section.coder]:
-            raise DataError(f"{what} claims a size of {size}, more than its {stored_bytes} stored bytes can hold")
-        if section.kind == Property.METADATA and size > MAX_METADATA:
-            raise DataError(f"{what} is longer than {MAX_METADATA} bytes")
-        seen.update((prop, k) for k in section.indices)
-        sections.append(section)
-        offset += stored_bytes
-    if offset != file_bytes:
-        raise DataError("the sections do not fill the file")
-    if (Property.OPACITY, 0) not in seen:
-        raise DataError("there is no opacity section")
-    bundled = {section.coder == Coder.BUNDLES for section in sections if is_per_splat(section.kind)}
-    if len(bundled) > 1:
-        raise DataError(f"only some sections of splats are of coder {Coder.BUNDLES.value}")
-    return tuple(sections)
+class _Table:
+    """The entries of header and blocks, one after another.
+
+    Args:
+        data: the header.
+        at, end: where the table begins and ends in it.
+        offset: of the first section in the file.
+        file_bytes: size of the file.
+    """
+
+    def __init__(self, data: bytes | memoryview, at: int, end: int, offset: int, file_bytes: int) -> None:
+        self._data, self._at, self._end, self._offset, self._file_bytes = data, at, end, offset, file_bytes
+
+    @property
+    def at_end(self) -> bool:
+        """Whether the table has been read to its end, and its sections fill the file."""
+        return self._at == self._end and self._offset == self._file_bytes
+
+    def _next(self, form: struct.Struct) -> tuple[Any, ...]:
+        if self._at + form.size > self._end:
+            raise DataError("the header is damaged (its table is longer than it says): get the file again")
+        self._at += form.size
+        return form.unpack_from(self._data, self._at - form.size)
+
+    def sections(self, count: int, known: Sequence[Property], where: str) -> tuple[Section, ...]:
+        """The next entries; sections that are known stand in their order."""
+        found: list[Section] = []
+        start, place = self._offset, 0
+        for _ in range(count):
+            name, stored, raw, crc = self._next(_ENTRY)
+            if not _NAME.fullmatch(name):
+                raise DataError(f"{where} has a section whose name is no name: get the file again")
+            section = Section(name.decode(), stored, raw, crc, self._offset - start)
+            what = f"section '{section.title}'"
+            if section.kind in known:
+                if section.kind not in known[place:]:
+                    raise DataError(f"{what} stands twice, or not in its place")
+                place = known.index(section.kind) + 1
+            elif section.required:
+                raise DataError(f"{where} needs a section '{section.name}' that this potr_cl does not know: update it")
+            if stored > self._file_bytes - self._offset:
+                raise DataError(f"{what} reaches beyond the end of the file")
+            if raw > stored * _MOST_EXPANSION:
+                raise DataError(f"{what} claims a size of {raw}, more than its {stored} stored bytes can hold")
+            self._offset += stored
+            found.append(section)
+        return tuple(found)
+
+    def block(self, number: int, alike: Block, before: Block | None, trust: bool) -> Block:
+        """The next block, with what is the same in all."""
+        what = f"block {number}"
+        level, coder, depth, count, splats, *reals = self._next(_BLOCK)
+        corners, origin, (error, side), factors = reals[:6], reals[6:9], reals[9:11], reals[11:]
+        if coder not in tuple(Coder) or (coder == Coder.BUNDLES and not alike.rules.colour_steps):
+            raise DataError(f"{what} is of coder {coder}, which is unknown: update potr_cl")
+        if not 1 <= splats <= MOST_SPLATS or depth > MOST_LEVELS or count > MOST_SECTIONS:
+            raise DataError(f"{what} makes no sense: {splats} splats, octree of {depth} levels, {count} sections")
+        if not all(map(math.isfinite, corners)) or any(a > b for a, b in zip(corners, corners[3:], strict=False)):
+            raise DataError(f"{what} makes no sense: its box is {corners}")
+        if not all(map(math.isfinite, origin)) or not 0 <= side <= 2 * _LARGEST_FLOAT32:
+            raise DataError(f"{what} makes no sense: its root cube is not finite")
+        if not all(np.float32(1e-3) <= x <= 1e9 for x in factors):
+            raise DataError(f"{what} makes no sense: a scale factor outside 0.001 to 1e9")
+        if not 0 <= error < math.inf or (before is not None and not 0 <= before.level - level <= 1):
+            raise DataError(f"{what} makes no sense: level {level}, error {error}")
+        offset, known = self._offset, [prop for prop in ORDER if (prop.degree or 0) <= alike.sh_degree]
+        sections = self.sections(count, known, what)
+        first = before.first + before.splats if before is not None and before.level == level else 0
+        block = replace(
+            alike, splats=splats, depth=depth, origin=(origin[0], origin[1], origin[2]), side=side,
+            box=Box((corners[0], corners[1], corners[2]), (corners[3], corners[4], corners[5])), level=level,
+            coder=Coder(coder), error=error, sections=sections, first=first, offset=offset,
+            **dict(zip(("sf_scale", "sf_rotation", "sf_opacity", "sf_dc", "sf_ac"), factors, strict=True)),
+        )  # fmt: skip
+        check_claim(splats, block.nbytes, MOST_A_BYTE, trust)
+        _check_sizes(block, what)
+        cells = block.find(Property.OCCUPANCY)
+        if cells is not None:
+            check_claim(cells.raw_bytes, block.nbytes, MOST_A_BYTE, trust, "octree cells")
+        return block
 
 
-def _check_sizes(sections: tuple[Section, ...], splats: int, depth: int) -> None:
-    """Check that streams that are not one integer a splat are no longer than needed, before they are unpacked.
+def _check_sizes(block: Block, what: str) -> None:
+    """Check that sections are no longer than their splats need, before they are unpacked.
 
     A level has at most as many cells with splats as there are splats. A crowded cell above the deepest level has a byte
     of occupancy; every cell but the root is such a cell, or a leaf, of which there are no more than splats.
     """
-    integers = {section.kind: section.integers for section in sections}
+    splats, depth = block.splats, block.depth
+    cells = block.find(Property.OCCUPANCY)
     most = {
         Property.OCCUPANCY: splats * depth,
-        Property.SEVERAL: (splats + integers.get(Property.OCCUPANCY, 0) + 7) // 8,
-        Property.MULTIPLICITY: splats // 2,
-        Property.TAIL_LENGTH: splats,
+        Property.SEVERAL: (splats + (cells.raw_bytes if cells else 0) + 7) // 8,
+        Property.MULTIPLICITY: 4 * (splats // 2),
+        Property.LEAF_LEVEL: splats,
         Property.TAIL: 3 * depth * ((splats + 7) // 8),
-        Property.STEPS: MOST_BESIDE_GROUPS + splats,
+        Property.STEPS: MOST_BESIDE_GROUPS + splats if block.rules.colour_steps else 0,
     }
-    for kind, limit in most.items():
-        if integers.get(kind, 0) > limit:
+    for section in block.sections:
+        kind = section.kind
+        if kind is None:
+            continue
+        limit = most.get(kind, kind.streams * (1 + MOST_PLANES * splats))
+        if kind.streams and block.coder == Coder.BUNDLES:
+            limit = section.stored_bytes  # they are stored as they are
+        if section.raw_bytes > limit:
             raise DataError(
-                f"section '{kind.name.lower()}' holds {integers[kind]} integers, more than {splats} splats in an "
+                f"{what}: section '{kind.title}' holds {section.raw_bytes} bytes, more than {splats} splats in an "
                 f"octree of {depth} levels can need"
             )
+        if kind.streams and block.coder == Coder.BUNDLES and section.raw_bytes != section.stored_bytes:
+            raise DataError(f"{what}: section '{kind.title}' is of bundles, and not stored as it is")
+    if block.find(Property.OPACITY) is None:
+        raise DataError(f"{what}: there is no opacity section")

@@ -1,34 +1,36 @@
 """From a scene to the bytes of a .potr file (:func:`code_scene`): octree, quantised streams, entropy coding.
 
-The bytes do not depend on the number of threads.
+The bytes do not depend on the number of threads, nor on how many blocks are coded side by side.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
+from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec import container, octree, quantize, sections
-from potr_cl.codec.bundles import encoder as bundles_encoder
-from potr_cl.codec.byte_planes import pack_integers
+from potr_cl.codec import container, octree, plain, quantize
+from potr_cl.codec.blocks.geometry import AnyGeometry, GeometryOfBlocks, quantise
+from potr_cl.codec.bundles import encoder as bundles
 from potr_cl.codec.colours import colour_levels
-from potr_cl.codec.container import EntropyCoder, Header
-from potr_cl.codec.context import encoder as context_encoder
-from potr_cl.codec.geometry import Geometry, quantise_geometry
-from potr_cl.codec.sections import Coder, Property, Section
+from potr_cl.codec.container import Block, CodedSection, EntropyCoder
+from potr_cl.codec.geometry import Geometry
+from potr_cl.codec.quantisers import QUANTISERS
+from potr_cl.codec.sections import ORDER, SH, Coder, Property
 from potr_cl.codec.steps.prediction import to_residuals
-from potr_cl.codec.versions import VERSIONS, FormatVersion
-from potr_cl.host.threads import thread_pool
+from potr_cl.errors import DataError
+from potr_cl.host.threads import Run, thread_pool
+from potr_cl.model.box import Box
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 
-#: Of fewer splats the models of the context coder may weigh more than they save.
-_FEW = 1 << 15
+#: Threads that a block keeps busy: with more of them, further blocks are coded beside it, up to so many.
+_THREADS_A_BLOCK, _SIDE_BY_SIDE = 4, 4
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,21 @@ class Coded:
         return sum(map(len, self.pieces))
 
 
+@dataclass(frozen=True)
+class Level:
+    """A level of detail that is to be written.
+
+    Attributes:
+        scene: whose colours are coded.
+        geometry: of the scene, with its steps of colours.
+        error: by how far, world units, its splats may be off those of the finest level.
+    """
+
+    scene: Scene
+    geometry: AnyGeometry
+    error: float = 0.0
+
+
 def code_scene(
     scene: Scene,
     parameters: quantize.HyperParameters,
@@ -59,7 +76,7 @@ def code_scene(
     entropy: EntropyCoder | None = None,
     threads: int = 0,
     progress: Callable[[str, float], None] | None = None,
-    geometry: Geometry | None = None,
+    geometry: AnyGeometry | None = None,
 ) -> Coded:
     """Quantise and code a scene as it is.
 
@@ -67,7 +84,7 @@ def code_scene(
         scene: clean, at least one splat.
         parameters: γ, β and the scale factors count.
         views: they decide how coarse centres may be; without any, γ alone does.
-        metadata: for the file's section of that name.
+        metadata: JSON, how the file was made.
         entropy: the entropy stage.
         threads: to work with; the bytes do not depend on it. 0: one a processor.
         progress: told how far each stage is.
@@ -75,219 +92,126 @@ def code_scene(
 
     Raises:
         DataError: a value too large to quantise.
-        UsageError: the file's version cannot hold the parameters.
     """
-    version = VERSIONS[parameters.version]
-    version.check(parameters)
     report = progress or (lambda stage, done: None)
-    coder = entropy or EntropyCoder()
-    with thread_pool(threads) as pool:
-        report("octree", 0.0)
-        geometry = geometry or quantise_geometry(scene, parameters, views, pool.map)
-        parameters, tree, order = geometry.parameters, geometry.tree, geometry.order
-        report("octree", 1.0)
-        stage = "quantise and code"
-        report(stage, 0.0)
-        groups = [*_octree_groups(tree), _Group(Property.METADATA, 0, [np.frombuffer(metadata, np.uint8)])]
-        if geometry.steps is not None:
-            groups.append(_Group(Property.STEPS, 0, [np.frombuffer(geometry.steps.to_bytes(), np.uint8)]))
-        plain = pool.map(partial(_plain_sections, coder=coder), groups)
-        classes = geometry.colour_classes()
-        coefficients = colour_levels(scene.sh, order, parameters, classes, pool.map)
-        chains = _chains(geometry, coefficients, classes[0] if version.colour_steps else None)
-        report(stage, 0.2)
-        coded = _code_chains(chains, coder, version, classes[0], pool, lambda done: report(stage, 0.2 + 0.7 * done))
-        coded += [pair for pairs in plain for pair in pairs]
-        report(stage, 1.0)
-    coded.sort(key=lambda pair: (pair[0].kind, pair[0].index))
-    pieces = container.assemble(
-        Header(
-            version=version.number,
-            splats=len(scene),
-            sh_degree=scene.sh_degree,
-            origin=tree.origin,
-            side=tree.side,
-            depth=tree.depth,
-            sf_scale=parameters.sf_scale,
-            sf_rotation=parameters.sf_rotation,
-            sf_opacity=parameters.sf_opacity,
-            sf_dc=parameters.sf_dc,
-            sf_ac=parameters.sf_sh,
-            antialiased=scene.antialiased,
-            low_pass=scene.low_pass,
-        ),
-        coded,
-    )
-    return Coded(pieces, order)
+    if geometry is None:
+        with thread_pool(threads) as pool:
+            report("octree", 0.0)
+            geometry = quantise(scene, parameters, views, pool.map)
+    report("octree", 1.0)
+    return code_levels([Level(scene, geometry)], metadata, entropy, threads, progress)
 
 
-@dataclass(frozen=True)
-class _Group:
-    """Streams of one property, with consecutive indices from ``index`` on.
+def code_levels(
+    levels: Sequence[Level],
+    metadata: bytes = b"",
+    entropy: EntropyCoder | None = None,
+    threads: int = 0,
+    progress: Callable[[str, float], None] | None = None,
+) -> Coded:
+    """Code a scene in one or more levels of detail.
 
-    ``final`` are integers of DC that are differences already.
+    Args:
+        levels: the finest first; quantised alike.
+        metadata, entropy, threads, progress: as of :func:`code_scene`.
+
+    Returns:
+        The file; its order is that of the finest level.
+
+    Raises:
+        As :func:`code_scene`.
     """
+    coder, threads = entropy or EntropyCoder(), threads or os.cpu_count() or 1
+    work = [
+        (level, error, *part)
+        for level, error, parts in ((k, each.error, _parts(each)) for k, each in enumerate(levels))
+        for part in parts
+    ]
+    # The coarsest comes first in a file.
+    work.sort(key=lambda each: -each[0])
+    side_by_side = max(min(threads // _THREADS_A_BLOCK, _SIDE_BY_SIDE, len(work)), 1)
+    report = _Progress(progress, len(work))
 
-    prop: Property
-    index: int
-    streams: Sequence[NDArray[np.integer]]
-    final: bool = False
-
-    @property
-    def predicted(self) -> bool:
-        """Whether coder CONTEXT stores differences of these integers."""
-        return sections.is_predicted(self.prop, self.index) and not self.final
-
-
-def _plain_sections(group: _Group, coder: EntropyCoder) -> list[tuple[Section, bytes]]:
-    """A section a stream; none where all integers are 0, but for opacity, whose length vouches for that of others."""
-    signed = sections.is_signed(group.prop)
-    coded = []
-    for index, stream in enumerate(group.streams, start=group.index):
-        if group.prop == Property.SH and index < 3 and not group.final:
-            stream = stream.astype(np.int64)
-            stream[1:] -= stream[:-1].copy()
-        if sections.is_bytes(group.prop):
-            raw, planes = stream.astype(np.uint8).tobytes(), 1
-        else:
-            raw, planes = pack_integers(stream, signed)
-        if group.prop == Property.OPACITY and not raw:
-            raw, planes = bytes(len(stream)), 1
-        if raw:
-            coded.append(coder.section(group.prop, index, raw, planes))
-    return coded
-
-
-def _code_chains(
-    chains: list[list[_Group]],
-    coder: EntropyCoder,
-    version: FormatVersion,
-    classes: NDArray[np.int8],
-    pool: ThreadPoolExecutor,
-    progress: Callable[[float], None],
-) -> list[tuple[Section, bytes]]:
-    """Sections of some groups: those of a chain tell each other's contexts, where the context coder codes them."""
-    plain = partial(_plain_sections, coder=coder)
-    coded: list[tuple[Section, bytes]] = []
-    streams_by = version.coder_of_streams if coder.name == "context" else None
-    if streams_by == Coder.BUNDLES:
-        return _code_bundles(chains, classes, plain, pool, progress)
-    if streams_by is None:
-        # Each stream by itself, so that there is something to do for every thread.
-        groups = [
-            _Group(g.prop, g.index + k, [s], g.final)
-            for chain in chains
-            for g in chain
-            for k, s in enumerate(g.streams)
-        ]
-        for done, made in enumerate(pool.map(plain, groups), start=1):
-            coded += made
-            progress(done / len(groups))
+    def code(each: tuple[int, float, Scene, Geometry]) -> tuple[Block, list[CodedSection]]:
+        with thread_pool(-(-threads // side_by_side)) as pool:
+            coded = _coded(*each, coder, pool)
+        report.one_more()
         return coded
-    kept = [[g for g in chain if g.prop == Property.OPACITY or any(s.any() for s in g.streams)] for chain in chains]
-    # For few splats one has to try.
-    few = len(chains[-1][0].streams[0]) < _FEW
-    alternatives = [[pool.submit(plain, group) for group in chain] if few else [] for chain in kept]
-    streams = [[context_encoder.Streams(g.streams, sections.is_signed(g.prop), g.predicted) for g in c] for c in kept]
-    stored = context_encoder.encode(streams, pool.map, progress)
-    for chain, groups, data, others in zip(chains, kept, stored, alternatives, strict=True):
-        contextual = None if data is None else _context_sections(groups, data, [other.result() for other in others])
-        coded += [pair for group in chain for pair in plain(group)] if contextual is None else contextual
-    return coded
+
+    report.tell(0)
+    with ThreadPoolExecutor(side_by_side) as pool:
+        futures: list[Future[tuple[Block, list[CodedSection]]]] = [pool.submit(code, each) for each in work]
+        try:
+            blocks = [future.result() for future in futures]
+        finally:
+            # After an error nothing that has not begun should begin.
+            for future in futures:
+                future.cancel()
+    own = [coder.section(Property.METADATA, metadata)] if metadata else []
+    return Coded(container.assemble(blocks, own), levels[0].geometry.order)
 
 
-def _code_bundles(
-    chains: list[list[_Group]],
-    classes: NDArray[np.int8],
-    plain: Callable[[_Group], list[tuple[Section, bytes]]],
-    pool: ThreadPoolExecutor,
-    progress: Callable[[float], None],
-) -> list[tuple[Section, bytes]]:
-    """All sections of splats by coder BUNDLES; none where they would be smaller without, or the format forbids it."""
-    groups = [group for chain in chains for group in chain]
-    kept = [g for g in groups if g.prop == Property.OPACITY or any(s.any() for s in g.streams)]
-    splats = len(groups[0].streams[0])
-    # For few splats one has to try.
-    others = [pool.submit(plain, group) for group in kept] if splats < _FEW else []
-    stored = bundles_encoder.encode({(g.prop, g.index): g.streams for g in kept}, classes, pool.map, progress)
-    made = []
-    for group in kept if stored else []:
-        data = (stored or {})[group.prop, group.index]
-        integers = len(group.streams) * splats
-        if integers > container.most_integers(Coder.BUNDLES, data):
-            break
-        made.append(
-            container.stream_section(Coder.BUNDLES, group.prop, group.index, len(group.streams), integers, data)
-        )
-    if len(made) == len(kept) and not others:
-        return made
-    alternative = [pair for group in (others or kept) for pair in _plain_of(group, plain)]
-    return min((made, alternative), key=_bytes_of) if len(made) == len(kept) else alternative
+def _parts(level: Level) -> list[tuple[Scene, Geometry]]:
+    """The scene and the geometry of each block."""
+    geometry = level.geometry
+    if isinstance(geometry, GeometryOfBlocks):
+        return [(level.scene.subset(rows), block) for rows, block in zip(geometry.rows, geometry.blocks, strict=True)]
+    return [(level.scene, geometry)]
 
 
-def _plain_of(
-    group: _Group | Future[list[tuple[Section, bytes]]], plain: Callable[[_Group], list[tuple[Section, bytes]]]
-) -> list[tuple[Section, bytes]]:
-    return group.result() if isinstance(group, Future) else plain(group)
+def _coded(
+    level: int, error: float, scene: Scene, geometry: Geometry, coder: EntropyCoder, pool: ThreadPoolExecutor
+) -> tuple[Block, list[CodedSection]]:
+    """A block and its sections."""
+    parameters, tree = geometry.parameters, geometry.tree
+    rules = QUANTISERS[parameters.quantiser]
+    octree_bytes = {
+        Property.OCCUPANCY: tree.occupancy,
+        Property.SEVERAL: tree.several,
+        Property.MULTIPLICITY: tree.multiplicities.astype("<u4"),
+        Property.LEAF_LEVEL: tree.leaf_levels,
+        Property.TAIL: tree.tails,
+    }
+    raw = {prop: stream.tobytes() for prop, stream in octree_bytes.items() if len(stream)}
+    if geometry.steps is not None:
+        raw[Property.STEPS] = geometry.steps.to_bytes()
+    others = [pool.submit(coder.section, prop, content) for prop, content in raw.items()]
+    classes = geometry.colour_classes()
+    levels = colour_levels(scene.sh, geometry.order, parameters, classes, pool.map)
+    values: dict[Property, list[NDArray[np.integer]]] = {
+        Property.OPACITY: [geometry.opacities],
+        Property.SCALE: [*geometry.scales],
+        Property.ROTATION: [*geometry.rotations],
+    }
+    for degree in range(scene.sh_degree + 1):
+        values[SH[degree]] = list(levels[degree**2 : (degree + 1) ** 2].reshape(-1, len(scene)))
+    kind, coded = Coder.PLAIN, None
+    if coder.name == "bundles" and rules.colour_steps:
+        kind, coded = Coder.BUNDLES, _in_bundles(values, classes[0], pool.map)
+    if coded is None:
+        kind, coded = Coder.PLAIN, plain.encode(values, coder, pool.map)
+    if coded is None:
+        raise DataError("a splat's integers have more than 56 bits: lower the scale factors")
+    coded += [future.result() for future in others]
+    place = {prop.value: k for k, prop in enumerate(ORDER)}
+    coded.sort(key=lambda pair: place[pair[0].name])
+    factors = (parameters.sf_scale, parameters.sf_rotation, parameters.sf_opacity, parameters.sf_dc, parameters.sf_sh)
+    block = Block(
+        len(scene), scene.sh_degree, tree.origin, tree.side, tree.depth, *factors, parameters.quantiser, kind,
+        _box(geometry), level, error, scene.antialiased, scene.low_pass,
+    )  # fmt: skip
+    return block, coded
 
 
-def _bytes_of(coded: list[tuple[Section, bytes]]) -> int:
-    return sum(len(data) + container.ENTRY_BYTES for _, data in coded)
-
-
-def _context_sections(
-    groups: list[_Group], stored: list[bytes], others: list[list[tuple[Section, bytes]]]
-) -> list[tuple[Section, bytes]] | None:
-    """A section a group; None where one of the others, which are plain, is smaller, or the format does not allow it."""
-    made = []
-    for group, data in zip(groups, stored, strict=True):
-        integers = len(group.streams) * len(group.streams[0])
-        if integers > container.most_integers(Coder.CONTEXT, data):
-            return None
-        made.append(
-            container.stream_section(Coder.CONTEXT, group.prop, group.index, len(group.streams), integers, data)
-        )
-    for (_, data), plain in zip(made, others, strict=False):
-        if sum(len(p) for _, p in plain) + 24 * (len(plain) - 1) < len(data):
-            return None
-    return made
-
-
-def _octree_groups(tree: octree.OctreeStreams) -> list[_Group]:
-    streams: list[tuple[Property, NDArray[np.unsignedinteger]]] = [
-        (Property.TAIL, tree.tails),
-        (Property.OCCUPANCY, tree.occupancy),
-        (Property.SEVERAL, tree.several),
-        (Property.TAIL_LENGTH, tree.tail_lengths),
-        (Property.MULTIPLICITY, tree.multiplicities),
-    ]
-    return [_Group(prop, 0, [stream]) for prop, stream in streams if len(stream)]
-
-
-def _chains(
-    geometry: Geometry, coefficients: NDArray[np.signedinteger], classes: NDArray[np.int8] | None
-) -> list[list[_Group]]:
-    """All integers of splats; the groups of a chain tell each other's contexts, the longest chain comes first.
-
-    With ``classes`` of the steps of DC, DC is predicted as values rather than by the coder.
-    """
-    degree = round(len(coefficients) ** 0.5) - 1
-    if classes is None:
-        dc = _Group(Property.SH, 0, list(coefficients[0]))
-    else:
-        residuals = to_residuals(coefficients[0].astype(np.int64), classes)
-        dc = _Group(Property.SH, 0, [_narrowed(row) for row in residuals], final=True)
-    bands = [
-        _Group(Property.SH, 3 * first, list(coefficients[first:end].reshape(-1, coefficients.shape[2])))
-        for first, end in ((band**2, (band + 1) ** 2) for band in range(1, degree + 1))
-    ]
-    return [
-        bands,
-        [_Group(Property.ROTATION, 0, geometry.rotations)],
-        [_Group(Property.SCALE, 0, geometry.scales)],
-        [dc],
-        [_Group(Property.OPACITY, 0, [geometry.opacities])],
-    ]
+def _in_bundles(
+    values: dict[Property, list[NDArray[np.integer]]], classes: NDArray[np.int8], run: Run
+) -> list[CodedSection] | None:
+    """Sections of coder BUNDLES; None where an integer is too large."""
+    dc = to_residuals(np.stack(values[Property.SH0], dtype=np.int64), classes)
+    streams: dict[Property, list[NDArray[np.integer]]] = {**values, Property.SH0: [_narrowed(row) for row in dc]}
+    kept = {k: own for k, own in streams.items() if k is Property.OPACITY or any(stream.any() for stream in own)}
+    stored = bundles.encode(kept, classes, run)
+    return None if stored is None else [container.section_of(prop, data, data) for prop, data in stored.items()]
 
 
 def _narrowed(integers: NDArray[np.int64]) -> NDArray[np.signedinteger]:
@@ -297,3 +221,26 @@ def _narrowed(integers: NDArray[np.int64]) -> NDArray[np.signedinteger]:
         if largest <= np.iinfo(dtype).max:
             return integers.astype(dtype)
     return integers
+
+
+def _box(geometry: Geometry) -> Box:
+    """Around the centres as they are decoded."""
+    means = geometry.centres if geometry.centres is not None else octree.parse(geometry.tree, len(geometry.order))
+    low, high = means.min(axis=0).tolist(), means.max(axis=0).tolist()
+    return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+
+
+class _Progress:
+    """Counts blocks that are done, from any thread."""
+
+    def __init__(self, tell: Callable[[str, float], None] | None, blocks: int) -> None:
+        self._tell, self._blocks, self._done, self._lock = tell, blocks, 0, Lock()
+
+    def one_more(self) -> None:
+        with self._lock:
+            self._done += 1
+            self.tell(self._done / self._blocks)
+
+    def tell(self, part: float) -> None:
+        if self._tell is not None:
+            self._tell("quantise and code", part)

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from potr_cl.codec import octree, quantize
 from potr_cl.codec.native.library import native
 from potr_cl.codec.outliers import check_positions, may_be_coarse
+from potr_cl.codec.quantisers import QUANTISERS
 from potr_cl.codec.splat_levels import BLOCK, SplatLevels, splat_levels
 from potr_cl.codec.steps.fitting import fit_steps
 from potr_cl.codec.steps.rule import ColourSteps
-from potr_cl.codec.versions import VERSIONS
 from potr_cl.host.threads import Run, in_background
 from potr_cl.model.camera import Camera, camera_centres
 from potr_cl.model.scene import Scene
@@ -72,20 +72,20 @@ class Geometry:
     def decode_to(self, scene: Scene, order: NDArray[np.int64], run: Run = map) -> None:
         """Fill all but the colours of some splats of a scene; ``order`` (N,) are their numbers there."""
         parameters, n = self.parameters, len(order)
-        version = VERSIONS[parameters.version]
+        rules = QUANTISERS[parameters.quantiser]
         found = octree.parse(self.tree, n, run, -(-n // BLOCK)) if self.centres is None else self.centres
 
         def fill(start: int) -> None:
             part = slice(start, min(start + BLOCK, n))
             rows, scales = order[part], [axis[part] for axis in self.scales]
             scene.means[rows] = found[part]
-            log_scales = [version.dequantize_scales(levels, parameters.sf_scale) for levels in scales]
+            log_scales = [rules.dequantize_scales(levels, parameters.sf_scale) for levels in scales]
             scene.log_scales[rows] = np.stack(log_scales, axis=1)
             turned = np.empty((len(rows), 4), np.float32)
-            factors = version.rotation_factors(scales, parameters.sf_rotation)
+            factors = rules.rotation_factors(scales, parameters.sf_rotation)
             quantize.dequantize_rotations([axis[part] for axis in self.rotations], factors, turned)
             scene.quaternions[rows] = turned
-            scene.opacity_logits[rows] = version.dequantize_opacities(self.opacities[part], parameters.sf_opacity)
+            scene.opacity_logits[rows] = rules.dequantize_opacities(self.opacities[part], parameters.sf_opacity)
 
         list(run(fill, range(0, n, BLOCK)))
 
@@ -121,7 +121,7 @@ class Geometry:
         """
         world = self.parameters
         tolerance = np.maximum(world.gamma, world.beta * distances_to_views(means, views, run))
-        tree, order = octree.build(means, tolerance, absolute=VERSIONS[world.version].absolute_leaf_levels)
+        tree, order = octree.build(means, tolerance, absolute=QUANTISERS[world.quantiser].absolute_leaf_levels)
         place = np.empty(len(order), np.int64)
         place[self.order] = np.arange(len(order))
         was = place[order]
@@ -177,9 +177,9 @@ def quantise_geometry(
     Raises:
         DataError: a value too large to quantise, or a splat too far from the others to keep them exact.
     """
-    version = VERSIONS[parameters.version]
+    rules = QUANTISERS[parameters.quantiser]
     nearest = distances_to_views(scene.means, views, run)
-    world = version.in_world_units(parameters, scene, nearest, run)
+    world = rules.in_world_units(parameters, scene, nearest, run)
     return quantise_in_world_units(scene, None, parameters, world, nearest, run)[0]
 
 
@@ -204,7 +204,7 @@ def quantise_in_world_units(
     Raises:
         As :func:`quantise_geometry`.
     """
-    absolute = VERSIONS[parameters.version].absolute_leaf_levels
+    absolute = QUANTISERS[parameters.quantiser].absolute_leaf_levels
 
     def begun(numbers: NDArray[np.int64] | None, run: Run = map) -> octree.Begun:
         own = slice(None) if numbers is None else numbers

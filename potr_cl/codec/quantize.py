@@ -3,7 +3,7 @@
 A *level* is the integer that a value is rounded to; a *step* is the distance of two neighbouring levels' values, 1 / SF
 with the scale factor SF. Levels are those of the *activated* values (paper section "Codec", eq. for quantisation and
 dequantisation): standard deviations, opacities after the sigmoid, unit quaternions without their real part, SH
-coefficients in YCoCg. Which function an attribute takes is up to the file's version (:mod:`potr_cl.codec.versions`).
+coefficients in YCoCg. Which function an attribute takes is up to the quantiser (:mod:`potr_cl.codec.quantisers`).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Integers = NDArray[np.signedinteger]
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-#: "paper": the paper's steps and its file (version 1). "best": steps of equal worth, a small file. "smallest": the same
+#: "paper": the paper's steps and coder. "best": steps of equal worth, a small file. "smallest": the same
 #: with more looks at more views. "fast": the
 #: same with fewer looks at the views and quick coding.
 Preset = Literal["paper", "fast", "best", "smallest"]
@@ -42,6 +42,8 @@ _ROWS = 1 << 11
 #: Logarithms of levels are looked up in tables of two to the power of these: small ones are made in no time, large ones
 #: fit a second-level cache.
 _SMALLEST_TABLE, _LARGEST_TABLE = 8, 16
+#: Splats of a block that may be asked for: fewer would make more blocks than readers take.
+FEWEST_OF_A_BLOCK, MOST_OF_A_BLOCK = 1 << 14, 1 << 22
 #: Integers beyond this are not exact in float64; no sane scene comes near.
 _LARGEST = 2.0**53
 
@@ -51,22 +53,23 @@ class HyperParameters:
     """What one quality q sets; each can be replaced on its own.
 
     Attributes:
-        version: of the file format: how levels are made of values (:data:`potr_cl.codec.versions.VERSIONS`).
+        quantiser: how levels are made (:data:`potr_cl.codec.quantisers.QUANTISERS`): 0 the paper's way, 1 balanced.
         lam: λ, how strongly SH compaction pulls AC coefficients to zero, pixels squared.
         alpha: two SH columns whose cosine exceeds it count as parallel.
         delta_mse_max: ΔMSE_MAX: a splat may go if its removal changes the mean squared error by less.
         drop: the same for an AC coefficient, given up by the re-fit of the colours.
-        beta: allowed distance of a centre to its leaf's centre: version 1: as a part of the distance to the nearest
-            camera; version 2: as a part of a typical splat's size at that distance.
+        beta: allowed distance of a centre to its leaf's centre: the paper's: as a part of the distance to the nearest
+            camera; balanced: as a part of a typical splat's size at that distance.
         gamma: the least such distance, world units.
-        sf_dc, sf_sh: scale factors of constant and of all other SH coefficients; a quantiser step is 1 / SF. Version 3:
+        sf_dc, sf_sh: scale factors of constant and of all other SH coefficients; a quantiser step is 1 / SF. Balanced:
             of steps that, the same for all splats, would show as much as the splats' own.
-        sf_opacity: of opacities; version 2: of their logits.
-        sf_rotation: of quaternions; version 2: times the root of the largest level of the splat's three scales.
-        sf_scale: of standard deviations, world units; version 2: steps in a typical splat's size.
+        sf_opacity: of opacities; balanced: of their logits.
+        sf_rotation: of quaternions; balanced: times the root of the largest level of the splat's three scales.
+        sf_scale: of standard deviations, world units; balanced: steps in a typical splat's size.
+        block_splats: most splats of a block of the file; 0: as suits a file on a disk.
     """
 
-    version: int
+    quantiser: int
     lam: float
     alpha: float
     delta_mse_max: float
@@ -78,6 +81,7 @@ class HyperParameters:
     sf_opacity: float
     sf_rotation: float
     sf_scale: float
+    block_splats: float = 0
 
     @staticmethod
     def from_quality(q: float, preset: Preset = "paper", **replaced: float | None) -> HyperParameters:
@@ -102,6 +106,8 @@ class HyperParameters:
                 low, high = 1e-30, 1.0
             if field.name.startswith("sf_"):
                 low, high = 1e-3, 1e9
+            if field.name == "block_splats" and value:
+                low, high = FEWEST_OF_A_BLOCK, MOST_OF_A_BLOCK
             if not low <= value <= high:
                 raise UsageError(f"{field.name} is {value:g}, it must lie between {low:g} and {high:g}")
         return values
@@ -111,7 +117,7 @@ def _paper(q: float, given: Mapping[str, float]) -> HyperParameters:
     # The paper has one factor for all of SH.
     sf_sh = given.get("sf_sh", 1 + 100 * q)
     values = HyperParameters(
-        version=1,
+        quantiser=0,
         lam=10**-q,
         alpha=1 / (1 + math.exp(-3 * q)),
         delta_mse_max=10 ** (-8.8 - 2 * q),
@@ -136,7 +142,7 @@ def _balanced(q: float, given: Mapping[str, float]) -> HyperParameters:
     delta_mse_max = 10 ** (-8.3 - 2 * q)
     values = replace(
         _paper(q, {}),
-        version=3,
+        quantiser=1,
         delta_mse_max=delta_mse_max,
         drop=delta_mse_max / 14,
         beta=0.056 / finer,

@@ -1,8 +1,4 @@
-"""What a file's sections are: the properties that they hold, the streams of each property, and a table entry.
-
-A *stream* is a sequence of integers; most hold one integer a splat. Coders CONTEXT and BUNDLES store several streams in
-one section, every other coder one.
-"""
+"""What sections hold: :class:`Property`, by the name in the file; and a table entry, :class:`Section`."""
 
 from __future__ import annotations
 
@@ -10,132 +6,91 @@ import enum
 from dataclasses import dataclass
 
 
-class Property(enum.IntEnum):
-    """What a section holds."""
+class Property(enum.Enum):
+    """What a section holds, in the order in which sections stand. A reader may skip those that begin in lower case."""
 
-    METADATA = 0
-    OCCUPANCY = 1
-    SEVERAL = 2
-    MULTIPLICITY = 3
-    TAIL_LENGTH = 4
-    TAIL = 5
-    STEPS = 6
-    SCALE = 16
-    ROTATION = 17
-    OPACITY = 18
-    SH = 19
+    OCCUPANCY = "OCCU"
+    SEVERAL = "SEVE"
+    MULTIPLICITY = "MULT"
+    LEAF_LEVEL = "LEAF"
+    TAIL = "TAIL"
+    STEPS = "STEP"
+    OPACITY = "OPAC"
+    SCALE = "SCAL"
+    ROTATION = "ROTA"
+    SH0 = "SHC0"
+    SH1 = "SHC1"
+    SH2 = "SHC2"
+    SH3 = "SHC3"
+    METADATA = "meta"
+
+    @property
+    def degree(self) -> int | None:
+        """Of the SH coefficients in it; None: it holds none."""
+        return SH.index(self) if self in SH else None
+
+    @property
+    def streams(self) -> int:
+        """How many integers it holds of each splat; 0: it does not hold the same of each."""
+        if self in SH:
+            return 3 * (2 * SH.index(self) + 1)
+        return {Property.OPACITY: 1, Property.SCALE: 3, Property.ROTATION: 3}.get(self, 0)
+
+    @property
+    def signed(self) -> bool:
+        """Whether its integers can be negative, and so are zig-zag mapped."""
+        return self is Property.ROTATION or self in SH
+
+    @property
+    def title(self) -> str:
+        """For messages and tables."""
+        return self.name.lower().replace("_", " ")
+
+
+#: The sections of SH coefficients, by degree.
+SH = (Property.SH0, Property.SH1, Property.SH2, Property.SH3)
+#: All sections of a block, in their order.
+ORDER = tuple(prop for prop in Property if prop is not Property.METADATA)
 
 
 class Coder(enum.IntEnum):
-    """How a section's integers are stored."""
+    """How a block's integers of splats are coded."""
 
-    RAW = 0
-    ZSTD = 1
-    DEFLATE = 2
-    CONTEXT = 3
-    BUNDLES = 4
-
-    @property
-    def of_streams(self) -> bool:
-        """Whether it stores several streams in a section, as integers and not as bytes."""
-        return self in (Coder.CONTEXT, Coder.BUNDLES)
-
-
-_STREAMS = {
-    Property.METADATA: 1,
-    Property.OCCUPANCY: 1,
-    Property.SEVERAL: 1,
-    Property.MULTIPLICITY: 1,
-    Property.TAIL_LENGTH: 1,
-    Property.TAIL: 1,
-    Property.STEPS: 1,
-    Property.SCALE: 3,
-    Property.ROTATION: 3,
-    Property.OPACITY: 1,
-    Property.SH: 48,
-}
-_SIGNED = {Property.ROTATION, Property.SH}
-_PER_SPLAT = {Property.SCALE, Property.ROTATION, Property.OPACITY, Property.SH}
-_BYTES = {
-    Property.METADATA,
-    Property.OCCUPANCY,
-    Property.SEVERAL,
-    Property.TAIL_LENGTH,
-    Property.TAIL,
-    Property.STEPS,
-}
+    PLAIN = 0
+    BUNDLES = 1
 
 
 @dataclass(frozen=True)
 class Section:
-    """One entry of the section table.
+    """One entry of a table.
 
     Attributes:
-        kind: what it holds.
-        index: of its first stream within the property: the axis of a scale or rotation; 3 · coefficient + channel of
-            SH; else 0.
-        coder: how it is stored.
-        crc: CRC-32 of the stored bytes.
-        streams: number of streams in it; more than one for coders of streams only.
-        integers: number of integers in it, those of all streams together; bytes where the property is one of bytes.
-        planes: bytes an integer before the coder; 0 for coders of streams, whose integers are never bytes.
+        name: four letters or digits.
         stored_bytes: its size in the file.
-        offset: of the stored bytes in the file.
+        raw_bytes: size of its content; the same if it is stored as it is, else it is a zstd frame.
+        crc: CRC-32 of the stored bytes.
+        offset: of the stored bytes, from the first byte of the block, or of the file's own sections.
     """
 
-    kind: Property
-    index: int
-    coder: Coder
-    crc: int
-    streams: int
-    integers: int
-    planes: int
+    name: str
     stored_bytes: int
+    raw_bytes: int
+    crc: int
     offset: int = 0
 
     @property
-    def raw_bytes(self) -> int | None:
-        """Size before the coder; None for coders of streams, where there is no such thing."""
-        return None if self.coder.of_streams else self.planes * self.integers
+    def kind(self) -> Property | None:
+        """None: not known to this version of the package, which may skip it."""
+        return _BY_NAME.get(self.name)
 
     @property
-    def indices(self) -> range:
-        """Of its streams within the property."""
-        return range(self.index, self.index + self.streams)
+    def required(self) -> bool:
+        """Whether a reader that does not know it must refuse the file."""
+        return self.name[0].isupper()
 
     @property
-    def name(self) -> str:
-        """For messages and tables."""
-        return self.kind.name.lower() + (f" {self.index}" if _STREAMS[self.kind] > 1 else "")
+    def title(self) -> str:
+        return self.kind.title if self.kind else self.name
 
 
-def stream_count(prop: Property) -> int:
-    """The most streams that a property can have."""
-    return _STREAMS[prop]
-
-
-def is_signed(prop: Property) -> bool:
-    """Whether a property's integers can be negative, and so are zig-zag mapped."""
-    return prop in _SIGNED
-
-
-def is_per_splat(prop: Property) -> bool:
-    """Whether a property's streams hold one integer a splat."""
-    return prop in _PER_SPLAT
-
-
-def is_bytes(prop: Property) -> bool:
-    """Whether a property's integers are bytes whose number means something, zeros included."""
-    return prop in _BYTES
-
-
-def is_predicted(prop: Property, index: int) -> bool:
-    """Whether coders of streams store a property's differences from the splats before."""
-    return prop == Property.SH and index == 0
-
-
-def context_groups(prop: Property, degree: int) -> list[tuple[int, int]]:
-    """The sections of coders of streams that a property can have: index and number of streams of each."""
-    if prop == Property.SH:
-        return [(3 * band**2, 3 * (2 * band + 1)) for band in range(degree + 1)]
-    return [(0, _STREAMS[prop])] if prop in _PER_SPLAT else []
+_BY_NAME = {prop.value: prop for prop in Property}

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from potr_cl.codec import quantize
 from potr_cl.codec.native.functions import Functions
 from potr_cl.codec.native.library import native
-from potr_cl.codec.versions import VERSIONS, Version2
+from potr_cl.codec.quantisers import QUANTISERS, Balanced
 from potr_cl.host.threads import Run
 from potr_cl.model.scene import Scene
 
@@ -50,16 +50,16 @@ def splat_levels(scene: Scene, order: I64, world: quantize.HyperParameters, run:
     Raises:
         DataError: a value too large to quantise.
     """
-    version, functions = VERSIONS[world.version], native()
-    if functions is not None and version.quantises_splats_as(Version2):
+    rules, functions = QUANTISERS[world.quantiser], native()
+    if functions is not None and isinstance(rules, Balanced):
         found = _natively(functions, scene, order, world, run)
         if found is not None:
             return found
     imaginary, log_scales = _canonical(scene, order, run)
-    scales = list(run(lambda part: version.quantize_scales(part.astype(np.float64), world.sf_scale), log_scales.T))
+    scales = list(run(lambda part: rules.quantize_scales(part.astype(np.float64), world.sf_scale), log_scales.T))
     logits = scene.opacity_logits[order].astype(np.float64)
-    rotations = version.quantize_rotations(imaginary, scales, world.sf_rotation, run)
-    opacities = version.quantize_opacities(logits, world.sf_opacity)
+    rotations = rules.quantize_rotations(imaginary, scales, world.sf_rotation, run)
+    opacities = rules.quantize_opacities(logits, world.sf_opacity)
     return SplatLevels(scales, list(rotations), opacities)
 
 

@@ -7,15 +7,13 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
-from potr_cl.codec.blocks.encoder import code_blocks
-from potr_cl.codec.blocks.file import BlockedFile
-from potr_cl.codec.blocks.geometry import AnyGeometry, GeometryOfBlocks, in_blocks, quantise
-from potr_cl.codec.decoder import AnyFile, decode, open_file, scene_of_file
+from potr_cl.codec.blocks.geometry import AnyGeometry, GeometryOfBlocks, quantise
+from potr_cl.codec.decoder import PotrFile, decode, open_file
 from potr_cl.codec.encoder import Coded, code_scene
 from potr_cl.codec.geometry import Geometry
+from potr_cl.codec.quantisers import QUANTISERS
 from potr_cl.codec.quantize import HyperParameters
-from potr_cl.codec.sections import Property
-from potr_cl.codec.versions import VERSIONS
+from potr_cl.codec.sections import ORDER, SH, Property
 from potr_cl.errors import DeviceError
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes.potr import FORMAT
@@ -30,15 +28,13 @@ from potr_cl.raster.kept_scene import large_for
 from potr_cl.raster.scene_buffers import Drawable
 
 _NAMES = {
-    Property.OCCUPANCY: "position",
-    Property.SEVERAL: "position",
-    Property.MULTIPLICITY: "position",
-    Property.TAIL_LENGTH: "position",
-    Property.TAIL: "position",
+    **dict.fromkeys(ORDER[: ORDER.index(Property.STEPS)], "position"),
     Property.SCALE: "scale",
     Property.ROTATION: "rotation",
     Property.OPACITY: "opacity",
     Property.STEPS: "colour: steps",
+    Property.SH0: "colour: DC",
+    **dict.fromkeys(SH[1:], "colour: AC"),
 }
 
 
@@ -59,8 +55,8 @@ class Potr(Output):
             return quantise(scene, request.parameters, request.views, pool.map)
 
     def on_grid(self, request: Request) -> bool:
-        """In the versions of the format that have steps of each splat."""
-        return VERSIONS[request.parameters.version].colour_steps
+        """With the quantiser that has steps of each splat."""
+        return QUANTISERS[request.parameters.quantiser].colour_steps
 
     def colour_grid(self, rounded: Rounded, effects: FloatArray, request: Request) -> tuple[Rounded, ColourGrid]:
         """Fit the steps of colours to each splat."""
@@ -69,12 +65,8 @@ class Potr(Output):
         return geometry, ColourGrid.of(geometry)
 
     def file(self, scene: Scene, rounded: Rounded | None, request: Request) -> Coded:
-        """See :func:`potr_cl.codec.encoder.code_scene`, and :func:`potr_cl.codec.blocks.encoder.code_blocks`."""
-        if rounded is None and in_blocks(len(scene), request.parameters):
-            rounded = self.geometry(scene, request)
-        if isinstance(rounded, GeometryOfBlocks):
-            return code_blocks(scene, rounded, request.metadata, request.entropy, request.threads, request.progress)
-        assert rounded is None or isinstance(rounded, Geometry)
+        """See :func:`potr_cl.codec.encoder.code_scene`."""
+        assert rounded is None or isinstance(rounded, (Geometry, GeometryOfBlocks))
         return code_scene(
             scene,
             request.parameters,
@@ -106,26 +98,19 @@ class Potr(Output):
                     scene = stack.enter_context(decode_to_device(file, device))
             if scene is None:
                 with bounded(memory):
-                    scene = scene_of_file(file)
+                    scene = file.scene()
             yield scene
 
     def properties(self, data: bytes) -> dict[str, int]:
         """Bytes by attribute; the header and the metadata are "other"."""
         names = ("position", "scale", "rotation", "opacity", "colour: DC", "colour: AC", "colour: steps", "other")
         sums = dict.fromkeys(names, 0)
-        file = open_file(data, trust=True)
-        headers = [file.header(k) for k in file.numbers()] if isinstance(file, BlockedFile) else [file.header]
-        for section in (section for header in headers for section in header.sections):
-            if section.kind == Property.SH:
-                name = "colour: DC" if section.index < 3 else "colour: AC"
-            else:
-                name = _NAMES.get(section.kind, "other")
-            sums[name] += section.stored_bytes
+        for section in (section for block in open_file(data, trust=True).blocks for section in block.sections):
+            sums[_NAMES.get(section.kind, "other") if section.kind else "other"] += section.stored_bytes
         sums["other"] += len(data) - sum(sums.values())
         return {name: nbytes for name, nbytes in sums.items() if nbytes}
 
 
-def _decoded_bytes(file: AnyFile) -> int:
+def _decoded_bytes(file: PotrFile) -> int:
     """Of the scene that a file holds."""
-    of = file.table if isinstance(file, BlockedFile) else file.header
-    return 4 * of.splats * (11 + 3 * SH_COEFFICIENTS[of.sh_degree])
+    return 4 * file.header.splats * (11 + 3 * SH_COEFFICIENTS[file.header.sh_degree])

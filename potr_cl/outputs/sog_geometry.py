@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from potr_cl.clustering.codebook import codebook, nearest
 from potr_cl.clustering.curve import along_curve
+from potr_cl.codec.quantisers import QUANTISERS
 from potr_cl.codec.quantize import HyperParameters, canonical_rotations
-from potr_cl.codec.versions import VERSIONS
 from potr_cl.formats.scenes.sog_images import CODEBOOK, FIRST_TAG, U8
 from potr_cl.formats.scenes.sog_steps import (
     STEPS,
@@ -78,7 +78,7 @@ def rounded_geometry(scene: Scene, parameters: HyperParameters, distances: NDArr
     Raises:
         DataError: a value too large to quantise.
     """
-    version = VERSIONS[parameters.version]
+    version = QUANTISERS[parameters.quantiser]
     world = version.in_world_units(parameters, scene, distances)
     least, most, steps = _positions(scene, np.maximum(world.gamma, world.beta * distances))
     order = along_curve(steps)

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from potr_cl.codec.encoder import Coded
 from potr_cl.codec.geometry import distances_to_views
+from potr_cl.codec.quantisers import QUANTISERS, Balanced, Paper
 from potr_cl.codec.quantize import ZERO_SCALE, HyperParameters, canonical_rotations
-from potr_cl.codec.versions import VERSIONS
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes import spz, spz_values
@@ -73,7 +73,7 @@ class Spz(Output):
         parameters = request.parameters
         with thread_pool(request.threads) as pool:
             nearest = distances_to_views(scene.means, request.views, pool.map)
-        world = VERSIONS[parameters.version].in_world_units(parameters, scene, nearest)
+        world = QUANTISERS[parameters.quantiser].in_world_units(parameters, scene, nearest)
         bits, positions = self._positions(scene, np.maximum(world.gamma, world.beta * nearest))
         order = self._order(positions)
         scales, opacities = _scales(world), _opacities(world)
@@ -143,7 +143,11 @@ class Spz(Output):
     def _rotations(self, imaginary: NDArray[np.float64], log_scales: FloatArray, world: HyperParameters) -> FloatArray:
         """(N, 4) unit quaternions w, x, y, z with w largest, on multiples of SPZ's steps."""
         largest = np.exp(log_scales.max(axis=1).astype(np.float64)) * world.sf_scale
-        factor = world.sf_rotation * np.sqrt(np.maximum(largest, 1)) if world.version > 1 else world.sf_rotation
+        factor = (
+            world.sf_rotation * np.sqrt(np.maximum(largest, 1))
+            if world.quantiser == Balanced.number
+            else world.sf_rotation
+        )
         unit, offset = (127.5, 0.5) if self.version < 3 else (511 * np.sqrt(2), 0.0)
         coarser = 2.0 ** np.maximum(np.round(np.log2(unit / factor)), 0) * np.ones(len(imaginary))
         levels = np.round((imaginary * unit - offset) / coarser[:, None])
@@ -252,7 +256,7 @@ def _scales(world: HyperParameters) -> U8:
 def _opacities(world: HyperParameters) -> U8:
     """(256,) the level of an opacity that stands for each; steps are those of logits but in version 1."""
     opacities = np.clip(np.arange(256) / 255, 1e-4, 1 - 1e-4)
-    values: NDArray[Any] = opacities if world.version == 1 else np.log(opacities / (1 - opacities))
+    values: NDArray[Any] = opacities if world.quantiser == Paper.number else np.log(opacities / (1 - opacities))
     groups = np.floor(values * world.sf_opacity + 0.5)
     return _merged(values * world.sf_opacity, groups, groups)
 

@@ -38,7 +38,7 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
         Fit(),
         Compact(on=False),
         Refit(steps=4),
-        Code(entropy="zstd", zstd_level=9),
+        Code(),
     ),
     "paper": (
         Between(views=0, weigh=False),
@@ -46,16 +46,16 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
         Fit(),
         Compact(),
         Refit(steps=0),
-        Code(),
+        Code(entropy="zstd"),
     ),
 }
 
 #: What each preset is for, in a line.
 PURPOSE: dict[Preset, str] = {
-    "best": "colours re-fitted together, steps of equal worth, the context coder: a small file in little time",
+    "best": "colours re-fitted together, steps of equal worth, bundles: a small file in little time",
     "smallest": "as best, in more iterations, with re-fits while pruning and a fit of all parameters: takes far longer",
-    "fast": "as best, in fewer iterations and steps, with zstd 9: encodes and decodes faster",
-    "paper": "what the paper does: colours compacted splat by splat, its steps",
+    "fast": "as best, in fewer iterations and steps: encodes faster",
+    "paper": "what the paper does: colours compacted splat by splat, its steps, zstd",
 }
 
 

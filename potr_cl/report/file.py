@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from potr_cl.codec.blocks.file import BlockedFile
-from potr_cl.codec.container import Header
-from potr_cl.codec.decoder import AnyFile, PotrFile
-from potr_cl.codec.sections import Property, Section
+from potr_cl.codec.body import Body
+from potr_cl.codec.container import Block
+from potr_cl.codec.decoder import PotrFile
+from potr_cl.codec.sections import Coder, Property, Section
 from potr_cl.model.box import Box
 from potr_cl.model.scene import SH_COEFFICIENTS
 from potr_cl.plain_text import plain_fact
@@ -18,7 +18,7 @@ _GROUPS = {
     Property.OCCUPANCY: "position: octree",
     Property.SEVERAL: "position: octree",
     Property.MULTIPLICITY: "position: octree",
-    Property.TAIL_LENGTH: "position: tails",
+    Property.LEAF_LEVEL: "position: tails",
     Property.TAIL: "position: tails",
     Property.SCALE: "scale",
     Property.ROTATION: "rotation",
@@ -36,27 +36,36 @@ _MOST_BLOCKS = 40
 
 
 def _group(section: Section) -> str:
-    if section.kind != Property.SH:
-        return _GROUPS[section.kind]
-    coefficient = section.index // 3
-    return "colour: DC" if coefficient == 0 else f"colour: AC degree {int(coefficient**0.5)}"
+    if section.kind is None:
+        return section.name
+    if section.kind.degree is not None:
+        return f"colour: AC degree {section.kind.degree}" if section.kind.degree else "colour: DC"
+    return _GROUPS[section.kind]
 
 
-def _contents(sections: Sequence[Section]) -> dict[str, Any]:
+def _contents(sections: Sequence[tuple[Block | None, Section]]) -> dict[str, Any]:
     """What some sections hold and take; no serialised size where integers are coded without being bytes first."""
-    raw = [section.raw_bytes for section in sections]
+    coders, integers, serialised = set(), 0, True
+    for block, section in sections:
+        streams = section.kind.streams if section.kind else 0
+        if block is not None and streams and block.coder == Coder.BUNDLES:
+            coders.add("bundles")
+            serialised = False
+        else:
+            coders.add("raw" if section.raw_bytes == section.stored_bytes else "zstd")
+        integers += streams * block.splats if block is not None and streams else section.raw_bytes
     return {
-        "coders": sorted({section.coder.name.lower() for section in sections}),
-        "streams": sum(section.streams for section in sections),
-        "integers": sum(section.integers for section in sections),
-        "serialised_bytes": None if None in raw else sum(size for size in raw if size is not None),
-        "bytes": sum(section.stored_bytes for section in sections),
+        "coders": sorted(coders),
+        "streams": sum(section.kind.streams or 1 if section.kind else 1 for _, section in sections),
+        "integers": integers,
+        "serialised_bytes": sum(section.raw_bytes for _, section in sections) if serialised else None,
+        "bytes": sum(section.stored_bytes for _, section in sections),
     }
 
 
-def _colour_steps(file: PotrFile) -> dict[str, Any] | None:
+def _colour_steps(body: Body) -> dict[str, Any] | None:
     """The numbers of the rule that fits the steps of colours to each splat; None where there is none."""
-    steps = file.colour_steps()
+    steps = body.colour_steps()
     if steps is None:
         return None
     return {
@@ -68,93 +77,75 @@ def _colour_steps(file: PotrFile) -> dict[str, Any] | None:
     }
 
 
-def file_report(file: AnyFile) -> dict[str, Any]:
+def file_report(file: PotrFile) -> dict[str, Any]:
     """Counts, parameters, bounding box, and what the sections hold and take.
 
     Of each group of sections: the coders; the number of streams and of integers in them (bytes, for streams of bytes);
-    the size of these as bytes before the coder, None where the context coder codes integers as they are; and the size
-    in the file. Of the header the sizes alone.
+    the size of these as bytes before the coder, None where bundles code integers as they are; and the size in the file.
+    Of the header the sizes alone.
 
     Raises:
-        DataError: the positions, the steps of colours or the metadata are damaged.
+        DataError: the steps of colours are damaged.
     """
-    if isinstance(file, BlockedFile):
-        return _report_of_blocks(file)
-    means = file.means()
-    bounds = Box.of([*means.min(axis=0), *means.max(axis=0)])
-    header_bytes = len(file.data) - sum(section.stored_bytes for section in file.header.sections)
-    return _report([file.header], file.metadata, bounds, len(file.data), header_bytes) | {
-        "colour_steps": _colour_steps(file),
-        "blocks": None,
-    }
-
-
-def _report_of_blocks(file: BlockedFile[PotrFile]) -> dict[str, Any]:
-    headers = [file.header(number) for number in file.numbers()]
-    size = file.table.file_bytes
-    header_bytes = size - sum(section.stored_bytes for header in headers for section in header.sections)
-    blocks = [
-        {"splats": block.splats, "bytes": block.nbytes, "bounding_box": [list(block.box.low), list(block.box.high)]}
-        for block in file.table.blocks
-    ]
-    return _report(headers, file.metadata, file.bounds, size, header_bytes) | {"colour_steps": None, "blocks": blocks}
-
-
-def _report(
-    headers: Sequence[Header], facts: dict[str, Any], bounds: Box, file_bytes: int, header_bytes: int
-) -> dict[str, Any]:
-    """What the headers of a file's blocks, or its only one, say together."""
-    header = headers[0]
-    splats = sum(each.splats for each in headers)
+    header, block = file.header, file.blocks[-1]
     # A file says of itself what it likes.
-    metadata = {name: plain_fact(value) for name, value in facts.items()}
-    grouped: dict[str, list[Section]] = {}
-    for section in (section for each in headers for section in each.sections):
-        grouped.setdefault(_group(section), []).append(section)
+    metadata = {name: plain_fact(value) for name, value in file.metadata.items()}
+    grouped: dict[str, list[tuple[Block | None, Section]]] = {}
+    for section in header.sections:
+        grouped.setdefault(_group(section), []).append((None, section))
+    for each in file.blocks:
+        for section in each.sections:
+            grouped.setdefault(_group(section), []).append((each, section))
     groups = {name: _contents(sections) for name, sections in grouped.items()}
-    groups["header"] = {
-        "coders": [],
-        "streams": 0,
-        "integers": 0,
-        "serialised_bytes": header_bytes,
-        "bytes": header_bytes,
-    }
+    own = header.start
+    groups["header"] = {"coders": [], "streams": 0, "integers": 0, "serialised_bytes": own, "bytes": own}
     for entry in groups.values():
-        entry["bits_a_splat"] = 8 * entry["bytes"] / splats
+        entry["bits_a_splat"] = 8 * entry["bytes"] / header.splats
     # The original layout: position, normal, colours, opacity, scales, rotation, all float32.
-    ply_bytes = 4 * splats * (14 + 3 * SH_COEFFICIENTS[header.sh_degree])
-    source = metadata.get("source_bytes")
+    ply_bytes = 4 * header.splats * (14 + 3 * SH_COEFFICIENTS[header.sh_degree])
+    source, bounds, many = metadata.get("source_bytes"), file.bounds, len(file.blocks) > 1
     return {
-        "splats": splats,
+        "splats": header.splats,
         "sh_degree": header.sh_degree,
-        "antialiased": header.antialiased,
-        "low_pass": header.low_pass,
+        "antialiased": block.antialiased,
+        "low_pass": block.low_pass,
         "q": metadata.get("q"),
         "cameras": metadata.get("cameras"),
         "bounding_box": [list(bounds.low), list(bounds.high)],
-        "octree_levels": max(each.depth for each in headers),
+        "octree_levels": max(each.depth for each in file.blocks),
         "scale_factors": {
-            "scale": header.sf_scale,
-            "rotation": header.sf_rotation,
-            "opacity": header.sf_opacity,
-            "DC": header.sf_dc,
-            "AC": header.sf_ac,
+            "scale": block.sf_scale,
+            "rotation": block.sf_rotation,
+            "opacity": block.sf_opacity,
+            "DC": block.sf_dc,
+            "AC": block.sf_ac,
         },
-        "colour_steps": None,
+        "colour_steps": None if many else file.of(0, _colour_steps),
         "gamma": metadata.get("gamma"),
         "beta": metadata.get("beta"),
         "delta_mse_max": metadata.get("delta_mse_max"),
         "lambda": metadata.get("lambda"),
         "alpha": metadata.get("alpha"),
-        "coders": sorted({s.coder.name.lower() for each in headers for s in each.sections}),
-        "bytes": file_bytes,
-        "bytes_a_splat": file_bytes / splats,
+        "coders": sorted({coder for entry in groups.values() for coder in entry["coders"]}),
+        "bytes": header.file_bytes,
+        "bytes_a_splat": header.file_bytes / header.splats,
         "ply_bytes": ply_bytes,
-        "ratio_to_ply": ply_bytes / file_bytes,
+        "ratio_to_ply": ply_bytes / header.file_bytes,
         "source_splats": metadata.get("source_splats"),
         "source_bytes": source,
-        "ratio_to_source": source / file_bytes if isinstance(source, int) else None,
+        "ratio_to_source": source / header.file_bytes if isinstance(source, int) else None,
+        "levels": file.blocks[0].level + 1,
         "sections": groups,
+        "blocks": [_block_report(each) for each in file.blocks] if many else None,
+    }
+
+
+def _block_report(block: Block) -> dict[str, Any]:
+    return {
+        "splats": block.splats,
+        "level": block.level,
+        "bytes": block.nbytes,
+        "bounding_box": [list(block.box.low), list(block.box.high)],
     }
 
 

@@ -16,7 +16,7 @@ class Code(Stage):
 
     Attributes:
         entropy, zstd_level: choose the entropy coder (:class:`potr_cl.codec.container.EntropyCoder`).
-        gamma, beta, sf_dc, sf_sh, sf_opacity, sf_rotation, sf_scale: replace the values that q gives
+        gamma, beta, sf_dc, sf_sh, sf_opacity, sf_rotation, sf_scale, block_splats: replace the values that q gives
             (:class:`potr_cl.codec.quantize.HyperParameters`).
 
     Raises:
@@ -31,8 +31,7 @@ class Code(Stage):
         EntropyCoder.name,
         Flag(
             "--entropy",
-            "context: smallest, not for preset paper; zstd: decodes fastest; npz: deflate, as NumPy's compressed files "
-            "use",
+            "bundles: smallest, not for preset paper; zstd: for readers that have nothing but a zstd library",
             choices=ENTROPY_CODERS,
             default="the preset's",
         ),
@@ -81,6 +80,18 @@ class Code(Stage):
             "steps a unit for standard deviations; best, fast: in a typical splat's size, twice as many if antialiased",
             "SF",
             float,
+        ),
+        parameter=True,
+    )
+
+    block_splats: float | None = option(
+        None,
+        Flag(
+            "--block-splats",
+            "most splats of a block of a .potr file; 65536 for readers that show blocks as they arrive",
+            "N",
+            int,
+            default="1048576, in scenes of more than 2097152",
         ),
         parameter=True,
     )

@@ -190,7 +190,7 @@ def test_every_parameter_can_be_set(tmp_path, scene_path, capsys):
 
 def test_both_entropy_stages(tmp_path, scene_path, capsys):
     scenes = []
-    for entropy in ("zstd", "npz"):
+    for entropy in ("zstd", "bundles"):
         potr = tmp_path / f"{entropy}.potr"
         assert cli.main(["encode", str(scene_path), "-o", str(potr), "--entropy", entropy, *KEEP]) == 0
         assert cli.main(["decode", str(potr), "-o", str(tmp_path / "back.ply")]) == 0

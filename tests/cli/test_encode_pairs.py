@@ -28,7 +28,7 @@ ASKED = {
     "unseen": ["--unseen", "drop"],
     "antialiased": ["--antialiased", "yes"],
     "background": ["--background", "white"],
-    "npz": ["--entropy", "npz"],
+    "zstd": ["--entropy", "zstd"],
 }
 #: And how it is told.
 TOLD = {

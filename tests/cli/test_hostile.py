@@ -316,7 +316,7 @@ def unreadable(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_args: object, **_keywords: object) -> None:
         raise DataError("the octree's origin is not finite")
 
-    monkeypatch.setattr("potr_cl.codec.decoder.PotrFile.decode_into", refuse)
+    monkeypatch.setattr("potr_cl.codec.body.Body.decode_into", refuse)
 
 
 def test_a_file_that_cannot_be_decoded_replaces_nothing(

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
-import struct
 import threading
 import tracemalloc
-import zlib
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,14 +14,11 @@ import pytest
 import potr_cl
 from potr_cl import cli
 from potr_cl.codec.blocks import geometry as blocks_geometry
-from potr_cl.codec.blocks import splitting
-from potr_cl.codec.blocks.encoder import code_blocks
-from potr_cl.codec.blocks.file import BlockedFile
 from potr_cl.codec.blocks.geometry import GeometryOfBlocks, quantise
 from potr_cl.codec.blocks.splitting import blocks_of
 from potr_cl.codec.container import EntropyCoder
-from potr_cl.codec.decoder import PotrFile, decode, open_file
-from potr_cl.codec.encoder import Coded, code_scene
+from potr_cl.codec.decoder import decode, open_file
+from potr_cl.codec.encoder import Coded, Level, code_levels, code_scene
 from potr_cl.codec.geometry import quantise_geometry
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import DataError, UsageError
@@ -34,12 +29,13 @@ from potr_cl.model.morton import morton_order
 from potr_cl.model.scene import Scene
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
+from tests.cases.options import as_it_is
 from tests.oracles.decoder import decode as decode_independently
+from tests.reference.file_parts import File
 from tests.reference.scenes import random_scene, ring_of_cameras
 
 ARRAYS = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
 BEST = HyperParameters.from_quality(0.5, "best")
-HEADER, ENTRY = struct.Struct("<8sHHIQQB3sIII"), struct.Struct("<6fQQII")
 
 
 def in_blocks(scene: Scene, most: int, effects=None, threads: int = 0, **options) -> Coded:
@@ -47,7 +43,7 @@ def in_blocks(scene: Scene, most: int, effects=None, threads: int = 0, **options
     assert isinstance(geometry, GeometryOfBlocks)
     if effects is not None:
         geometry = geometry.with_steps(effects)
-    return code_blocks(scene, geometry, b'{"q":0.5}', threads=threads, **options)
+    return code_levels([Level(scene, geometry)], b'{"q":0.5}', threads=threads, **options)
 
 
 def effects_of(scene: Scene) -> np.ndarray:
@@ -84,7 +80,7 @@ def test_values_are_those_of_one_piece(scene):
     assert np.sqrt((error_a**2).mean()) < 1.2 * np.sqrt((error_b**2).mean())
 
 
-@pytest.mark.parametrize("entropy", ["context", "zstd"])
+@pytest.mark.parametrize("entropy", ["bundles", "zstd"])
 def test_the_number_of_threads_changes_nothing(scene, entropy):
     coded = [in_blocks(scene, 400, effects_of(scene), n, entropy=EntropyCoder(entropy, 3)).pieces for n in (1, 16)]
     assert b"".join(coded[0]) == b"".join(coded[1])
@@ -151,13 +147,12 @@ def test_many_splats_are_written_in_blocks(monkeypatch, plush_excerpt, plush_exc
     """By a whole encode, of so many splats that are left; few stay what they were, byte for byte."""
     options = EncodeOptions.for_preset("best", between=False)
     few = encode(plush_excerpt, plush_excerpt_cameras, options)
-    assert few.data[8] == 3
+    assert len(open_file(few.data).blocks) == 1
     monkeypatch.setattr(blocks_geometry, "MOST_WHOLE", 300)
-    monkeypatch.setattr(splitting.blocks_of, "__defaults__", (256, map))
+    monkeypatch.setattr(blocks_geometry, "MOST_A_BLOCK", 256)
     many = encode(plush_excerpt, plush_excerpt_cameras, options)
     file = open_file(many.data)
-    assert isinstance(file, BlockedFile)
-    assert len(file.table.blocks) == -(-len(many.order) // 256)
+    assert len(file.blocks) == -(-len(many.order) // 256)
     assert file.metadata["source_splats"] == len(plush_excerpt)
     assert abs(len(many.order) - len(few.order)) <= 2
     assert many.refitted is not None
@@ -165,6 +160,14 @@ def test_many_splats_are_written_in_blocks(monkeypatch, plush_excerpt, plush_exc
     assert same(many.scene, decode(many.data))
     in_place = plush_excerpt.subset(many.order).means - many.scene.means
     assert np.abs(in_place).max() < 0.02
+
+
+def test_blocks_of_any_size_may_be_asked_for():
+    options = as_it_is("best").with_parameters(block_splats=1 << 14)
+    blocks = open_file(b"".join(encode(random_scene(40_000, 0), None, options).pieces)).blocks
+    assert [block.splats for block in blocks] == [13_333, 13_333, 13_334]
+    with pytest.raises(UsageError, match=r"block_splats is 100, it must lie between 16384 and 4\.1943e"):
+        _ = as_it_is("best").with_parameters(block_splats=100).parameters
 
 
 @pytest.mark.slow
@@ -179,30 +182,35 @@ def test_they_cost_next_to_nothing():
 
 def spoilt_but(data: bytes, spare: list[int]) -> bytes:
     changed = bytearray(data)
-    for number, block in enumerate(open_file(data).table.blocks):
+    for number, block in enumerate(open_file(data).blocks):
         if number not in spare:
-            changed[block.offset + 2000 : block.offset + block.nbytes] = bytes(block.nbytes - 2000)
+            changed[block.offset : block.offset + block.nbytes] = bytes(block.nbytes)
     return bytes(changed)
 
 
 def test_blocks_decode_alone(data, tmp_path):
-    whole, table = decode(data), open_file(data).table
-    for number, block in enumerate(table.blocks):
+    whole, blocks = decode(data), open_file(data).blocks
+    for number, block in enumerate(blocks):
         file = tmp_path / "a.potr"
         file.write_bytes(spoilt_but(data, [number]))
         opened = open_file(file)
         assert same(opened.part(number), whole.subset(np.arange(block.first, block.first + block.splats)))
-    with pytest.raises(DataError, match=r"a.potr': block \d is damaged"):
+    with pytest.raises(DataError, match=r"a.potr': block \d: section '.*' is damaged"):
         decode(file)
 
 
 def test_a_box_reads_only_what_it_meets(data):
-    whole, table = decode(data), open_file(data).table
-    middle = np.median(whole.means[: table.blocks[0].splats], axis=0).tolist()
+    whole, blocks = decode(data), open_file(data).blocks
+    middle = np.median(whole.means[: blocks[0].splats], axis=0).tolist()
     box = [*(x - 0.5 for x in middle), *(x + 0.5 for x in middle)]
     met = open_file(data).numbers(potr_cl.model.box.Box.of(box))
-    assert 0 < len(met) < len(table.blocks)
+    assert 0 < len(met) < len(blocks)
     found = potr_cl.decode(spoilt_but(data, met), box=box)
+    read: list[tuple[int, int]] = []
+    whole_file = open_file(data)
+    counting = dataclasses.replace(whole_file, read=lambda *part: read.append(part) or whole_file.read(*part))
+    assert len(counting.scene(box=potr_cl.model.box.Box.of(box))) == len(found)
+    assert sorted(read) == [(blocks[k].offset, blocks[k].nbytes) for k in met]
     inside = ((whole.means >= box[:3]) & (whole.means <= box[3:])).all(axis=1)
     assert 0 < len(found) < len(whole)
     assert same(found, whole.subset(np.flatnonzero(inside)))
@@ -313,129 +321,19 @@ def test_where_memory_is_bounded_colours_of_one_block_are_decoded_to_the_disk():
 # Files that lie ------------------------------------------------------------------------------------------------------
 
 
-def relabelled(data: bytes, block: int | None = None, **fields) -> bytes:
-    """With other numbers in the header, or in a block's entry, and the checksum made right."""
-    head = list(HEADER.unpack_from(data))
-    names = ["magic", "version", "flags", "size", "whole", "splats", "degree", "zeros", "count", "metadata", "reserved"]
-    if block is None:
-        for name, value in fields.items():
-            head[names.index(name)] = value
-        data = HEADER.pack(*head) + data[HEADER.size :]
-    else:
-        at = HEADER.size + ENTRY.size * block
-        entry = list(ENTRY.unpack_from(data, at))
-        names = ["x0", "y0", "z0", "x1", "y1", "z1", "splats", "nbytes", "crc", "zero"]
-        for name, value in fields.items():
-            entry[names.index(name)] = value
-        data = data[:at] + ENTRY.pack(*entry) + data[at + ENTRY.size :]
-    size = open_size(data)
-    return data[: size - 4] + struct.pack("<I", zlib.crc32(data[: size - 4])) + data[size:]
-
-
-def open_size(data: bytes) -> int:
-    return min(int.from_bytes(data[12:16], "little"), len(data))
-
-
-def test_more_blocks_than_there_are_splats_for_are_refused(scene):
-    """Each takes milliseconds to open, whatever it holds."""
-    with pytest.raises(DataError, match="makes no sense: 1000 blocks of 3000 splats"):
-        open_file(b"".join(in_blocks(scene, 3, effects_of(scene)).pieces))
-
-
-def test_metadata_that_is_no_json_is_refused_by_every_reader(data):
-    size, told = open_size(data), b'{"q":0.5}'
-    assert data[size - 4 - len(told) : size - 4] == told
-    broken = relabelled(data[: size - 4 - len(told)] + b'{"q":NaN}' + data[size - 4 :])
-    for read in (open_file, decode, potr_cl.decode_to_device):
-        with pytest.raises(DataError, match="section 'metadata' is not a JSON object"):
-            read(broken)
-
-
-LIES = {
-    "no block": ((None, {"count": 0}), "its size does not fit"),
-    "countless blocks": ((None, {"count": 2**32 - 1}), "its size does not fit"),
-    "countless splats": ((None, {"splats": 2**63}), "not all of its splats"),
-    "one more splat": ((None, {"splats": 3001}), "not all of its splats"),
-    "one splat less": ((None, {"splats": 2999}), "more than the file has"),
-    "degree": ((None, {"degree": 4}), "makes no sense"),
-    "another degree": ((None, {"degree": 1}), "block 0 is not what the table says"),
-    "flags": ((None, {"flags": 2}), "unknown"),
-    "antialiased": ((None, {"flags": 1}), "block 0 is not what the table says"),
-    "reserved": ((None, {"reserved": 1}), "unknown"),
-    "zeros": ((None, {"zeros": b"\0\0\1"}), "unknown"),
-    "file size": ((None, {"whole": 10}), "followed by something else"),
-    "header of gigabytes": ((None, {"size": 2**32 - 1}), "does not fit|truncated"),
-    "splats of a block": ((1, {"splats": 2**62}), "more than the file has"),
-    "no splat": ((1, {"splats": 0}), "claims 0 splats"),
-    "bytes of a block": ((1, {"nbytes": 2**63}), "more than the file has"),
-    "too few bytes": ((1, {"nbytes": 10}), "do not fill the file"),
-    "checksum": ((1, {"crc": 1}), "block 1 is damaged"),
-    "an entry's zero": ((1, {"zero": 1}), "makes no sense"),
-    "NaN": ((1, {"x0": float("nan")}), "makes no sense"),
-    "infinity": ((1, {"x1": float("inf")}), "makes no sense"),
-    "inside out": ((1, {"x0": 9.0, "x1": 8.0}), "makes no sense"),
-    "another box": ((1, {"x0": 8.0, "x1": 9.0}), "block 1 holds centres outside of its box"),
-}
-
-
-@pytest.mark.parametrize("lie", LIES)
-def test_lies_are_found(lie, data):
-    (block, fields), message = LIES[lie]
-    lying = relabelled(data, block, **fields)
-    with pytest.raises(DataError, match=message):
-        decode(lying)
-    with pytest.raises(ValueError, match=r"."):
-        decode_independently(lying)
-
-
-def test_a_table_that_promises_more_than_its_blocks_have(data):
-    """Before memory is taken for it: all that the table promises would pass for real in a file of this size."""
-    blocks = open_file(data).table.blocks
-    more = 60_000
-    lying = relabelled(relabelled(data, 0, splats=blocks[0].splats + more), splats=3000 + more)
-    assert isinstance(open_file(lying), BlockedFile)
-    tracemalloc.start()
-    with pytest.raises(DataError, match="block 0 is not what the table says"):
-        decode(lying)
-    assert tracemalloc.get_traced_memory()[1] < 1 << 20
-    tracemalloc.stop()
-
-
-def test_a_bomb_in_the_table(data):
-    lying = relabelled(relabelled(data, 3, splats=1 << 40), splats=2250 + (1 << 40))
-    with pytest.raises(DataError, match="--trust"):
-        decode(lying)
-    with pytest.raises(DataError, match="block 3 is not what the table says"):
-        decode(lying, trust=True)
-
-
-def assembled_of(bodies: list[bytes], splats: list[int], degree: int = 2) -> bytes:
-    size = HEADER.size + ENTRY.size * len(bodies) + 4
-    head = HEADER.pack(
-        b"POTR\r\n\x1a\n", 4, 0, size, size + sum(map(len, bodies)), sum(splats), degree, bytes(3), len(bodies), 0, 0
-    )
-    for body, own in zip(bodies, splats, strict=True):
-        head += ENTRY.pack(*(-1e9,) * 3, *(1e9,) * 3, own, len(body), zlib.crc32(body), 0)
-    return head + struct.pack("<I", zlib.crc32(head)) + b"".join(bodies)
-
-
-def test_blocks_are_of_version_3(data, scene):
-    """No block is a file of blocks: there is no going round in circles."""
-    one = b"".join(code_scene(scene, BEST).pieces)
-    assert len(decode(assembled_of([one, one], [3000, 3000]))) == 6000
-    old = b"".join(code_scene(scene, HyperParameters.from_quality(0.5)).pieces)
-    for body, said in ((data, "a file of blocks stands where"), (old, "format version 1, which no block may be of")):
-        for lying in (assembled_of([body], [3000]), assembled_of([one, body], [3000, 3000])):
-            with pytest.raises(DataError, match=said):
-                decode(lying)
-            with pytest.raises(ValueError, match=r"."):
-                decode_independently(lying)
+def test_a_box_that_its_centres_are_not_in(data):
+    file = File.of(data)
+    file.blocks[1].reals[:6] = [8.0, 8.0, 8.0, 9.0, 9.0, 9.0]
+    with pytest.raises(DataError, match="block 1: centres lie outside of the block's box"):
+        decode(file.bytes())
+    with pytest.raises(ValueError, match="outside"):
+        decode_independently(file.bytes())
 
 
 def test_single_bytes_changed(data):
     """Every byte is covered by a checksum: none can be changed unseen."""
     rng = np.random.default_rng(1)
-    for at in [*range(0, HEADER.size), *rng.integers(HEADER.size, len(data), 200)]:
+    for at in [*range(32), *rng.integers(32, len(data), 200)]:
         changed = bytearray(data)
         changed[at] ^= 1 << rng.integers(8)
         with pytest.raises(DataError):
@@ -449,11 +347,3 @@ def test_truncated(left, data, tmp_path):
         decode(data[:left])
     with pytest.raises(DataError, match=r"a\.potr"):
         decode(tmp_path / "a.potr")
-
-
-def test_one_piece_is_asked_for(data, tmp_path):
-    Path(tmp_path / "a.potr").write_bytes(data)
-    with pytest.raises(DataError, match="a file of blocks"):
-        PotrFile.open(tmp_path / "a.potr")
-    with pytest.raises(DataError, match="a file of blocks"):
-        PotrFile.from_bytes(data)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import zlib
 
 import numpy as np
 import pytest
@@ -13,16 +12,16 @@ from hypothesis import strategies as st
 from potr_cl.codec.bundles import encoder, native_encoder
 from potr_cl.codec.bundles.decoder import Reader, Wanted
 from potr_cl.codec.bundles.sections import MAIN, ORDER, ROTATION
-from potr_cl.codec.decoder import PotrFile
+from potr_cl.codec.decoder import open_file
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.native.library import VARIABLE, VECTORS_VARIABLE, native
 from potr_cl.codec.quantize import HyperParameters
-from potr_cl.codec.sections import Coder, Property
+from potr_cl.codec.sections import SH, Coder, Property
 from potr_cl.codec.steps.rule import KNOTS, ColourSteps
 from potr_cl.errors import DataError
 
 PATHS = {"numpy": "0", "native": "1", "native, without wide vectors": "1"}
-DEGREES = {3: 9, 12: 15, 27: 21}
+DEGREES = {prop: prop.streams for prop in SH[1:]}
 NONE = lambda: None  # noqa: E731
 #: Around where bundles and lanes begin and end.
 SIZES = (1, 2, 255, 256, 257, 300, 7937, 8191, 8192, 8193, 8448, 16385)
@@ -55,7 +54,7 @@ def integers(splats: int, seed: int = 1, density: float = 0.1, spread: int = 20)
         ROTATION: [some(True) for _ in range(3)],
     }
     for index, streams in DEGREES.items():
-        values[Property.SH, index] = [some(True) * (rng.random(splats) < density) for _ in range(streams)]
+        values[index] = [some(True) * (rng.random(splats) < density) for _ in range(streams)]
     return values
 
 
@@ -74,7 +73,7 @@ def classes_of(values: dict, steps: ColourSteps | None) -> np.ndarray:
 
 def reader_of(stored: dict, splats: int, steps: ColourSteps | None = None) -> Reader:
     def opened(key):
-        return (memoryview(stored[key]), f"{key[0].name.lower()} {key[1]}") if key in stored else None
+        return (memoryview(stored[key]), key.title) if key in stored else None
 
     return Reader(splats, opened, lambda: steps)
 
@@ -87,9 +86,9 @@ def assert_same(values: dict, levels) -> None:
         assert all(np.array_equal(a, b) for a, b in zip(values.get(key, none), found, strict=True))
     for index, streams in DEGREES.items():
         for k in range(streams):
-            m, c = divmod(index + k, 3)
-            there = (Property.SH, index) in values
-            wanted = values[Property.SH, index][k] if there else none[0]
+            m, c = divmod(3 * index.degree**2 + k, 3)
+            there = index in values
+            wanted = values[index][k] if there else none[0]
             assert np.array_equal(levels.coefficient(m)[c], wanted)
 
 
@@ -141,8 +140,8 @@ def ordered(values: dict) -> list:
 @pytest.mark.parametrize("density", [0.0, 0.001, 1.0])
 def test_channels_without_a_value_and_full_ones(path, density):
     values = integers(600, density=density)
-    values[Property.SH, 12][4][:] = 0
-    values[Property.SH, 12][4][77] = 3
+    values[Property.SH2][4][:] = 0
+    values[Property.SH2][4][77] = 3
     stored = encoder.encode(values, np.zeros(600, np.int8))
     assert_same(values, reader_of(stored, 600).levels(0, 1))
 
@@ -200,7 +199,18 @@ def test_it_is_small():
     stored = encoder.encode(values, np.zeros(splats, np.int8))
     assert len(stored[MAIN[0]]) < 1.03 * 7 / 8 * splats
     assert len(stored[MAIN[1]]) < 200
-    assert sum(len(stored[Property.SH, index]) for index in DEGREES) < 600
+    assert sum(len(stored[index]) for index in DEGREES) < 600
+
+
+@pytest.mark.parametrize("splats", [1, 12, 300])
+def test_few_splats_need_no_models_of_their_own(path, splats):
+    """A section begins with the size of its description, which is nothing where it does not pay."""
+    values = integers(splats, 3)
+    stored = encoder.encode(values, np.zeros(splats, np.int8))
+    assert stored[MAIN[0]][:4] == bytes(4)
+    assert_same(values, reader_of(stored, splats).levels(0, 1))
+    if splats == 1:
+        assert sum(map(len, stored.values())) < 160
 
 
 # ------------------------------------------------------------------------------------------------ damage
@@ -235,7 +245,7 @@ def test_both_paths_say_the_same_of_damaged_sections(monkeypatch, small, data):
         pytest.skip("the compiled library is not there")
     stored, steps = dict(small[0]), small[1]
     for _ in range(data.draw(st.integers(1, 3))):
-        key = data.draw(st.sampled_from(sorted(stored)))
+        key = data.draw(st.sampled_from(list(stored)))
         section = bytearray(stored[key])
         # Often the states, counts and words, which come last.
         at = data.draw(st.integers(0, len(section) - 1))
@@ -300,34 +310,21 @@ def test_states_that_no_encoder_leaves_are_refused(path, small):
 # ------------------------------------------------------------------------------------------------ files
 
 
-def version_3(plush_excerpt) -> bytes:
+def of_bundles(plush_excerpt) -> bytes:
     return b"".join(code_scene(plush_excerpt, HyperParameters.from_quality(0.5, "best")).pieces)
-
-
-def test_sections_of_this_coder_come_all_together(plush_excerpt):
-    """One whose coder is another is refused, before anything is decoded."""
-    data = bytearray(version_3(plush_excerpt))
-    file = PotrFile.from_bytes(bytes(data))
-    number = next(k for k, s in enumerate(file.header.sections) if s.kind == Property.ROTATION)
-    # The entry's coder becomes 1: a frame of three planes; its size fits.
-    struct.pack_into("<B", data, 120 + 24 * number + 2, 1)
-    end = 120 + 24 * len(file.header.sections)
-    struct.pack_into("<I", data, end, zlib.crc32(data[:end]))
-    with pytest.raises(DataError, match="only some sections of splats are of coder 4"):
-        PotrFile.from_bytes(bytes(data))
 
 
 @pytest.mark.parametrize("threads", [1, 3])
 def test_threads_and_paths_decode_the_same_bits(monkeypatch, plush_excerpt, threads):
     monkeypatch.delenv(VARIABLE, raising=False)
-    data = version_3(plush_excerpt)
+    data = of_bundles(plush_excerpt)
     scenes = []
     for way in "01" if native() is not None else "0":
         monkeypatch.setenv(VARIABLE, way)
-        scenes.append(PotrFile.from_bytes(data).scene(threads))
+        scenes.append(open_file(data).scene(threads))
     for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
         assert all(np.array_equal(getattr(scenes[0], name), getattr(scene, name)) for scene in scenes)
-    alone = PotrFile.from_bytes(data)
+    alone = open_file(data).body(0)
     assert np.array_equal(alone.quaternions(), scenes[0].quaternions)
     assert np.array_equal(alone.log_scales(), scenes[0].log_scales)
     assert np.array_equal(alone.opacity_logits(), scenes[0].opacity_logits)
@@ -341,13 +338,13 @@ def test_levels_beyond_what_is_looked_up(monkeypatch, plush_excerpt):
         pytest.skip("the compiled library is not there")
     parameters = HyperParameters.from_quality(0.5, "best", sf_scale=1e5, sf_opacity=1e4)
     data = b"".join(code_scene(plush_excerpt, parameters).pieces)
-    file = PotrFile.from_bytes(data)
-    assert file.header.find(Property.OPACITY).coder == Coder.BUNDLES
+    file = open_file(data)
+    assert file.blocks[0].coder == Coder.BUNDLES
     scenes = []
     for way in "01":
         monkeypatch.setenv(VARIABLE, way)
-        scenes.append(PotrFile.from_bytes(data).scene(1))
+        scenes.append(open_file(data).scene(1))
     for name in ("log_scales", "quaternions", "opacity_logits", "sh"):
         assert np.array_equal(getattr(scenes[0], name), getattr(scenes[1], name))
-    largest = np.exp(scenes[0].log_scales.max()) * file.header.sf_scale
+    largest = np.exp(scenes[0].log_scales.max()) * file.blocks[0].sf_scale
     assert largest > 1 << 16

@@ -14,8 +14,8 @@ from hypothesis.extra import numpy as hnp
 
 from potr_cl.codec import quantize
 from potr_cl.codec.container import EntropyCoder
-from potr_cl.codec.decoder import PotrFile, decode, open_file
-from potr_cl.codec.sections import Coder, Property
+from potr_cl.codec.decoder import decode, open_file
+from potr_cl.codec.sections import SH, Coder, Property
 from potr_cl.errors import DataError, UsageError
 from potr_cl.model.camera import camera_centres, train_views
 from potr_cl.model.scene import SH_COEFFICIENTS, Scene
@@ -64,9 +64,9 @@ def check_within_steps(source: Scene, decoded: Scene, order, parameters, toleran
 
 
 def check_within_balanced_steps(source: Scene, data: bytes, order, tolerance):
-    """The same for version 3: steps as the header and the decoded scales say."""
-    header, decoded, original = PotrFile.from_bytes(data).header, decode(data), source.subset(order)
-    assert header.version == 3
+    """The same for the other quantiser: steps as the table and the decoded scales say."""
+    header, decoded, original = open_file(data).blocks[0], decode(data), source.subset(order)
+    assert header.quantiser == 1
 
     rounding = np.abs(original.means.astype(np.float64)).max(axis=1) * 2.0**-23
     distance = np.linalg.norm(decoded.means.astype(np.float64) - original.means, axis=1)
@@ -96,16 +96,14 @@ def typical_size(scene: Scene) -> float:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-@pytest.mark.parametrize("entropy", [FAST, EntropyCoder("npz"), EntropyCoder("context")])
+@pytest.mark.parametrize("entropy", [FAST, EntropyCoder()])
 @pytest.mark.parametrize("q", [0.0, 0.5, 1.0])
 def test_within_balanced_steps(degree, entropy, q):
     scene = random_scene(1500, degree, seed=degree)
     options = as_it_is("best", entropy, q=q)
     encoded = encode(scene, options=options)
     data = joined(encoded)
-    bundled = any(s.coder == Coder.BUNDLES for s in PotrFile.from_bytes(data).header.sections)
-    # Of few splats without much to tell, bundles may take more than zstd.
-    assert bundled == (entropy.name == "context") or (not bundled and degree == 0)
+    assert (open_file(data).blocks[0].coder == Coder.BUNDLES) == (entropy.name == "bundles")
     check_within_balanced_steps(scene, data, encoded.order, options.parameters.beta * typical_size(scene))
 
 
@@ -121,15 +119,14 @@ def test_balanced_steps_do_not_depend_on_the_unit_of_length():
     assert np.abs(again.log_scales.max() - millimetres.log_scales.max()) < 0.1
 
 
-def test_version_1_has_no_context_coder():
-    data = joined(encode(random_scene(200), options=as_it_is(entropy=EntropyCoder("context"))))
-    file = PotrFile.from_bytes(data)
-    assert file.header.version == 1
-    assert not any(s.coder.of_streams for s in file.header.sections)
+def test_the_papers_quantiser_has_no_bundles():
+    data = joined(encode(random_scene(200), options=as_it_is(entropy=EntropyCoder())))
+    assert open_file(data).blocks[0].quantiser == 0
+    assert open_file(data).blocks[0].coder == Coder.PLAIN
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-@pytest.mark.parametrize("entropy", [FAST, EntropyCoder("npz")])
+@pytest.mark.parametrize("entropy", [FAST])
 @pytest.mark.parametrize("q", [0.0, 0.5, 1.0])
 def test_within_steps(degree, entropy, q):
     scene = random_scene(500, degree, seed=degree)
@@ -189,7 +186,7 @@ def test_any_scene(data, degree, splats, q, balanced):
     )
     if balanced:
         # Both coders; the steps themselves are checked on scenes that have a typical size.
-        for entropy in (FAST, EntropyCoder("context")):
+        for entropy in (FAST, EntropyCoder()):
             options = as_it_is("best", entropy, q=q)
             if options.parameters.beta * typical_size(scene) < np.ptp(scene.means, axis=0).max() * 2.0**-43:
                 return  # splats of next to no size may ask for more levels than there are, and be refused
@@ -206,7 +203,7 @@ def test_same_input_same_bytes_whatever_the_threads(preset):
     first = joined(encode(scene, options=as_it_is(preset, threads=1)))
     for threads in (1, 2, 5):
         assert joined(encode(scene, options=as_it_is(preset, threads=threads))) == first
-    a, b = decode(first), PotrFile.from_bytes(first).scene(threads=1)
+    a, b = decode(first), open_file(first).scene(threads=1)
     for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
         assert np.array_equal(getattr(a, name), getattr(b, name))
 
@@ -240,18 +237,19 @@ def test_sections_decode_alone(preset):
     scene = random_scene(2000)
     data = joined(encode(scene, options=as_it_is(preset)))
     whole = decode(data)
-    assert np.array_equal(PotrFile.from_bytes(data).means(), whole.means)
-    assert np.array_equal(PotrFile.from_bytes(data).log_scales(), whole.log_scales)
-    assert np.array_equal(PotrFile.from_bytes(data).quaternions(), whole.quaternions)
-    assert np.array_equal(PotrFile.from_bytes(data).opacity_logits(), whole.opacity_logits)
-    assert np.array_equal(PotrFile.from_bytes(data).sh(), whole.sh)
+    assert np.array_equal(open_file(data).means(), whole.means)
+    assert np.array_equal(open_file(data).body(0).log_scales(), whole.log_scales)
+    assert np.array_equal(open_file(data).body(0).quaternions(), whole.quaternions)
+    assert np.array_equal(open_file(data).body(0).opacity_logits(), whole.opacity_logits)
+    assert np.array_equal(open_file(data).body(0).sh(), whole.sh)
     # A damaged colour does not keep the positions from decoding.
-    section = next(s for s in PotrFile.from_bytes(data).header.sections if s.kind == Property.SH and s.index >= 3)
+    block = open_file(data).blocks[0]
+    section = block.find(Property.SH1)
     damaged = bytearray(data)
-    damaged[section.offset] ^= 1
-    file = PotrFile.from_bytes(bytes(damaged))
+    damaged[block.offset + section.offset] ^= 1
+    file = open_file(bytes(damaged))
     assert np.array_equal(file.means(), whole.means)
-    with pytest.raises(DataError, match=f"'{section.name}' is damaged"):
+    with pytest.raises(DataError, match=f"'{section.title}' is damaged"):
         file.scene()
 
 
@@ -260,8 +258,7 @@ def test_zero_streams_take_no_bytes():
     quiet = Scene(scene.means, scene.log_scales, scene.quaternions, scene.opacity_logits, scene.sh.copy())
     quiet.sh[:, 4:] = 0
     encoded = encode(quiet, options=KEEP)
-    kinds = [(s.kind, s.index) for s in PotrFile.from_bytes(joined(encoded)).header.sections]
-    assert max(index for kind, index in kinds if kind == Property.SH) < 12
+    assert [open_file(joined(encoded)).blocks[0].find(prop) for prop in SH[2:]] == [None, None]
     assert (decode(joined(encoded)).sh[:, 4:] == 0).all()
 
 
@@ -294,7 +291,7 @@ def test_independent_decoder_agrees(degree, preset):
         agree(decode(data), decode_independently(data))
 
 
-GOLDEN = sorted(DATA.glob("golden_v*.potr"))
+GOLDEN = sorted(DATA.glob("golden_*.potr"))
 
 
 def test_there_are_golden_files():
@@ -318,12 +315,11 @@ def test_golden_files_say_for_ever_how_they_are_rendered(path):
 
 
 def test_flags_are_all_that_marks_an_antialiased_scene():
-    """Of version 1, whose steps are the same for all: classic files stay as they were, byte for byte."""
+    """With the paper's quantiser, whose steps are the same for all."""
     scene = random_scene(100, 1)
     options = EncodeOptions.for_preset("paper", prune=False, compact=False)
     classic, marked = (joined(encode(scene.rendered(kind), None, options)) for kind in (False, True))
-    assert classic[10:12] == b"\0\0"
-    assert marked[10:12] == b"\1\0"
+    assert (classic[10], marked[10]) == (0, 1)
     changed = [i for i, (a, b) in enumerate(zip(classic, marked, strict=True)) if a != b]
     checksum = int.from_bytes(classic[12:16], "little") - 4
     assert set(changed) <= {10, *range(checksum, checksum + 4)}
@@ -335,7 +331,7 @@ def test_scales_of_antialiased_scenes_have_finer_steps(preset):
     scene = random_scene(300, 1)
     options = EncodeOptions.for_preset(preset, prune=False, compact=False, refit=False)
     data = [joined(encode(scene.rendered(kind), None, options)) for kind in (False, True)]
-    classic, marked = (PotrFile.from_bytes(each).header for each in data)
+    classic, marked = (open_file(each).blocks[0] for each in data)
     assert marked.sf_scale == 2 * classic.sf_scale
     for each in ("sf_rotation", "sf_opacity", "sf_dc", "sf_ac"):
         assert getattr(marked, each) == getattr(classic, each)

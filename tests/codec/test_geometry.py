@@ -74,7 +74,7 @@ def test_centres_move_while_the_rest_stays_rounded_and_shapes_after_them(kind):
     assert np.array_equal(third.means, seen.means)
 
 
-@pytest.mark.parametrize("entropy", ["context", "zstd"])
+@pytest.mark.parametrize("entropy", ["bundles", "zstd"])
 def test_a_file_of_geometry_that_was_there_is_the_same_file(entropy):
     scene = random_scene(700, 2)
     parameters, coder = EncodeOptions().parameters, EntropyCoder(entropy)

@@ -125,7 +125,7 @@ def test_any_scene(means, tolerance):
 def test_damaged_streams_are_refused_or_parse_to_the_right_count(data):
     means = np.vstack([SHELL[:30], np.zeros((3, 3))]).astype(np.float32)
     streams, _ = octree.build(means, 1e-3)
-    field = data.draw(st.sampled_from(["occupancy", "several", "multiplicities", "tail_lengths", "tails", "depth"]))
+    field = data.draw(st.sampled_from(["occupancy", "several", "multiplicities", "leaf_levels", "tails", "depth"]))
     value = getattr(streams, field)
     if field == "depth":
         damaged = data.draw(st.integers(0, 52))

@@ -52,7 +52,7 @@ def test_same_streams(scene, finest, alike, monkeypatch):
     assert np.array_equal(our_order, our_leaves)
     assert our_order.dtype == their_order.dtype
     assert (ours.origin, ours.side, ours.depth) == (theirs.origin, theirs.side, theirs.depth)
-    for name in ("occupancy", "several", "multiplicities", "tail_lengths", "tails"):
+    for name in ("occupancy", "several", "multiplicities", "leaf_levels", "tails"):
         a, b = getattr(ours, name), getattr(theirs, name)
         assert a.dtype == b.dtype
         assert np.array_equal(a, b), name
@@ -71,7 +71,7 @@ def test_levels_at_a_turn_are_numpys(monkeypatch):
     levels = []
     for value in ("0", "1"):
         monkeypatch.setenv(VARIABLE, value)
-        levels.append(octree.build(means, tolerance, absolute=True)[0].tail_lengths)
+        levels.append(octree.build(means, tolerance, absolute=True)[0].leaf_levels)
     assert np.array_equal(*levels)
     functions = native().octree_build
     assert set(functions.wanted(turn, half, 20)) == {-1}

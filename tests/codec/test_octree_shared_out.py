@@ -25,7 +25,7 @@ def test_the_same_octree(monkeypatch, tolerance):
         tree, its_order = octree.build(means, tolerance, absolute=True, run=pool.map)
     assert np.array_equal(wanted_order, its_order)
     assert (tree.origin, tree.side, tree.depth) == (wanted.origin, wanted.side, wanted.depth)
-    for name in ("occupancy", "several", "multiplicities", "tail_lengths", "tails"):
+    for name in ("occupancy", "several", "multiplicities", "leaf_levels", "tails"):
         assert np.array_equal(getattr(tree, name), getattr(wanted, name)), name
 
 
@@ -44,7 +44,7 @@ def test_what_is_begun_ends_as_what_is_built(absolute, tolerance, spread):
         centres = begun.decoded(pool.map)
     tree = begun.streams()
     assert begun.depth == tree.depth
-    for name in ("occupancy", "several", "multiplicities", "tail_lengths", "tails"):
+    for name in ("occupancy", "several", "multiplicities", "leaf_levels", "tails"):
         assert np.array_equal(getattr(tree, name), getattr(wanted, name)), name
     assert np.array_equal(centres, octree.parse(tree, len(means)))
 

@@ -7,18 +7,18 @@ import pytest
 
 from potr_cl import cli, load_scene
 from potr_cl.codec.container import EntropyCoder
-from potr_cl.codec.decoder import PotrFile, decode
+from potr_cl.codec.decoder import decode, open_file
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.native.library import VARIABLE
 from potr_cl.codec.quantize import HyperParameters
-from potr_cl.codec.sections import Coder, Property
+from potr_cl.codec.sections import ORDER, Coder, Property
 from potr_cl.errors import DataError, UsageError
 
 COEFFICIENTS = (1, 4, 9, 16)
 OTHERS = ("means", "log_scales", "quaternions", "opacity_logits")
 
 
-@pytest.fixture(scope="module", params=[("best", "context"), ("fast", "zstd"), ("paper", "npz")], ids=lambda p: p[0])
+@pytest.fixture(scope="module", params=[("best", "bundles"), ("fast", "zstd"), ("paper", "zstd")], ids=lambda p: p[0])
 def coded(request, plush_excerpt):
     preset, entropy = request.param
     parameters = HyperParameters.from_quality(0.5, preset)
@@ -27,10 +27,10 @@ def coded(request, plush_excerpt):
 
 def spoiled(data: bytes, spare) -> bytes:
     """The file with all sections damaged but those that ``spare`` says."""
-    changed = bytearray(data)
-    for section in PotrFile.from_bytes(data).header.sections:
-        if section.kind != Property.METADATA and not spare(section):
-            changed[section.offset] ^= 0xFF
+    changed, block = bytearray(data), open_file(data).blocks[0]
+    for section in block.sections:
+        if not spare(section.kind):
+            changed[block.offset + section.offset] ^= 0xFF
     return bytes(changed)
 
 
@@ -42,8 +42,8 @@ def test_a_lower_degree(coded, degree, path, monkeypatch):
     whole = decode(coded)
     kept = COEFFICIENTS[degree]
 
-    def needed(section):
-        return section.kind != Property.SH or section.index < 3 * kept
+    def needed(kind):
+        return (kind.degree or 0) <= degree
 
     damaged = spoiled(coded, needed)
     part = decode(damaged, sh_degree=degree)
@@ -57,16 +57,14 @@ def test_a_lower_degree(coded, degree, path, monkeypatch):
 
 
 def test_positions_and_dc_alone(coded):
-    """A point cloud: nothing else of the file need be whole, but what steps of colours are made of."""
+    """A point cloud: nothing else of the file need be whole, but what contexts and steps of colours are made of."""
     whole = decode(coded)
-    octree = (Property.OCCUPANCY, Property.SEVERAL, Property.MULTIPLICITY, Property.TAIL_LENGTH, Property.TAIL)
-    bundled = any(section.coder == Coder.BUNDLES for section in PotrFile.from_bytes(coded).header.sections)
-    needed = (*octree, Property.OPACITY, Property.SCALE) if bundled else octree
-    file = PotrFile.from_bytes(
-        spoiled(coded, lambda section: section.kind in needed or (section.kind == Property.SH and section.index < 3))
-    )
-    assert np.array_equal(file.means(), whole.means)
-    assert np.array_equal(file.sh(0), whole.sh[:, :1])
+    octree = ORDER[: ORDER.index(Property.STEPS)]
+    bundled = open_file(coded).blocks[0].coder == Coder.BUNDLES
+    needed = (*octree, Property.SH0, Property.OPACITY, *([Property.SCALE] if bundled else []))
+    body = open_file(spoiled(coded, lambda kind: kind in needed)).body(0)
+    assert np.array_equal(body.means(), whole.means)
+    assert np.array_equal(body.sh(0), whole.sh[:, :1])
 
 
 def test_a_degree_that_the_file_does_not_have(plush_excerpt):

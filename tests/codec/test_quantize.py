@@ -54,11 +54,11 @@ def test_one_factor_for_all_of_sh_in_the_paper():
 
 
 def test_presets():
-    assert HyperParameters.from_quality(0.5).version == 1
+    assert HyperParameters.from_quality(0.5).quantiser == 0
     for other in ("fast", "smallest"):
         assert HyperParameters.from_quality(0.3, "best") == HyperParameters.from_quality(0.3, other)
     coarse, fine = (HyperParameters.from_quality(q, "best") for q in (0.2, 0.7))
-    assert coarse.version == fine.version == 3
+    assert coarse.quantiser == fine.quantiser == 1
     for name in ("sf_dc", "sf_sh", "sf_opacity", "sf_rotation", "sf_scale"):
         assert getattr(coarse, name) < getattr(fine, name)
     assert coarse.beta > fine.beta

@@ -14,8 +14,8 @@ import pytest
 from numpy._core import _multiarray_umath as umath
 
 from potr_cl.codec import quantize
+from potr_cl.codec.bundles.tokens import SIZES
 from potr_cl.codec.container import EntropyCoder
-from potr_cl.codec.context.tokens import SIZES
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.codec.quantize import HyperParameters
@@ -23,7 +23,7 @@ from tests.cases.decoded_bits import decoded_bits
 from tests.reference.scenes import random_scene
 
 ROOT = Path(__file__).parents[2]
-GOLDEN = sorted((ROOT / "tests" / "data").glob("golden_v*.potr"))
+GOLDEN = sorted((ROOT / "tests" / "data").glob("golden_*.potr"))
 DISPATCHED = [name for name in umath.__cpu_dispatch__ if umath.__cpu_features__[name]]
 
 

@@ -9,21 +9,22 @@ import pytest
 
 from potr_cl.codec import quantize
 from potr_cl.codec.container import EntropyCoder
-from potr_cl.codec.decoder import PotrFile, decode
+from potr_cl.codec.decoder import decode, open_file
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.geometry import Geometry, quantise_geometry
 from potr_cl.codec.native.library import VARIABLE, native
 from potr_cl.codec.quantize import HyperParameters
-from potr_cl.codec.sections import Property
+from potr_cl.codec.sections import SH, Property
 from potr_cl.codec.steps import prediction
 from potr_cl.codec.steps.fitting import FEWEST, fit_steps
 from potr_cl.codec.steps.rule import KNOTS, ColourSteps
 from potr_cl.errors import DataError
 from potr_cl.report.file import file_report, format_report
 from tests.oracles import decoder as oracle
+from tests.reference.file_parts import File
 from tests.reference.scenes import random_scene
 
-VERSION_3 = dataclasses.replace(HyperParameters.from_quality(0.5, "best"), version=3)
+BEST = HyperParameters.from_quality(0.5, "best")
 STEPS = ColourSteps(
     group_bits=2,
     knot_shift=3,
@@ -47,19 +48,19 @@ def effects_of(geometry: Geometry, seed: int = 1) -> np.ndarray:
     return effects
 
 
-def adapted(scene, parameters=VERSION_3) -> Geometry:
+def adapted(scene, parameters=BEST) -> Geometry:
     geometry = quantise_geometry(scene, parameters, ())
     return geometry.with_steps(effects_of(geometry))
 
 
-def file_of(scene, geometry, entropy="context", parameters=VERSION_3) -> bytes:
+def file_of(scene, geometry, entropy="bundles", parameters=BEST) -> bytes:
     return b"".join(code_scene(scene, parameters, geometry=geometry, entropy=EntropyCoder(entropy, 3)).pieces)
 
 
 def colour_bytes(data: bytes) -> int:
     """What colours and their steps take."""
-    sections = PotrFile.from_bytes(data).header.sections
-    return sum(section.stored_bytes for section in sections if section.kind in (Property.SH, Property.STEPS))
+    sections = open_file(data).blocks[0].sections
+    return sum(section.stored_bytes for section in sections if section.kind in (*SH, Property.STEPS))
 
 
 @pytest.fixture(params=["0", "1"], ids=["numpy", "native"])
@@ -76,23 +77,23 @@ def skip_without_library(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("degree", "splats", "entropy"), [(3, 700, "context"), (1, 900, "zstd"), (0, 300, "npz")])
+@pytest.mark.parametrize(("degree", "splats", "entropy"), [(3, 700, "bundles"), (1, 900, "zstd"), (0, 300, "zstd")])
 def test_the_independent_decoder_agrees(degree, splats, entropy, path):
     scene = random_scene(splats, degree, seed=degree)
     geometry = adapted(scene)
     assert len(np.unique(geometry.colour_classes()[0])) > 5
     data = file_of(scene, geometry, entropy)
-    file, wanted = PotrFile.from_bytes(data), oracle.decode(data)
+    file, wanted = open_file(data), oracle.decode(data)
     for threads in (1, 3):
         got = file.scene(threads)
         assert np.allclose(got.sh, wanted["sh"], rtol=1e-6, atol=1e-7)
         assert np.allclose(got.means, wanted["means"], rtol=1e-6, atol=1e-7)
         assert np.allclose(np.exp(got.log_scales), wanted["scales"], rtol=1e-5)
-    assert np.array_equal(file.sh(), got.sh)
-    assert np.array_equal(file.sh(0), got.sh[:, :1])
+    assert np.array_equal(file.body(0).sh(), got.sh)
+    assert np.array_equal(file.body(0).sh(0), got.sh[:, :1])
 
 
-@pytest.mark.parametrize("entropy", ["context", "zstd"])
+@pytest.mark.parametrize("entropy", ["bundles", "zstd"])
 def test_both_paths_give_the_same_bits(entropy, monkeypatch):
     skip_without_library(monkeypatch)
     scene = random_scene(3000, 2, seed=5)
@@ -112,7 +113,7 @@ def test_colours_are_within_half_of_each_splats_own_step():
     back = decode(file_of(scene, geometry))
     source = scene.sh[geometry.order].astype(np.float64)
     for m in range(4):
-        factor = (VERSION_3.sf_sh if m else VERSION_3.sf_dc) * 2 ** (geometry.colour_classes()[min(m, 1)] / 4)
+        factor = (BEST.sf_sh if m else BEST.sf_dc) * 2 ** (geometry.colour_classes()[min(m, 1)] / 4)
         channels = zip(quantize.to_ycocg(source[:, m]), quantize.to_ycocg(back.sh[:, m].astype(float)), strict=True)
         for wanted, got in channels:
             assert (np.abs(wanted - got) <= 0.5 / factor + 1e-5).all()
@@ -120,17 +121,17 @@ def test_colours_are_within_half_of_each_splats_own_step():
 
 def test_without_steps_all_are_alike(path):
     scene = random_scene(500, 1, seed=4)
-    geometry = quantise_geometry(scene, VERSION_3, ())
+    geometry = quantise_geometry(scene, BEST, ())
     data = file_of(scene, geometry)
-    assert PotrFile.from_bytes(data).header.find(Property.STEPS) is None
+    assert open_file(data).blocks[0].find(Property.STEPS) is None
     assert np.allclose(decode(data).sh, oracle.decode(data)["sh"], rtol=1e-6, atol=1e-7)
-    assert np.abs(decode(data).sh[:, 0] - scene.sh[geometry.order, 0]).max() <= 1.5 / VERSION_3.sf_dc + 1e-6
+    assert np.abs(decode(data).sh[:, 0] - scene.sh[geometry.order, 0]).max() <= 1.5 / BEST.sf_dc + 1e-6
 
 
 def test_the_same_error_costs_fewer_bits():
     """The error that the steps add stays as it was, with steps that are coarser on average."""
     scene = random_scene(20000, 0, seed=6)
-    geometry = quantise_geometry(scene, VERSION_3, ())
+    geometry = quantise_geometry(scene, BEST, ())
     effects = effects_of(geometry)[geometry.order]
     adapted_geometry = geometry.with_steps(effects_of(geometry))
     for classes in adapted_geometry.colour_classes():
@@ -142,17 +143,17 @@ def test_the_same_error_costs_fewer_bits():
 
 def test_a_scene_of_which_nothing_is_known_has_no_steps():
     scene = random_scene(400, 0, seed=7)
-    geometry = quantise_geometry(scene, VERSION_3, ())
+    geometry = quantise_geometry(scene, BEST, ())
     assert geometry.with_steps(np.zeros(400)).steps is None
     assert geometry.with_steps(np.full(400, np.inf)).steps is None
-    few = quantise_geometry(random_scene(FEWEST - 1, 0, seed=8), VERSION_3, ())
+    few = quantise_geometry(random_scene(FEWEST - 1, 0, seed=8), BEST, ())
     assert few.with_steps(np.ones(FEWEST - 1)).steps is None
     assert geometry.with_steps(np.ones(400)).steps is not None
 
 
 @pytest.mark.parametrize("sf_opacity", [1e-3, 5.5, 1e9])
 def test_steps_of_any_scale_factor(sf_opacity):
-    parameters = dataclasses.replace(VERSION_3, sf_opacity=sf_opacity)
+    parameters = dataclasses.replace(BEST, sf_opacity=sf_opacity)
     scene = random_scene(400, 0, seed=9)
     geometry = adapted(scene, parameters)
     data = file_of(scene, geometry, "zstd", parameters)
@@ -207,12 +208,9 @@ def test_hostile_rules_give_what_the_page_says(seed):
         (rng.integers(0, 2**63, n, dtype=np.uint64) * 2 + 1) >> rng.integers(0, 64, n, dtype=np.uint64)
         for _ in range(4)
     ]
-    header = oracle.Header(3, 0, n, 1, 0, 0, (0, 0, 0), 0, {}, (1, 1), False, 0.3)
-    sections = {(oracle.STEPS, 0): oracle.Section(1, steps.to_bytes())}
-    for axis in range(3):
-        sections[oracle.SCALE, axis] = oracle.Section(0, b"", [[int(v) for v in levels[axis]]])
-    sections[oracle.OPACITY, 0] = oracle.Section(0, b"", [[int(v) for v in levels[3]]])
-    wanted = oracle.decode_classes(sections, header)
+    block = oracle.Block(0, 0, 0, n, (), (), 0, (), [], 0, 1)
+    integers = {"SCAL": [[int(v) for v in axis] for axis in levels[:3]], "OPAC": [[int(v) for v in levels[3]]]}
+    wanted = oracle.decode_classes({"STEP": steps.to_bytes()}, integers, block)
     got = ColourSteps.from_bytes(steps.to_bytes(), n).classes(levels[:3], levels[3])
     assert [part.tolist() for part in got] == list(wanted)
 
@@ -237,21 +235,19 @@ def test_colours_are_predicted_as_colours():
     assert np.abs(residuals[:, 4:]).max() <= 3
 
 
-def test_other_versions_have_no_steps():
+def test_the_papers_quantiser_has_no_steps():
     scene = random_scene(400, 0, seed=10)
-    data = bytearray(file_of(scene, adapted(scene), "zstd"))
-    data[8] = 2
-    size = int.from_bytes(data[12:16], "little")
-    data[size - 4 : size] = oracle.zlib.crc32(data[: size - 4]).to_bytes(4, "little")
-    with pytest.raises(DataError, match="section 'steps' does not belong to format version 2"):
-        decode(bytes(data))
-    with pytest.raises(ValueError, match="unknown property"):
-        oracle.decode(bytes(data))
+    file = File.of(file_of(scene, adapted(scene), "zstd"))
+    file.quantiser = 0
+    with pytest.raises(DataError, match=r"section 'steps' holds .* bytes, more than"):
+        decode(file.bytes())
+    with pytest.raises(ValueError, match="STEP is too long"):
+        oracle.decode(file.bytes())
 
 
 def test_rules_do_not_depend_on_the_order_of_threads_or_the_unit_of_effects():
     scene = random_scene(5000, 0, seed=11)
-    geometry = quantise_geometry(scene, VERSION_3, ())
+    geometry = quantise_geometry(scene, BEST, ())
     effects = effects_of(geometry)[geometry.order]
     first, second = (
         fit_steps(geometry.scales, geometry.opacities, geometry.parameters.sf_opacity, effects * unit)
@@ -265,11 +261,11 @@ def test_rules_do_not_depend_on_the_order_of_threads_or_the_unit_of_effects():
 def test_the_report_says_what_the_header_holds():
     scene = random_scene(400, 0, seed=12)
     geometry = adapted(scene)
-    report = file_report(PotrFile.from_bytes(file_of(scene, geometry)))
+    report = file_report(open_file(file_of(scene, geometry)))
     assert report["colour_steps"]["scales"] == list(geometry.steps.scales)
     assert report["colour_steps"]["groups"] == 25
     assert report["sections"]["colour: steps"]["serialised_bytes"] == 50 + 25
     assert "its group of 16 splats" in format_report(report)
-    alike = file_report(PotrFile.from_bytes(file_of(scene, quantise_geometry(scene, VERSION_3, ()))))
+    alike = file_report(open_file(file_of(scene, quantise_geometry(scene, BEST, ()))))
     assert alike["colour_steps"] is None
     assert "the same for all splats" in format_report(alike)

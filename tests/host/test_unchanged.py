@@ -78,7 +78,7 @@ def test_cameras(tmp_path: Path, written_while_read: Callable[..., None]) -> Non
 
 
 @pytest.mark.parametrize("times", [1, math.inf])
-@pytest.mark.parametrize("name", ["golden_v3_degree3_steps", "golden_v4_degree1_antialiased_blocks"])
+@pytest.mark.parametrize("name", ["golden_bundles_degree3", "golden_blocks"])
 def test_a_compressed_scene(
     tmp_path: Path, data: Path, written_while_read: Callable[..., None], name: str, times: float
 ) -> None:
@@ -94,7 +94,7 @@ def test_a_compressed_scene_for_other_computers(
     tmp_path: Path, data: Path, written_while_read: Callable[..., None]
 ) -> None:
     path = tmp_path / "a.potr"
-    shutil.copy(data / "golden_v3_degree3_steps.potr", path)
+    shutil.copy(data / "golden_bundles_degree3.potr", path)
     written_while_read(path)
     with pytest.raises(DataError, match=rf"a\.potr' {SAID}$"):
         coded_scene(path)
@@ -104,7 +104,7 @@ def test_a_compressed_scene_for_other_computers(
 def test_a_file_of_blocks_that_is_written_between_two_of_them(tmp_path: Path, data: Path, how: str) -> None:
     """Another encode may end meanwhile, whose file takes this one's place."""
     path = tmp_path / "a.potr"
-    shutil.copy(data / "golden_v4_degree1_antialiased_blocks.potr", path)
+    shutil.copy(data / "golden_blocks.potr", path)
     file = open_file(path)
     if how == "replaced":
         shutil.copy(path, tmp_path / "b.potr")
@@ -112,7 +112,7 @@ def test_a_file_of_blocks_that_is_written_between_two_of_them(tmp_path: Path, da
     else:
         os.utime(path, ns=(1, 1))
     with pytest.raises(DataError, match=rf"a\.potr' {SAID}$"):
-        file.scene()  # type: ignore[union-attr]
+        file.scene()
     assert len(potr_cl.decode(path))
 
 

@@ -1,4 +1,4 @@
-"""Coder 4 of the independent decoder, written from docs/format.md alone: section "Bundles".
+"""Coder 1 of the independent decoder, written from docs/format.md alone: section "Bundles".
 
 Plain and slow on purpose, as the rest of it.
 """
@@ -11,11 +11,9 @@ from typing import NamedTuple
 
 from tests.oracles import decoder as rest
 
-#: The sections with the states of the lanes, and all others in the order of decoding.
-FIRST = (rest.OPACITY, 0)
-MAIN_CHAIN = (FIRST, (rest.SCALE, 0), (rest.SH, 0), (rest.SH, 3), (rest.SH, 12), (rest.SH, 27))
-ROTATION = (rest.ROTATION, 0)
-STREAMS = {FIRST: 1, (rest.SCALE, 0): 3, ROTATION: 3, (rest.SH, 0): 3}
+#: The sections whose states go on from one to the next.
+MAIN_CHAIN = ("OPAC", "SCAL", "SHC0", "SHC1", "SHC2", "SHC3")
+NAMES = {"OPAC": "opacity", "SCAL": "scale", "ROTA": "rotation", "SHC0": "dc"}
 
 
 class Stream(NamedTuple):
@@ -43,74 +41,61 @@ class Bundle:
         self.splats = splats
         self.sizes: dict[str, list[int]] = {}
         self.sums = [[0] * splats for _ in range(3)]
-        self.integers: dict[tuple[int, int], list[int]] = {}
+        self.integers: dict[tuple[str, int], list[int]] = {}
 
     def size(self, name: str, splat: int) -> int:
         """Return the size of a splat's token, 0 where its section is absent."""
         return self.sizes[name][splat] if name in self.sizes else 0
 
 
-def decode_bundles(
-    coded: dict[tuple[int, int], bytes], sections: rest.Sections, header: rest.Header
-) -> dict[tuple[int, int], list[int]]:
-    """Return the integers of all streams by property and index, one a splat."""
-    number = -(-header.splats // 8192)
-    sizes = [min(8192, header.splats - 8192 * b) for b in range(number)]
-    parts = {key: take_apart(coded[key], key, sizes) for key in coded}
-    whole: dict[tuple[int, int], list[int]] = {}
-    for prop, index in coded:
-        for k in range(sections[prop, index].planes):
-            whole[prop, index + k] = []
+def decode_bundles(coded: dict[str, bytes], sections: rest.Sections, block: rest.Block) -> rest.Integers:
+    """Return the integers of all streams of the sections that there are; of DC what its prediction has left."""
+    sizes = [min(8192, block.splats - 8192 * b) for b in range(-(-block.splats // 8192))]
+    parts = {name: take_apart(coded[name], name, sizes) for name in coded}
     bundles = []
     for b, splats in enumerate(sizes):
         bundle = Bundle(splats)
-        lanes = -(-splats // 256)
-        states = parts[FIRST].states[32 * b : 32 * b + lanes]
-        for key in MAIN_CHAIN[:2]:
-            decode_section(key, parts, b, bundle, states, [])
+        states = parts["OPAC"].states[32 * b : 32 * b + -(-splats // 256)]
+        for name in MAIN_CHAIN[:2]:
+            decode_section(name, parts, b, bundle, states, [])
         bundles.append((bundle, states))
-    for b, (bundle, _) in enumerate(bundles):
-        for prop, streams in ((rest.OPACITY, 1), (rest.SCALE, 3)):
-            for k in range(streams):
-                if (prop, k) in whole:
-                    whole[prop, k] += bundle.integers[prop, k]
-        check_length(whole, rest.OPACITY, 8192 * b + bundle.splats)
-    for prop in (rest.OPACITY, rest.SCALE):
-        for k in range(3):
-            if (prop, k) in whole:
-                sections[prop, k] = rest.Section(0, b"", [whole[prop, k]])
-    classes, _ = rest.decode_classes(sections, header)
+    whole = {name: joined([bundle for bundle, _ in bundles], name) for name in ("OPAC", "SCAL")}
+    classes, _ = rest.decode_classes(sections, whole, block)
     for b, (bundle, states) in enumerate(bundles):
         own = classes[8192 * b : 8192 * b + bundle.splats]
-        for key in MAIN_CHAIN[2:]:
-            decode_section(key, parts, b, bundle, states, own)
+        for name in MAIN_CHAIN[2:]:
+            decode_section(name, parts, b, bundle, states, own)
         rest.check(all(state == 65536 for state in states), "a lane does not end where it began")
-        if ROTATION in parts:
-            states = parts[ROTATION].states[32 * b : 32 * b + len(states)]
-            decode_section(ROTATION, parts, b, bundle, states, own)
+        if "ROTA" in parts:
+            states = parts["ROTA"].states[32 * b : 32 * b + len(states)]
+            decode_section("ROTA", parts, b, bundle, states, own)
             rest.check(all(state == 65536 for state in states), "a lane does not end where it began")
-        for key, integers in whole.items():
-            if key[0] not in (rest.OPACITY, rest.SCALE):
-                integers += bundle.integers[key]
-    return whole
+    return {name: joined([bundle for bundle, _ in bundles], name) for name in coded}
 
 
-def check_length(whole: dict[tuple[int, int], list[int]], prop: int, splats: int) -> None:
-    """Check that so many splats were decoded."""
-    rest.check(len(whole[prop, 0]) == splats, "a bundle has another number of splats")
+def joined(bundles: list[Bundle], name: str) -> list[list[int]]:
+    """Return the streams of a section, of all bundles together; 0 where there is none."""
+    streams: list[list[int]] = [[] for _ in range(rest.STREAMS[name])]
+    for bundle in bundles:
+        for k, stream in enumerate(streams):
+            stream += bundle.integers.get((name, k), [0] * bundle.splats)
+    return streams
 
 
-def take_apart(stored: bytes, key: tuple[int, int], sizes: list[int]) -> Part:
+def take_apart(stored: bytes, name: str, sizes: list[int]) -> Part:
     """Return the parts of a section."""
     rest.check(len(stored) >= 4, "a section of bundles is shorter than its size")
     (description_size,) = struct.unpack_from("<I", stored)
     at = 4 + description_size
-    lanes = sum(-(-splats // 256) for splats in sizes) if key in (FIRST, ROTATION) else 0
+    lanes = sum(-(-splats // 256) for splats in sizes) if name in ("OPAC", "ROTA") else 0
     rest.check(at + 4 * lanes + 4 * len(sizes) <= len(stored), "a section of bundles is shorter than its parts")
     description = stored[4:at]
-    size = rest.zstandard.frame_content_size(description)
-    rest.check(0 <= size <= 2**20, "impossible size of a description")
-    streams = read_streams(rest.undo_zstandard(description, size, "description of contexts"), key)
+    raw = None
+    if description:
+        size = rest.zstandard.frame_content_size(description)
+        rest.check(0 <= size <= 2**20, "impossible size of a description")
+        raw = rest.undo_zstandard(description, size, "description of contexts")
+    streams = read_streams(raw, name)
     states = list(struct.unpack_from(f"<{lanes}I", stored, at))
     rest.check(all(state >= 65536 for state in states), "a state is below 65536")
     at += 4 * lanes
@@ -124,16 +109,21 @@ def take_apart(stored: bytes, key: tuple[int, int], sizes: list[int]) -> Part:
     return Part(streams, states, words)
 
 
-def read_streams(raw: bytes, key: tuple[int, int]) -> list[Stream]:
-    """Return what a description says."""
-    if key in STREAMS:
-        known = {FIRST: 0, (rest.SCALE, 0): 0, ROTATION: 6, (rest.SH, 0): 5}[key]
-        numbers = [(known + s, 0) for s in range(STREAMS[key])]
-        alphabets = [252] * STREAMS[key]
+def read_streams(raw: bytes | None, name: str) -> list[Stream]:
+    """Return what a description says; None: there is none."""
+    if name in NAMES:
+        known = {"OPAC": 0, "SCAL": 0, "ROTA": 6, "SHC0": 5}[name]
+        numbers = [(known + s, 0) for s in range(rest.STREAMS[name])]
+        alphabets = [252] * rest.STREAMS[name]
     else:
-        coefficients = {3: 3, 12: 5, 27: 7}[key[1]]
+        coefficients = 2 * int(name[3]) + 1
         numbers = [(11, 0), (5, coefficients), (6, coefficients), (7, coefficients), (8, coefficients)]
         alphabets = [2**coefficients, 8, 252, 252, 252]
+    if raw is None:
+        return [
+            Stream([0] * terms, 28, 0, [0] * biases, known_model(min(alphabet, 216)))
+            for (terms, biases), alphabet in zip(numbers, alphabets, strict=True)
+        ]
     at = 0
     read = []
     for terms, biases in numbers:
@@ -148,26 +138,36 @@ def read_streams(raw: bytes, key: tuple[int, int]) -> list[Stream]:
     ]
 
 
-def decode_section(
-    key: tuple[int, int], parts: dict[tuple[int, int], Part], b: int, bundle: Bundle, states: list[int], own: list[int]
-) -> None:
+def known_model(tokens: int) -> rest.Model:
+    """Return the model of a stream without a description."""
+    rows = []
+    for k in range(32):
+        c = ((4096 if k % 2 == 0 else 5793) * 2 ** (k // 2)) >> 6
+        below = []
+        for a in range(tokens):
+            r = (c + 16 * min(rest.least_of_token(a), 2**20)) ** 2
+            below.append((4096 - tokens) * (r - c**2) // r + a)
+        below.append(4096)
+        rows.append([below[a + 1] - below[a] for a in range(tokens)])
+    return rest.Model(list(range(8, 256, 8)), rows)
+
+
+def decode_section(key: str, parts: dict[str, Part], b: int, bundle: Bundle, states: list[int], own: list[int]) -> None:
     """Decode a section of a bundle, if the file has it; ``own`` are the classes of the steps of DC."""
     if key not in parts:
         return
     streams, words = parts[key].streams, list(reversed(parts[key].words[b]))
-    prop, index = key
-    names = {rest.OPACITY: "opacity", rest.SCALE: "scale", rest.ROTATION: "rotation", rest.SH: "dc"}
-    if prop != rest.SH or index == 0:
+    if key in NAMES:
         for s, stream in enumerate(streams):
-            items = [(terms_of(bundle, names[prop], n, s, own), 0) for n in range(bundle.splats)]
-            signed = prop in (rest.ROTATION, rest.SH)
+            items = [(terms_of(bundle, NAMES[key], n, s, own), 0) for n in range(bundle.splats)]
+            signed = key in ("ROTA", "SHC0")
             found, tokens = decode_items(
                 stream, items, states, words, lambda t, signed=signed: rest.token_size(t, signed)
             )
-            bundle.sizes[f"{names[prop]} {s}"] = [rest.token_size(token, signed) for token in tokens]
-            bundle.integers[prop, index + s] = [signed_of(u) if signed else u for u in found]
+            bundle.sizes[f"{NAMES[key]} {s}"] = [rest.token_size(token, signed) for token in tokens]
+            bundle.integers[key, s] = [rest.signed_of(u) if signed else u for u in found]
     else:
-        decode_degree(index, streams, bundle, states, words, own)
+        decode_degree(key, streams, bundle, states, words, own)
     rest.check(not words, "a bundle has too many words")
 
 
@@ -184,11 +184,10 @@ def terms_of(bundle: Bundle, name: str, n: int, s: int, own: list[int]) -> list[
 
 
 def decode_degree(
-    index: int, streams: list[Stream], bundle: Bundle, states: list[int], words: list[int], own: list[int]
+    key: str, streams: list[Stream], bundle: Bundle, states: list[int], words: list[int], own: list[int]
 ) -> None:
     """Decode the AC coefficients of a degree."""
-    first = index // 3
-    coefficients = {1: 3, 4: 5, 9: 7}[first]
+    coefficients = 2 * int(key[3]) + 1
     mask, pattern, *of_channels = streams
     items = []
     for n in range(bundle.splats):
@@ -204,7 +203,7 @@ def decode_degree(
     patterns, _ = decode_items(pattern, [(known[n], k) for n, k in where], states, words, pattern_size)
     for k in range(coefficients):
         for c in range(3):
-            bundle.integers[rest.SH, 3 * (first + k) + c] = [0] * bundle.splats
+            bundle.integers[key, 3 * k + c] = [0] * bundle.splats
     sizes: list[dict[tuple[int, int], int]] = [{}, {}, {}]
     for c, stream in enumerate(of_channels):
         there = [(place, p) for place, p in zip(where, patterns, strict=True) if p >> c & 1]
@@ -214,7 +213,7 @@ def decode_degree(
             items.append(([*known[n], pattern_size(p), *before], k))
         values, tokens = decode_items(stream, items, states, words, value_size)
         for ((n, k), _), value, token in zip(there, values, tokens, strict=True):
-            bundle.integers[rest.SH, 3 * (first + k) + c][n] = signed_of(value + 1)
+            bundle.integers[key, 3 * k + c][n] = rest.signed_of(value + 1)
             sizes[c][n, k] = value_size(token)
     for c in range(3):
         for (n, _), size in sizes[c].items():
@@ -272,11 +271,6 @@ def take_words(active: list[int], states: list[int], words: list[int]) -> None:
         if states[lane] < 65536:
             rest.check(len(words) > 0, "a bundle has too few words")
             states[lane] = states[lane] * 65536 + words.pop()
-
-
-def signed_of(u: int) -> int:
-    """Undo the mapping of signed integers."""
-    return u // 2 if u % 2 == 0 else -(u + 1) // 2
 
 
 def mask_size(mask: int) -> int:

@@ -123,7 +123,7 @@ def test_a_file_keeps_how_its_scene_is_rendered(device, preset, low_pass):
     scene, cameras = small(300, 2, low_pass=low_pass), ring_of_cameras(6, size=40)
     options = EncodeOptions.for_preset(preset, q=0.7, prune={"iterations": 4})
     data = b"".join(encode(scene, cameras, options, device=device).pieces)
-    back = potr_cl.codec.decoder.PotrFile.from_bytes(data).scene()
+    back = potr_cl.codec.decoder.open_file(data).scene()
     assert (back.antialiased, back.low_pass) == (True, low_pass)
     assert 0 < len(back) <= len(scene)
     keyword = b"".join(encode(scene.rendered(False), cameras, options, device=device, antialiased=True).pieces)
@@ -146,7 +146,7 @@ def test_encoded_as_antialiased_it_looks_better_than_encoded_as_classic(device, 
         targets = [rasterizer.render(view)[0] for view in judged]
     for kind in (True, False):
         encoded = encode(plush_excerpt.rendered(kind), train_views(plush_excerpt_cameras), options, device=device)
-        back = potr_cl.codec.decoder.PotrFile.from_bytes(b"".join(encoded.pieces)).scene()
+        back = potr_cl.codec.decoder.open_file(b"".join(encoded.pieces)).scene()
         with Rasterizer(device, back.rendered(True)) as rasterizer:
             pictures = [rasterizer.render(view)[0] for view in judged]
         error = np.mean([np.mean(np.square(a - b)) for a, b in zip(pictures, targets, strict=True)])

@@ -3,16 +3,13 @@
     python -m tools.bench.decode [FILE.potr …] [--splats N] [--runs R] [--part PART …] [--device DEVICE …] [--json FILE]
 
 FILEs are .potr files; without any, a scene of N splats (default: a million) is drawn from a real one and coded without
-pruning by the presets best and fast. Parts (default: all but roads and device):
+pruning by the presets best and fast. Parts (default: all but device):
 
 speed    decodes in this process, in turn by NumPy and by the native path, with one thread and with one a processor;
          wall time and processor time
 memory   host memory that a decode takes at most, beside what it makes; a process each
 command  `decode FILE -o scene.ply` as a fresh process; the decoded scene is written as PLY too. Python finds its
          modules compiled, as `pip install` leaves them
-versions the same splats in files of version 2 and of version 3: bytes, how fast they are coded and decoded, in turn
-roads    the tokens of the context coder alone: by NumPy, by the native path, and by OpenCL kernels of both families on
-         the devices given, with what a fresh process pays for a context and for loading the kernels
 device   from the file's bytes to buffers of a device, in turn by way of a scene on the host and straight, on the
          devices given (default: the best one)
 """
@@ -29,17 +26,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from potr_cl.codec.decoder import PotrFile
-from potr_cl.codec.encoder import code_scene
+from potr_cl.codec.decoder import open_file
 from potr_cl.codec.native.library import VARIABLE
-from potr_cl.codec.quantize import HyperParameters
 from potr_cl.formats import load_cameras, load_scene
-from potr_cl.model.scene import Scene
 from potr_cl.ondevice.decode import decode_to_device
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
@@ -63,9 +56,7 @@ def main() -> None:
     parser.add_argument("--splats", type=int, default=10**6, metavar="N")
     parser.add_argument("--runs", type=int, default=9, metavar="R", help="of each; default 9")
     parser.add_argument("--part", action="append", choices=list(PARTS), dest="parts")
-    parser.add_argument(
-        "--device", action="append", dest="devices", default=[], help="for roads and device; more than one"
-    )
+    parser.add_argument("--device", action="append", dest="devices", default=[], help="for device; more than one")
     parser.add_argument(
         "--threads", action="append", type=int, metavar="T", help="to decode with; default: 1, 2 and one a processor"
     )
@@ -74,7 +65,7 @@ def main() -> None:
     results = Results(None, args.json)
     with tempfile.TemporaryDirectory() as folder:
         files = args.files or made_files(args.splats, Path(folder))
-        for part in args.parts or [name for name in PARTS if name not in ("roads", "device")]:
+        for part in args.parts or [name for name in PARTS if name != "device"]:
             PARTS[part](results, files, args)
 
 
@@ -112,7 +103,7 @@ def _processor_time() -> float:
 
 def _decode(path: Path, way: str, threads: int) -> None:
     os.environ[VARIABLE] = PATHS[way]
-    PotrFile.open(path).scene(threads=threads)
+    open_file(path).scene(threads=threads)
 
 
 def speed(results: Results, files: Iterable[Path], args: argparse.Namespace) -> None:
@@ -132,7 +123,7 @@ def speed(results: Results, files: Iterable[Path], args: argparse.Namespace) -> 
         Column("native, rate of a processor at work", "million splats/s", ".2f"),
     )
     for path in files:
-        splats = PotrFile.open(path).header.splats
+        splats = open_file(path).header.splats
         for threads in args.threads or _threads():
             works = {way: partial(_decode, path, way, threads) for way in PATHS}
             in_turn(works, 1)
@@ -150,49 +141,6 @@ def speed(results: Results, files: Iterable[Path], args: argparse.Namespace) -> 
 
 def _threads() -> list[int]:
     return sorted({1, min(2, processors()), processors()})
-
-
-def versions(results: Results, files: Iterable[Path], args: argparse.Namespace) -> None:
-    table = results.table(
-        "versions",
-        "The same splats in files of version 2 and of version 3, by the native path, medians",
-        Column("file"),
-        Column("splats", format=","),
-        Column("threads"),
-        Column("size, version 2", "bytes", ","),
-        Column("size, version 3", "bytes", ","),
-        Column("coding version 2, processor time", "ms", ".0f"),
-        Column("coding version 3, processor time", "ms", ".0f"),
-        Column("rate, version 2", "million splats/s", ".2f"),
-        Column("rate, version 3", "million splats/s", ".2f"),
-        Column("times as fast", format=".2f"),
-    )
-    os.environ[VARIABLE] = PATHS["native"]
-    for path in files:
-        scene = PotrFile.open(path).scene()
-        coded: dict[int, bytes] = {}
-        for threads in args.threads or _threads():
-            coding = {version: partial(_coded, scene, version, threads, coded) for version in (2, 3)}
-            used = {version: statistics.median(t[1]) for version, t in in_turn(coding, 3).items()}
-            works = {str(v): partial(_decode_bytes, coded[v], threads) for v in (2, 3)}
-            in_turn(works, 1)
-            times = in_turn(works, args.runs)
-            rates = {way: len(scene) / statistics.median(times[way][0]) / 1e6 for way in works}
-            ratio = statistics.median(a / b for a, b in zip(times["2"][0], times["3"][0], strict=True))
-            table.add(
-                path.stem, len(scene), threads, len(coded[2]), len(coded[3]),
-                *(round(1e3 * used[v], 1) for v in (2, 3)), round(rates["2"], 3), round(rates["3"], 3), round(ratio, 2),
-            )  # fmt: skip
-
-
-def _coded(scene: Scene, version: int, threads: int, coded: dict[int, bytes]) -> None:
-    """A scene as it is; with the same steps for all splats, so that only the coder differs."""
-    parameters = replace(HyperParameters.from_quality(0.5, "best"), version=version)
-    coded[version] = b"".join(code_scene(scene, parameters, threads=threads).pieces)
-
-
-def _decode_bytes(data: bytes, threads: int) -> None:
-    PotrFile.from_bytes(data).scene(threads=threads)
 
 
 def memory(results: Results, files: Iterable[Path], _: argparse.Namespace) -> None:
@@ -213,14 +161,14 @@ def memory(results: Results, files: Iterable[Path], _: argparse.Namespace) -> No
                 environment = {**os.environ, VARIABLE: value, "PYTHONPATH": str(ROOT)}
                 output = subprocess.run(command, check=True, capture_output=True, text=True, env=environment).stdout
                 found[way] = json.loads(output)
-            table.add(path.stem, PotrFile.open(path).header.splats, threads, *(round(found[w], 3) for w in PATHS))
+            table.add(path.stem, open_file(path).header.splats, threads, *(round(found[w], 3) for w in PATHS))
 
 
 def _growth(path: Path, threads: int) -> float:
     """In a process of its own: by how much memory grows at most, in sizes of what a decode makes."""
     reset_peak()
     before = resident("VmRSS")
-    scene = PotrFile.open(path).scene(threads=threads)
+    scene = open_file(path).scene(threads=threads)
     return 1e9 * (resident("VmHWM") - before) / scene.nbytes
 
 
@@ -242,7 +190,7 @@ def command(results: Results, files: Iterable[Path], args: argparse.Namespace) -
             times = in_turn(works, args.runs)
         wall, used = ({way: statistics.median(times[way][k]) for way in PATHS} for k in (0, 1))
         table.add(
-            path.stem, PotrFile.open(path).header.splats, *(round(wall[way], 3) for way in PATHS),
+            path.stem, open_file(path).header.splats, *(round(wall[way], 3) for way in PATHS),
             *(round(used[way], 3) for way in PATHS),
         )  # fmt: skip
 
@@ -254,15 +202,6 @@ def _whole_command(path: Path, way: str, folder: Path) -> None:
     whole = [sys.executable, "-m", "potr_cl", "decode", str(path), "-o", str(output)]
     subprocess.run(whole, check=True, capture_output=True, env=environment)
     output.unlink()
-
-
-def roads(results: Results, files: Iterable[Path], args: argparse.Namespace) -> None:
-    from tools.study import decoder_roads
-
-    of_version_2 = [path for path in files if PotrFile.open(path).header.version == 2]
-    if not of_version_2:
-        sys.exit("the context coder is in files of version 2 only: give some")
-    decoder_roads.compare(results, of_version_2, args.devices, args.runs)
 
 
 def device(results: Results, files: Iterable[Path], args: argparse.Namespace) -> None:
@@ -295,7 +234,7 @@ def device(results: Results, files: Iterable[Path], args: argparse.Namespace) ->
             timed.stage_times()
             _straight(data, timed)
             table.add(
-                path.stem, PotrFile.from_bytes(data, True).header.splats, opened.info.name,
+                path.stem, open_file(data, True).header.splats, opened.info.name,
                 *(round(each, 2) for each in (medians["host"], medians["both"] - medians["host"], medians["both"])),
                 round(medians["straight"], 2), round(1e3 * min(walls["straight"]), 2),
                 round(1e3 * sum(timed.stage_times().values()), 3),
@@ -303,24 +242,22 @@ def device(results: Results, files: Iterable[Path], args: argparse.Namespace) ->
 
 
 def _on_host(data: bytes) -> None:
-    PotrFile.from_bytes(data, trust=True).scene()
+    open_file(data, trust=True).scene()
 
 
 def _by_way_of_the_host(data: bytes, opened: Device) -> None:
-    with uploaded(opened, PotrFile.from_bytes(data, trust=True).scene()):
+    with uploaded(opened, open_file(data, trust=True).scene()):
         opened.queue.finish()
 
 
 def _straight(data: bytes, opened: Device) -> None:
-    decode_to_device(PotrFile.from_bytes(data, trust=True), opened).close()
+    decode_to_device(open_file(data, trust=True), opened).close()
 
 
 PARTS: dict[str, Callable[[Results, Iterable[Path], argparse.Namespace], None]] = {
     "speed": speed,
     "memory": memory,
     "command": command,
-    "versions": versions,
-    "roads": roads,
     "device": device,
 }
 

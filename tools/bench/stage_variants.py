@@ -358,14 +358,12 @@ def refit_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]:
 
 def code_rows(load: Workload, quick: bool) -> Iterator[Row]:
     """Entropy coders and levels, and decoding what they made."""
-    coders = [EntropyCoder("npz"), *(EntropyCoder("zstd", level) for level in (1, 9, 19, 22)), EntropyCoder("context")]
+    coders = [*(EntropyCoder("zstd", level) for level in (1, 9, 19, 22)), EntropyCoder()]
     for coder in coders:
-        parameters = EncodeOptions.for_preset("best" if coder.name == "context" else "paper").parameters
+        parameters = EncodeOptions.for_preset("best" if coder.name == "bundles" else "paper").parameters
         coded = code_scene(load.scene, parameters, load.train, entropy=coder)
         data = b"".join(coded.pieces)
         name = f"{coder.name} {coder.level}" if coder.name == "zstd" else coder.name
-        if coder.name == "context":
-            name += f" (format {parameters.version})"
         for stage, work in (
             ("code", lambda c=coder, p=parameters: code_scene(load.scene, p, load.train, entropy=c)),
             ("decode", lambda d=data: decode(d)),

@@ -1,8 +1,8 @@
-"""Make the golden files of the versions of the format that are written, 1, 3 and 4; those of version 2 stay.
+"""Make the golden files of the format.
 
     python -m tools.make.golden_files
 
-Writes tests/data/golden_vN_NAME.potr and has the tests' independent decoder write the values that they must yield for
+Writes tests/data/golden_NAME.potr and has the tests' independent decoder write the values that they must yield for
 ever. Refuses to touch a golden file that exists: those are never made again. What an encoder of another day makes
 of the same scenes differs (metadata, steps, what the re-fit and the coder find), which is as it should be: an encoder
 may change, what a decoder makes of an old file may not.
@@ -17,85 +17,74 @@ from pathlib import Path
 
 import numpy as np
 
-from potr_cl.codec.blocks.encoder import code_blocks
-from potr_cl.codec.blocks.geometry import GeometryOfBlocks, quantise
+from potr_cl.codec.blocks.geometry import AnyGeometry, quantise
 from potr_cl.codec.blocks.splitting import blocks_of
-from potr_cl.codec.quantize import HyperParameters
+from potr_cl.codec.container import EntropyCoder
+from potr_cl.codec.encoder import Level, code_levels
+from potr_cl.codec.quantize import HyperParameters, Preset
 from potr_cl.model.scene import MIP_SPLATTING_LOW_PASS, Scene
-from potr_cl.pipeline.encode import encode
-from potr_cl.pipeline.options import EncodeOptions
 from tests.reference.scenes import random_scene, ring_of_cameras
 
 DATA = Path(__file__).parents[2] / "tests" / "data"
-KEEP = EncodeOptions.for_preset("paper", prune=False, compact=False)
 
 
 def _with_means(scene: Scene, means: np.ndarray) -> Scene:
-    return Scene(means.astype(np.float32), scene.log_scales, scene.quaternions, scene.opacity_logits, scene.sh)
+    return dataclasses.replace(scene, means=means.astype(np.float32))
 
 
-def in_blocks(scene: Scene, most_a_block: int) -> bytes:
-    """A scene in blocks of so few splats, each with steps of colours of its own."""
-    parameters = HyperParameters.from_quality(0.5, "best")
-    geometry = quantise(scene, parameters, ring_of_cameras(8), rows=blocks_of(scene.means, most_a_block))
-    geometry = geometry.with_steps(np.exp(np.random.default_rng(3).normal(size=len(scene))))
-    assert isinstance(geometry, GeometryOfBlocks)
-    return b"".join(code_blocks(scene, geometry, b'{"q":0.5}').pieces)
+def _geometry(scene: Scene, q: float, preset: Preset, most: int | None = None, **replaced: float | None) -> AnyGeometry:
+    """Of a scene, in blocks of so few splats if a number is given; with steps of colours where there can be."""
+    parameters = HyperParameters.from_quality(q, preset, **replaced)
+    rows = None if most is None else blocks_of(scene.means, most)
+    geometry = quantise(scene, parameters, ring_of_cameras(8), rows=rows)
+    effects = np.exp(np.random.default_rng(3).normal(size=len(scene)))
+    return geometry.with_steps(effects) if preset != "paper" else geometry
+
+
+def _coded(*levels: Level, entropy: str = "bundles") -> bytes:
+    return b"".join(code_levels(levels, b'{"q":0.5}', EntropyCoder(entropy)).pieces)
+
+
+def _of(scene: Scene, q: float, preset: Preset, most: int | None = None, **replaced: float | None) -> bytes:
+    geometry = _geometry(scene, q, preset, most, **replaced)
+    return _coded(Level(scene, geometry), entropy="zstd" if preset == "paper" else "bundles")
 
 
 def main() -> None:
     rng = np.random.default_rng(1)
-    cameras = ring_of_cameras(8)
     deep = np.vstack([rng.normal(size=(39, 3)) * 1e-6, [[1e6, 1e6, 1e6]]])
     coincident = random_scene(60, 2, seed=3).subset(np.r_[np.arange(60), np.arange(20), [5, 5]])
     still = random_scene(50, 3, seed=8)
     still.sh[:, 4:] = 0
-    scenes = {
-        "degree3_cameras": encode(random_scene(200, 3, seed=1), cameras, KEEP),
-        "degree1_npz": encode(random_scene(80, 1, seed=2), None, KEEP.changed(q=0.8, code={"entropy": "npz"})),
-        "degree2_coincident": encode(coincident, None, KEEP.changed(q=0.2)),
-        "degree0_one_splat": encode(random_scene(1, 0, seed=4), None, KEEP),
-        "degree0_deep": encode(_with_means(random_scene(40, 0, seed=5), deep), None, KEEP.changed(q=1.0)),
-        "degree0_all_coincident": encode(
-            _with_means(random_scene(30, 0, seed=6), np.full((30, 3), 0.7)),
-            cameras,
-            KEEP,
-        ),
-        "degree3_zero_bands": encode(still, cameras, KEEP.changed(q=0.0)),
-        "degree0_wide_integers": encode(
-            random_scene(30, 0, seed=9, extent=1e3), None, KEEP.with_parameters(sf_scale=1e8, sf_sh=1e6)
-        ),
-    }
-    best, fast = (EncodeOptions.for_preset(preset, prune=False, compact=False) for preset in ("best", "fast"))
-    many = random_scene(1500, 3, seed=11)
-    many.sh[:, 1:] *= np.random.default_rng(2).random((1500, 15, 1)) < 0.3
-    scenes |= {
-        "degree3_steps": encode(many, cameras, best),
-        "degree1_fine": encode(random_scene(1000, 1, seed=12), None, best.changed(q=1.0)),
-        "degree3_zstd": encode(random_scene(300, 3, seed=13), cameras, fast),
-        "degree2_coincident_balanced": encode(coincident, None, best),
-        "degree0_one_splat_balanced": encode(random_scene(1, 0, seed=14), None, best),
-        "degree0_deep_balanced": encode(_with_means(random_scene(40, 0, seed=15), deep), None, best),
-    }
-    small = random_scene(120, 1, seed=16)
+    some = random_scene(700, 3, seed=11)
+    some.sh[:, 1:] *= np.random.default_rng(2).random((700, 15, 1)) < 0.3
+    small = random_scene(60, 1, seed=16)
+    alike = random_scene(1, 0, seed=5).subset(np.zeros(8300, np.int64))
+    alike = _with_means(alike, rng.normal(size=(8300, 3)).round(1))
     sharper = dataclasses.replace(small, antialiased=True, low_pass=MIP_SPLATTING_LOW_PASS)
-    scenes |= {
-        "degree1_antialiased": encode(small.rendered(True), cameras, KEEP),
-        "degree1_antialiased_balanced": encode(small.rendered(True), cameras, fast),
-        "degree1_mip_splatting": encode(sharper, cameras, best),
+    balanced = Level(small, _geometry(small, 0.9, "best"))
+    half = random_scene(60, 1, seed=20)
+    quarter = half.subset(np.arange(0, 60, 4))
+    levels = Level(half, _geometry(half, 0.5, "best", 30)), Level(quarter, _geometry(quarter, 0.3, "best"), 0.25)
+    files = {
+        "paper_degree3": _of(random_scene(120, 3, seed=1), 0.5, "paper"),
+        "paper_coincident": _of(coincident, 0.2, "paper"),
+        "paper_deep": _of(_with_means(random_scene(40, 0, seed=5), deep), 1.0, "paper"),
+        "paper_zero_degrees": _of(still, 0.0, "paper"),
+        "paper_wide_integers": _of(random_scene(30, 0, seed=9), 0.5, "paper", sf_scale=1e8, sf_sh=1e6),
+        "plain_balanced": _coded(balanced, entropy="zstd"),
+        "bundles_degree3": _of(some, 0.5, "best"),
+        "bundles_one_splat": _of(random_scene(1, 0, seed=4), 0.5, "best"),
+        "bundles_coincident": _of(coincident, 0.5, "best"),
+        "bundles_antialiased": _of(small.rendered(True), 0.5, "best"),
+        "bundles_mip_splatting": _of(sharper, 0.5, "best"),
+        "bundles_wide_integers": _of(random_scene(200, 0, seed=18), 0.5, "best", sf_scale=1e8, sf_dc=1e6),
+        "bundles_two": _of(alike, 0.0, "best"),
+        "blocks": _of(random_scene(300, 2, seed=19), 0.5, "best", 90),
+        "levels": _coded(*levels),
     }
-    scenes |= {
-        "degree0_two_bundles": encode(random_scene(8500, 0, seed=17), None, best.changed(q=0.0)),
-        "degree0_wide_integers_balanced": encode(
-            random_scene(400, 0, seed=18, extent=1e3), None, best.with_parameters(sf_scale=1e8, sf_dc=1e6)
-        ),
-    }
-    files = {name: b"".join(encoded.pieces) for name, encoded in scenes.items()}
-    files["degree2_blocks"] = in_blocks(random_scene(900, 2, seed=19), 250)
-    files["degree1_antialiased_blocks"] = in_blocks(random_scene(40, 1, seed=20).rendered(True), 39)
     for name, data in files.items():
-        version = int.from_bytes(data[8:10], "little")
-        path = DATA / f"golden_v{version}_{name}.potr"
+        path = DATA / f"golden_{name}.potr"
         if path.exists():
             print(f"{path.name} exists: kept")
             continue

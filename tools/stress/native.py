@@ -1,7 +1,7 @@
 """The decoder's native path with sanitizers, fed changed files: does it touch memory that is not its own, or differ?
 
     python -m tools.stress.native [--count N] [--first N] [--seconds S] [--seed SEED] [--processes P] [--json FILE]
-                                  [--continue] [--compare K] [--version V]
+                                  [--continue] [--compare K]
 
 Compiles potr_cl/codec/native with AddressSanitizer and UndefinedBehaviorSanitizer (gcc or clang), and has processes
 decode changed .potr files with it, those of ``tools.stress.fuzz --format potr`` and some of more splats, most of them
@@ -21,7 +21,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
 from contextlib import ExitStack, contextmanager
 from functools import cache
@@ -32,14 +32,15 @@ from unittest.mock import patch
 
 import numpy as np
 
-from potr_cl.codec import bundled_scene, encoder, sectioned_scene
-from potr_cl.codec.decoder import PotrFile
+from potr_cl.codec import plain_values
+from potr_cl.codec.body import Body
+from potr_cl.codec.decoder import PotrFile, open_file
 from potr_cl.codec.destination import BundleTaker, SceneArrays
 from potr_cl.codec.native import arrays, bundles, functions, octree, share, values
 from potr_cl.codec.native.library import LIBRARY_VARIABLE, VARIABLE, VECTORS_VARIABLE
 from potr_cl.codec.native.values import BUNDLE, PackedValues
 from potr_cl.codec.quantize import HyperParameters
-from potr_cl.codec.sections import Coder, Property
+from potr_cl.codec.sections import Coder
 from potr_cl.errors import DataError
 from tests.reference.scenes import random_scene
 from tools.make.native import compile_library
@@ -59,33 +60,29 @@ _ATTRIBUTES = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
 _BATCH = 500
 
 
-def changed_file(seed: int, number: int, version: int = 0) -> bytes:
-    """File ``number`` of a seed: always the same; of originals of one version only, if one is given."""
+def changed_file(seed: int, number: int) -> bytes:
+    """File ``number`` of a seed: always the same."""
     rng = Random(f"{seed}/native/{number}")
-    files, often = _small_originals(version) if version else (_originals(), _how_often())
+    files = _originals()
+    often = (*_FUZZED_HOW_OFTEN, *(max(1, 2400 // size) for _, size in _MORE))
     with patch.object(potr_files, "originals", lambda: files), patch.object(potr_files, "_HOW_OFTEN", often):
         return potr_files.changed(rng)
 
 
-@cache
-def _small_originals(version: int) -> tuple[list[bytes], tuple[int, ...]]:
-    """Those of a version, and how often each is taken: of few splats much more often, which take far less time."""
-    files = [data for data in _originals() if PotrFile.from_bytes(data).header.version == version]
-    splats = [PotrFile.from_bytes(data).header.splats for data in files]
-    return files, tuple(max(1, 1200 // number) for number in splats)
+#: SH degree and splats of files whose integers have many bits, and whose lanes end at different steps.
+_MORE = ((0, 700), (2, 90), (3, 520))
 
 
 @cache
 def _originals() -> list[bytes]:
-    """The fuzzer's, and some of coders of streams with integers of many bits and lanes that end at different steps."""
+    """The fuzzer's, and those."""
     files = list(_FUZZED())
-    with patch.object(encoder, "_FEW", 0):
-        for version, splats, degree in ((2, 700, 0), (2, 90, 2), (3, 700, 0), (3, 90, 2), (3, 520, 3)):
-            scene = random_scene(splats, degree, seed=splats)
-            scene.sh[...] *= np.float32(40)
-            # Most AC coefficients of real scenes are 0.
-            scene.sh[:, 1:] *= np.random.default_rng(splats).random(scene.sh[:, 1:].shape) < 0.3
-            files.append(potr_files.file_of(scene, "context", HyperParameters.from_quality(1.0, "best"), version))
+    for degree, splats in _MORE:
+        scene = random_scene(splats, degree, seed=splats)
+        scene.sh[...] *= np.float32(40)
+        # Most AC coefficients of real scenes are 0.
+        scene.sh[:, 1:] *= np.random.default_rng(splats).random(scene.sh[:, 1:].shape) < 0.3
+        files.append(potr_files.file_of([scene], HyperParameters.from_quality(1.0, "best"), "bundles", 1 << 20))
     return files
 
 
@@ -94,14 +91,10 @@ _FUZZED = potr_files.originals
 _FUZZED_HOW_OFTEN = potr_files._HOW_OFTEN
 
 
-def _how_often() -> tuple[int, ...]:
-    return (*_FUZZED_HOW_OFTEN, 2, 4, 3, 6, 2)
-
-
 # ---------------------------------------------------------------------------------------------------- worker
 
 
-def work(seed: int, first: int, stop: int, compare: int, version: int) -> None:
+def work(seed: int, first: int, stop: int, compare: int) -> None:
     """Decode files; print a line of JSON for each that differs, and after each batch.
 
     What threads work with is made once: what one file has left there must not matter to the next.
@@ -118,20 +111,19 @@ def work(seed: int, first: int, stop: int, compare: int, version: int) -> None:
     at = os.open(os.environ["POTR_STRESS_AT"], os.O_WRONLY | os.O_CREAT)
     with (
         ExitStack() as patches,
-        patch.object(sectioned_scene, "thread_pool", _at_once),
-        patch.object(bundled_scene, "thread_pool", _at_once),
+        patch.object(plain_values, "thread_pool", _at_once),
         patch.object(bundles.BundledFile, "work", _work_again(bundles.BundledFile.work)),
     ):
         for module in (arrays, functions, bundles, octree, share, values):
             patches.enter_context(patch.object(module, "address", copied))
         tally = dict.fromkeys(("read", "refused", "compared"), 0)
         for number in range(first, stop):
-            data = changed_file(seed, number, version)
+            data = changed_file(seed, number)
             os.environ[VARIABLE] = "1"
             os.environ[VECTORS_VARIABLE] = str(number // 3 % 2)  # with and without, whatever else goes by the number
             os.pwrite(at, b"%20d" % number, 0)
             try:
-                file = PotrFile.from_bytes(data)
+                file = open_file(data)
             except DataError:  # both read headers in the same way
                 tally["refused"] += 1
             else:
@@ -155,6 +147,9 @@ def work(seed: int, first: int, stop: int, compare: int, version: int) -> None:
 
 class _AtOnce:
     """In place of a pool of threads, whose starts would take longer than these files."""
+
+    def map(self, work: Callable[..., Any], items: Iterable[Any]) -> Iterator[Any]:
+        return map(work, items)
 
     def submit(self, work: Callable[..., Any], *args: Any) -> Future[Any]:
         future: Future[Any] = Future()
@@ -190,19 +185,23 @@ def _outcome(file: PotrFile) -> str | dict[str, bytes]:
 
 
 def _outcome_packed(file: PotrFile) -> str | dict[str, bytes] | None:
-    """Of the same by way of packed bundles, as devices are sent them; None for files of other coders."""
-    section = file.header.find(Property.OPACITY)
-    if section is None or section.coder != Coder.BUNDLES:
+    """Of the same by way of packed bundles, as devices are sent them; None for several blocks, or plain ones."""
+    block = file.blocks[0]
+    if len(file.blocks) > 1 or block.coder != Coder.BUNDLES:
         return None
-    unpacked = _Unpacked(file.header, file.rules, file.sh_count())
+
+    def unpack(body: Body) -> dict[str, bytes]:
+        unpacked = _Unpacked(block, body.sh_count())
+        body.decode_into(unpacked, threads=1)
+        return {name: np.ascontiguousarray(getattr(unpacked.scene, name)).tobytes() for name in _ATTRIBUTES}
+
     try:
-        file.decode_into(unpacked, threads=1)
+        return file.of(0, unpack)
     except DataError as error:
         return str(error)
-    return {name: np.ascontiguousarray(getattr(unpacked.scene, name)).tobytes() for name in _ATTRIBUTES}
 
 
-class _Unpacked(SceneArrays, BundleTaker):
+class _Unpacked(BundleTaker, SceneArrays):
     """The arrays of a scene that takes packed bundles."""
 
     def expect_bundles(self) -> None:
@@ -231,7 +230,7 @@ def _told(outcome: str | dict[str, bytes]) -> str:
 
 def main() -> None:
     if sys.argv[1:2] == ["--worker"]:
-        work(*map(int, sys.argv[2:7]))
+        work(*map(int, sys.argv[2:6]))
         return
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=10_000, metavar="N", help="files; default 10000")
@@ -240,7 +239,6 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1, help="default 1")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1, metavar="P", help="default: one a core")
     parser.add_argument("--compare", type=int, default=1, metavar="K", help="read every K-th file by NumPy, too")
-    parser.add_argument("--version", type=int, default=0, choices=(0, 1, 2, 3), help="of the format; default: all")
     parser.add_argument("--compiler", metavar="CC")
     parser.add_argument("--json", type=Path, metavar="FILE", help="keep the figures")
     parser.add_argument("--continue", action="store_true", dest="go_on", help="add to the figures of --json")
@@ -309,7 +307,7 @@ class _Worker:
             "POTR_STRESS_AT": str(self._at),
         }
         command = [sys.executable, "-m", "tools.stress.native", "--worker"]
-        numbers = [args.seed, first, stop, args.compare, args.version]
+        numbers = [args.seed, first, stop, args.compare]
         with self._said.open("w") as said:
             self.process = subprocess.Popen(
                 [*command, *map(str, numbers)], stdout=said, stderr=subprocess.STDOUT, env=environment, cwd=folder

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from potr_cl.codec import quantize
-from potr_cl.codec.decoder import PotrFile
+from potr_cl.codec.decoder import open_file
 from potr_cl.codec.encoder import code_scene
 from potr_cl.model.camera import train_views
 from potr_cl.model.scene import Scene
@@ -59,7 +59,7 @@ def from_channels(scene: Scene) -> Scene:
 
 def _figures(evaluator: EvaluatedScene, data: bytes, rgb: bool = False) -> dict[str, Any]:
     """What a file takes by property, and what it keeps; ``rgb``: of a scene that was coded :func:`as_channels`."""
-    file = PotrFile.from_bytes(data)
+    file = open_file(data)
     splats, sections = file.header.splats, file_report(file)["sections"]
     decoded = from_channels(file.scene()) if rgb else file.scene()
     figures: dict[str, Any] = {"splats": splats, "bytes": len(data), **evaluator(decoded)}

@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from potr_cl.codec.decoder import PotrFile
+from potr_cl.codec.decoder import open_file
 from potr_cl.errors import UsageError
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
@@ -96,7 +96,7 @@ def encode_options(changes: dict[str, Any], images: Path | None = None) -> Encod
 def measure_encode(evaluator: EvaluatedScene, options: EncodeOptions, device: Device) -> dict[str, Any]:
     """One encode with everything that it costs and keeps."""
     encoded = encode(evaluator.source, evaluator.cameras, options, device=device)
-    file = PotrFile.from_bytes(b"".join(encoded.pieces))
+    file = open_file(b"".join(encoded.pieces))
     report = file_report(file)
     return {
         "q": options.q,

@@ -11,10 +11,11 @@ from random import Random
 import pytest
 
 from potr_cl.codec.sections import Coder
+from tests.reference.file_parts import File, sealed
 from tools.stress.hostile.bomb_files import BOMBS
 from tools.stress.hostile.formats import FORMATS
 from tools.stress.hostile.judge import Verdict
-from tools.stress.hostile.potr_files import File, originals, sealed
+from tools.stress.hostile.potr_files import originals
 from tools.stress.hostile.supervisor import attack, read_again
 from tools.stress.hostile.worker import Job, changed_files, keep
 
@@ -118,7 +119,7 @@ def test_every_format_has_bombs():
 def test_potr_files_are_taken_apart_and_put_together():
     for data in originals():
         assert File.of(data).bytes() == sealed(data) == data
-    assert {section.coder for data in originals() for section in File.of(data).sections} == set(Coder)
+    assert {block.coder for data in originals() for block in File.of(data).blocks} == set(Coder)
 
 
 def test_a_damaged_potr_file_is_sealed():

@@ -72,13 +72,6 @@ def test_a_file_of_a_seed_is_always_the_same():
     assert len(set(files)) > 30
 
 
-def test_files_of_one_version_are_changed_alone():
-    files = [stress.changed_file(3, number, version=3) for number in range(60)]
-    assert len(set(files)) > 45
-    # The version itself may be what is changed.
-    assert sum(data[8:10] == b"\3\0" for data in files) > 45
-
-
 @pytest.mark.slow
 def test_what_a_decode_takes_is_measured(tmp_path):
     """On a small scene; NumPy and the native path, wherever there is one."""

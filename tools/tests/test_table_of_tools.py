@@ -8,8 +8,6 @@ from pathlib import Path
 import tools
 
 ROOT = Path(tools.__file__).parent
-#: A part of another tool (bench.decode --part roads), which the table says.
-PARTS = {"study.decoder_roads"}
 
 
 def test_every_tool_is_in_the_table():
@@ -21,4 +19,4 @@ def test_every_tool_is_in_the_table():
         if 'if __name__ == "__main__"' in path.read_text("utf-8")
     }
     assert len(listed) == len(set(listed))
-    assert set(listed) == programs | PARTS
+    assert set(listed) == programs

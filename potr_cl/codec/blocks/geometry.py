@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import quantize
-from potr_cl.codec.blocks.splitting import MOST_WHOLE, blocks_of
+from potr_cl.codec.blocks.splitting import MOST_A_BLOCK, MOST_WHOLE, blocks_of
 from potr_cl.codec.geometry import Geometry, distances_to_views, quantise_geometry, quantise_in_world_units, undecoded
+from potr_cl.codec.quantisers import QUANTISERS
 from potr_cl.codec.steps.fitting import fit_steps_of_blocks
-from potr_cl.codec.versions import VERSIONS
 from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
@@ -87,22 +87,19 @@ def quantise(
 
     Args:
         scene, parameters, views, run: as of :func:`potr_cl.codec.geometry.quantise_geometry`.
-        rows: of the blocks; None: as :func:`potr_cl.codec.blocks.splitting.blocks_of` has it, if there are many splats.
+        rows: of the blocks; None: as :func:`potr_cl.codec.blocks.splitting.blocks_of` has it, if there are more splats
+            than a block may have.
 
     Raises:
         As :func:`potr_cl.codec.geometry.quantise_geometry`.
     """
-    if rows is None and in_blocks(len(scene), parameters):
-        rows = blocks_of(scene.means, run=run)
+    most = int(parameters.block_splats)
+    if rows is None and len(scene) > (most or MOST_WHOLE):
+        rows = blocks_of(scene.means, most or MOST_A_BLOCK, run)
     if rows is None:
         return quantise_geometry(scene, parameters, views, run)
     nearest = distances_to_views(scene.means, views, run)
-    world = VERSIONS[parameters.version].in_world_units(parameters, scene, nearest, run)
+    world = QUANTISERS[parameters.quantiser].in_world_units(parameters, scene, nearest, run)
 
     blocks = quantise_in_world_units(scene, rows, parameters, world, nearest, run)
     return GeometryOfBlocks(parameters, world, tuple(rows), tuple(blocks))
-
-
-def in_blocks(splats: int, parameters: quantize.HyperParameters) -> bool:
-    """Whether a scene of so many splats is cut into blocks."""
-    return VERSIONS[parameters.version].in_blocks and splats > MOST_WHOLE

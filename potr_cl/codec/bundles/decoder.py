@@ -16,11 +16,11 @@ from potr_cl.codec.bundles.description import Fitted
 from potr_cl.codec.bundles.layout import BUNDLE, LANES, Bundles, Layout
 from potr_cl.codec.bundles.levels import Items, Levels, joined
 from potr_cl.codec.bundles.ranges import Words, decode_stream, integer_type
-from potr_cl.codec.bundles.sections import MAIN, ORDER, ROTATION, Key, Section
+from potr_cl.codec.bundles.rans import LOWEST, check_end, no_words_left
+from potr_cl.codec.bundles.sections import MAIN, ORDER, ROTATION, Section
 from potr_cl.codec.bundles.streams import band, differences, step_terms, streams_of
 from potr_cl.codec.native.bundles import FINE, TOO_FEW_WORDS, BundledFile
 from potr_cl.codec.native.library import native, vectors
-from potr_cl.codec.rans import LOWEST, check_end, no_words_left
 from potr_cl.codec.sections import Property
 from potr_cl.codec.steps.rule import ColourSteps
 from potr_cl.errors import DataError
@@ -52,7 +52,7 @@ class Wanted:
             raise ValueError("rotations need the scales, and all need the opacities")
 
     @property
-    def keys(self) -> list[Key]:
+    def keys(self) -> list[Property]:
         """Of the sections that it takes, in the order of decoding."""
         return [*MAIN[: self.sections], *([ROTATION] if self.rotations else [])]
 
@@ -76,12 +76,12 @@ class Reader:
     def __init__(
         self,
         splats: int,
-        open_section: Callable[[Key], tuple[memoryview, str] | None],
+        open_section: Callable[[Property], tuple[memoryview, str] | None],
         open_steps: Callable[[], ColourSteps | None],
     ) -> None:
         self.bundles = Bundles(splats)
         self._open_section, self._open_steps = open_section, open_steps
-        self._sections: dict[Key, Section | None] = {}
+        self._sections: dict[Property, Section | None] = {}
         self._files: dict[Wanted, BundledFile | None] = {}
 
     @cached_property
@@ -93,7 +93,7 @@ class Reader:
         """
         return self._open_steps()
 
-    def section(self, key: Key) -> Section | None:
+    def section(self, key: Property) -> Section | None:
         """A section; None if the file has none.
 
         Raises:
@@ -156,7 +156,7 @@ class _Run:
         self._states = {key: self._states_of(key) for key in chains}
         self.levels = Levels(start, stop)
 
-    def _states_of(self, key: Key) -> I64:
+    def _states_of(self, key: Property) -> I64:
         """(columns,) states of a chain at its beginning; lanes that are not there rest at the end."""
         columns = np.full(LANES * self._bundles.number, LOWEST, np.int64)
         section = self._reader.section(key)
@@ -167,19 +167,18 @@ class _Run:
             columns[there.ravel()] = section.states[start : start + int(self._bundles.lanes.sum())]
         return columns
 
-    def decode(self, key: Key) -> None:
-        prop, index = key
-        if prop == Property.OPACITY:
+    def decode(self, key: Property) -> None:
+        if key is Property.OPACITY:
             (self.levels.opacities,) = self._dense(key)
-        elif prop == Property.SCALE:
+        elif key is Property.SCALE:
             self.levels.scales = self._dense(key)
-        elif prop == Property.ROTATION:
+        elif key is Property.ROTATION:
             # It comes last, and needs no other terms.
             self._terms = {name: self._terms[name] for name in (f"scale {axis}" for axis in range(3))}
             scales = list(self._terms.values())
             self._terms.update({f"difference {k}": each for k, each in enumerate(differences(scales))})
             self.levels.rotations = [_signed(values) for values in self._dense(key)]
-        elif index == 0:
+        elif key is Property.SH0:
             self._find_steps()
             self.levels.dc = [_signed(values) for values in self._dense(key)]
         else:
@@ -192,17 +191,17 @@ class _Run:
             if section is not None:
                 check_end(True, self._states[key].astype(np.uint32), section.what)
 
-    def _chain(self, key: Key) -> I64:
+    def _chain(self, key: Property) -> I64:
         return self._states[ROTATION if key == ROTATION else MAIN[0]]
 
-    def _dense(self, key: Key) -> list[Integers]:
+    def _dense(self, key: Property) -> list[Integers]:
         """Integers of the streams of an item a splat."""
         section = self._reader.section(key)
         splats = self._bundles.splats
         if section is None:
-            for stream in streams_of(*key):
+            for stream in streams_of(key):
                 self._terms[stream.name] = np.full(splats, stream.sizes[0], np.int16)
-            return [np.zeros(splats, np.int16) for _ in streams_of(*key)]
+            return [np.zeros(splats, np.int16) for _ in streams_of(key)]
         words = section.of(self._first, self._last)
         return [
             self._stream(key, words, fitted, self._bundles.dense, self._sums(fitted, self._terms))
@@ -214,7 +213,7 @@ class _Run:
             raise DataError(f"section '{section.what}' does not end where its last token does")
         return []
 
-    def _stream(self, key: Key, words: Words, fitted: Fitted, layout: Layout, base: I32) -> Integers:
+    def _stream(self, key: Property, words: Words, fitted: Fitted, layout: Layout, base: I32) -> Integers:
         """Integers of a stream, mapped to unsigned; their sizes become a term. ``base``: (items,) weighted sums."""
         rows = layout.laid(base, np.int64)
         del base
@@ -244,7 +243,7 @@ class _Run:
                 classes[:, some] = steps.classes(scales, levels.opacities[some], levels.start + start)
         self._terms["step"] = step_terms(classes[0]).astype(np.int16)
 
-    def _decode_band(self, key: Key) -> None:
+    def _decode_band(self, key: Property) -> None:
         """The AC coefficients of a degree."""
         terms = self._terms
         splats = self._bundles.splats
@@ -253,7 +252,7 @@ class _Run:
         section = self._reader.section(key)
         if section is None:
             return
-        first, end = band(key[1])
+        first, end = band(key)
         words = section.of(self._first, self._last)
         mask, pattern, *values = section.streams
         masks = self._stream(key, words, mask, self._bundles.dense, self._sums(mask, terms))

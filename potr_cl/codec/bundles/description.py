@@ -7,13 +7,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
+from potr_cl.codec.bundles.model import (
+    KNOWN_RECENT,
+    KNOWN_TOKENS,
+    MOST_CONTEXTS,
+    Model,
+    inflate,
+    known_model,
+    model_bytes,
+    read_models,
+)
 from potr_cl.codec.bundles.streams import Stream
-from potr_cl.codec.context.model import MOST_CONTEXTS, Model, inflate, model_bytes, read_models
 from potr_cl.errors import DataError
 
 I64 = NDArray[np.int64]
@@ -29,11 +39,21 @@ class Fitted:
         stream: which it is.
         numbers: (stream.weights,) int64 weights of the terms, of the recent sizes, constant, biases of coefficients.
         model: contexts by expected size.
+        known: whether all decoders know it: it is not stored.
     """
 
     stream: Stream
     numbers: I64
     model: Model
+    known: bool = False
+
+    @staticmethod
+    @lru_cache(maxsize=64)
+    def without(stream: Stream) -> Fitted:
+        """What a stream has of which nothing is stored."""
+        numbers = np.zeros(stream.weights, np.int64)
+        numbers[len(stream.terms)] = KNOWN_RECENT
+        return Fitted(stream, numbers, known_model(min(stream.most_tokens, KNOWN_TOKENS)), known=True)
 
     @property
     def terms(self) -> I64:
@@ -67,7 +87,9 @@ class Fitted:
 
 
 def write_description(streams: Sequence[Fitted]) -> bytes:
-    """The stored description of a section."""
+    """The stored description of a section; none where nothing needs to be stored."""
+    if all(fitted.known for fitted in streams):
+        return b""
     numbers = b"".join(fitted.numbers.astype(_WEIGHTS).tobytes() for fitted in streams)
     raw = numbers + b"".join(model_bytes(fitted.model) for fitted in streams)
     return zstandard.ZstdCompressor(level=19, write_checksum=False).compress(raw)
@@ -84,6 +106,8 @@ def read_description(stored: memoryview, streams: Sequence[Stream], what: str) -
     Raises:
         DataError: damaged.
     """
+    if not len(stored):
+        return [Fitted.without(stream) for stream in streams]
     weights = sum(stream.weights for stream in streams)
     tokens = [stream.most_tokens for stream in streams]
     most = 2 * weights + sum(2 + MOST_CONTEXTS - 1 + 2 * MOST_CONTEXTS * number for number in tokens)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,24 +12,26 @@ from potr_cl.codec.bundles.fitting import expected_sizes, fit_model, products, r
 from potr_cl.codec.bundles.layout import LANES, Bundles, Layout
 from potr_cl.codec.bundles.native_encoder import encode_natively, narrow
 from potr_cl.codec.bundles.ranges import Tokens, encode_section
-from potr_cl.codec.bundles.sections import MAIN, ORDER, ROTATION, Key, stored_section
+from potr_cl.codec.bundles.rans import LOWEST
+from potr_cl.codec.bundles.sections import MAIN, ORDER, ROTATION, stored_section
 from potr_cl.codec.bundles.streams import Stream, band, differences, step_terms, streams_of
-from potr_cl.codec.context.tokens import MOST_BITS, tokens_of
+from potr_cl.codec.bundles.tokens import MOST_BITS, tokens_of
 from potr_cl.codec.native.library import native
-from potr_cl.codec.rans import LOWEST
-from potr_cl.codec.sections import Property, is_signed
+from potr_cl.codec.sections import Property
 from potr_cl.host.threads import Run
 
 I64 = NDArray[np.int64]
 Values = Sequence[NDArray[np.integer]]
 
+#: Of fewer splats, models may weigh more than they save.
+_FEW = 1 << 15
+
 
 def encode(
-    values: Mapping[Key, Values],
+    values: Mapping[Property, Values],
     classes: NDArray[np.int8],
     run: Run = map,
-    progress: Callable[[float], None] | None = None,
-) -> dict[Key, bytes] | None:
+) -> dict[Property, bytes] | None:
     """Code all integers of splats that a file holds.
 
     Args:
@@ -37,26 +39,40 @@ def encode(
             be left out. Of DC what its prediction has left.
         classes: (n,) of the steps of DC.
         run: in place of :func:`map`, to work with several threads.
-        progress: told which part is done.
 
     Returns:
         The stored bytes of each section; None if an integer is too large.
     """
-    report = progress or (lambda done: None)
     functions = native()
-    arrays = None if functions is None else narrow(values, run)
-    if functions is not None and arrays is not None:
-        return encode_natively(functions, arrays, classes, run, report)
-    drafts = _Drafts(Bundles(len(classes)), classes)
+    arrays = narrow(values, run)
+
+    def coded(known: frozenset[Property]) -> dict[Property, bytes] | None:
+        if functions is not None and arrays is not None:
+            return encode_natively(functions, arrays, classes, known, run)
+        return _encode(values, classes, known)
+
+    fitted = coded(frozenset())
+    if fitted is None or arrays is None or len(classes) >= _FEW:
+        return fitted
+    # What is fitted to few splats may weigh more than it saves.
+    without = coded(frozenset(values))
+    assert without is not None
+    return coded(frozenset(key for key in values if len(without[key]) < len(fitted[key])))
+
+
+def _encode(
+    values: Mapping[Property, Values], classes: NDArray[np.int8], known: frozenset[Property]
+) -> dict[Property, bytes] | None:
+    """:func:`encode` by NumPy, with some sections by models that decoders know."""
+    drafts = _Drafts(Bundles(len(classes)), classes, known)
     keys = [key for key in ORDER if key in values]
-    sections: dict[Key, list[Tokens]] = {}
-    for done, key in enumerate(keys):
+    sections: dict[Property, list[Tokens]] = {}
+    for key in keys:
         made = drafts.section(key, values[key])
         if made is None:
             return None
         sections[key] = made
-        report(0.6 * (done + 1) / len(keys))
-    coded: dict[Key, bytes] = {}
+    coded: dict[Property, bytes] = {}
     lanes = (np.arange(LANES) < drafts.bundles.lanes[:, None]).ravel()
     for chain in (MAIN, (ROTATION,)):
         states = np.full(LANES * drafts.bundles.number, LOWEST, np.int64)
@@ -64,7 +80,6 @@ def encode(
             counts, words = encode_section(sections[key], states)
             first = states[lanes] if key == chain[0] else None
             coded[key] = stored_section([tokens.fitted for tokens in sections[key]], first, counts, words)
-    report(1.0)
     return coded
 
 
@@ -74,26 +89,26 @@ class _Drafts:
     Args:
         bundles: of the file.
         classes: (n,) of the steps of DC.
+        known: sections whose models decoders know.
     """
 
-    def __init__(self, bundles: Bundles, classes: NDArray[np.int8]) -> None:
-        self.bundles = bundles
+    def __init__(self, bundles: Bundles, classes: NDArray[np.int8], known: frozenset[Property]) -> None:
+        self.bundles, self._known, self._without = bundles, known, False
         self._terms: dict[str, I64] = {"step": step_terms(classes)}
 
-    def section(self, key: Key, values: Values) -> list[Tokens] | None:
+    def section(self, key: Property, values: Values) -> list[Tokens] | None:
         """A section's streams; None if an integer is too large."""
-        prop, index = key
-        streams = streams_of(*key)
-        if prop == Property.SH and index:
-            return self._band(streams, index, values)
-        if prop == Property.ROTATION:
+        streams, self._without = streams_of(key), key in self._known
+        if (key.degree or 0) > 0:
+            return self._band(streams, key, values)
+        if key is Property.ROTATION:
             scales = [self._term(f"scale {axis}") for axis in range(3)]
             self._terms.update({f"difference {k}": each for k, each in enumerate(differences(scales))})
         layout = self.bundles.dense
         made = []
         for stream, integers in zip(streams, values, strict=True):
             wide = integers.astype(np.int64)
-            tokens = self._stream(stream, layout, _mapped(wide) if is_signed(prop) else wide, self._terms)
+            tokens = self._stream(stream, layout, _mapped(wide) if key.signed else wide, self._terms)
             if tokens is None:
                 return None
             made.append(tokens)
@@ -103,9 +118,9 @@ class _Drafts:
         """(n,) a term of a stream of an item a splat: 0 where its section is left out."""
         return self._terms.setdefault(name, np.zeros(self.bundles.splats, np.int64))
 
-    def _band(self, streams: Sequence[Stream], index: int, values: Values) -> list[Tokens] | None:
+    def _band(self, streams: Sequence[Stream], key: Property, values: Values) -> list[Tokens] | None:
         """The streams of the AC coefficients of a degree."""
-        first, end = band(index)
+        first, end = band(key)
         channels = np.array(values).reshape(end - first, 3, -1)
         there = channels.any(axis=1)
         mask, pattern, *of_channels = streams
@@ -143,6 +158,10 @@ class _Drafts:
         terms.update({name: np.zeros(len(tokens), np.int64) for name in missing})
         columns = [*(terms[name] for name in stream.terms), recent_sizes(layout, sizes)]
         terms[stream.name] = sizes
+        if self._without:
+            fitted = Fitted.without(stream)
+            known = expected_sizes(columns, which, fitted.numbers) * fitted.alphabet + tokens
+            return Tokens(layout, known.astype(np.uint16), mapped, fitted)
         alphabet = int(tokens.max(initial=0)) + 1
         if not len(tokens):
             tokens, columns, which = np.zeros(1, np.uint8), [np.zeros(1, np.int64) for _ in columns], None

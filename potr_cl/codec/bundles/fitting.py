@@ -12,9 +12,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec import rans
+from potr_cl.codec.bundles import rans
 from potr_cl.codec.bundles.layout import Layout
-from potr_cl.codec.context.model import LARGEST_SIZE, MOST_CONTEXTS, Model
+from potr_cl.codec.bundles.model import LARGEST_SIZE, MOST_CONTEXTS, Model
 
 I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]

@@ -36,9 +36,11 @@ class Levels:
         opacities: (n,) not negative.
         scales: of each axis, (n,), not negative.
         rotations: x, y, z, (n,) each.
-        dc: Y, Co, Cg of the DC coefficient, (n,) each: what its prediction has left.
+        dc: Y, Co, Cg of the DC coefficient, (n,) each: what its prediction has left, or the levels themselves.
         ac: items of the degrees asked for, those of each degree in the order of splats.
+        dense: of each AC coefficient in turn Y, Co, Cg, (n,) each, where they are not told as items.
         classes: (2, n) int8 classes of the steps of DC and of AC, where they were found.
+        predicted: whether DC is what its prediction has left.
     """
 
     start: int
@@ -48,7 +50,9 @@ class Levels:
     rotations: list[NDArray[Any]] | None = None
     dc: list[NDArray[Any]] | None = None
     ac: list[Items] = field(default_factory=list)
+    dense: list[list[NDArray[Any]]] = field(default_factory=list)
     classes: NDArray[np.int8] | None = None
+    predicted: bool = True
 
     def part(self, start: int, stop: int) -> Levels:
         """Those of some splats, which are counted from this run's first."""
@@ -58,6 +62,8 @@ class Levels:
         for name in ("scales", "rotations", "dc"):
             if (arrays := getattr(self, name)) is not None:
                 setattr(part, name, [array[own] for array in arrays])
+        part.dense = [[channel[own] for channel in channels] for channels in self.dense]
+        part.predicted = self.predicted
         if self.classes is not None:
             part.classes = self.classes[:, own]
         for items in self.ac:

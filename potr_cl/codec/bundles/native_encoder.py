@@ -6,7 +6,7 @@ Threads share the bundles out three times: for what weights are fitted to, for w
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 from potr_cl.codec.bundles.description import Fitted
 from potr_cl.codec.bundles.fitting import log_table, samples_of_bundle, solve
 from potr_cl.codec.bundles.layout import Bundles
-from potr_cl.codec.bundles.sections import MAIN, ORDER, ROTATION, Key, stored_section
+from potr_cl.codec.bundles.model import Model
+from potr_cl.codec.bundles.rans import TOTAL
+from potr_cl.codec.bundles.sections import MAIN, ORDER, ROTATION, stored_section
 from potr_cl.codec.bundles.streams import Stream, streams_of
-from potr_cl.codec.context.model import Model
-from potr_cl.codec.context.tokens import tokens_of
+from potr_cl.codec.bundles.tokens import tokens_of
 from potr_cl.codec.native.bundles import fits
 from potr_cl.codec.native.bundles_encode import BundleEncoder
 from potr_cl.codec.native.bundles_encode import Model as NativeModel
 from potr_cl.codec.native.functions import Functions
-from potr_cl.codec.rans import TOTAL
 from potr_cl.codec.sections import Property
 from potr_cl.host.threads import Run
 
@@ -37,18 +37,29 @@ _NOTHING = NativeModel(np.zeros(256, np.uint8), np.full((1, 1), TOTAL, np.uint16
 
 def encode_natively(
     functions: Functions,
-    values: Mapping[Key, list[I32]],
+    values: Mapping[Property, list[I32]],
     classes: NDArray[np.int8],
+    known: frozenset[Property],
     run: Run,
-    report: Callable[[float], None],
-) -> dict[Key, bytes]:
-    """:func:`potr_cl.codec.bundles.encoder.encode` of integers that :func:`narrow` lets through."""
+) -> dict[Property, bytes]:
+    """:func:`potr_cl.codec.bundles.encoder.encode` of integers that :func:`narrow` lets through.
+
+    Args:
+        functions: of the library.
+        values, classes, run: as there.
+        known: sections whose models decoders know.
+    """
     bundles = Bundles(len(values[MAIN[0]][0]))
     # Asked for once: threads that ask for the first time side by side get each their own.
-    of_section = [streams_of(*key) for key in ORDER]
+    of_section = [streams_of(key) for key in ORDER]
     streams = [stream for own in of_section for stream in own]
+    without = [
+        Fitted.without(stream) if key in known else None
+        for key, own in zip(ORDER, of_section, strict=True)
+        for stream in own
+    ]
     first_of_section = np.cumsum([0, *map(len, of_section)]).tolist()
-    of_degrees = [(index, section) for (prop, index), section in values.items() if prop == Property.SH and index]
+    of_degrees = [(3 * key.degree**2, section) for key, section in values.items() if key.degree]
     encoder = functions.bundle_encoder(
         bundles.splats,
         {name: values[key] for name, key in _DENSE.items() if key in values},
@@ -60,19 +71,24 @@ def encode_natively(
     )
     at_least = samples_of_bundle(bundles.number)
     deque(run(lambda bundle: encoder.survey(bundle, at_least), range(bundles.number)), 0)
-    report(0.3)
-    numbers = [_solved(stream, gram) for stream, gram in zip(streams, encoder.grams(), strict=True)]
+    numbers = [
+        _solved(stream, gram) if own is None else own.numbers
+        for stream, gram, own in zip(streams, encoder.grams(), without, strict=True)
+    ]
     encoder.take_numbers([some.tolist() for some in numbers])
     deque(run(encoder.count, range(bundles.number)), 0)
-    report(0.6)
     alphabets = tokens_of(encoder.largest().astype(np.int64)).astype(int) + 1
     jobs = enumerate(alphabets.tolist())
-    models = list(run(lambda job: _fitted_model(encoder, *job), jobs))
+    found = run(lambda job: _fitted_model(encoder, *job), jobs)
+    models = [
+        model if own is None else NativeModel(own.classes, own.frequencies.astype(np.uint16))
+        for model, own in zip(found, without, strict=True)
+    ]
     encoder.take_models(models)
     coded = list(run(encoder.code, range(bundles.number)))
     fitted = [
-        Fitted(stream, some, Model(model.classes, model.frequencies.astype(np.int64)))
-        for stream, some, model in zip(streams, numbers, models, strict=True)
+        own or Fitted(stream, some, Model(model.classes, model.frequencies.astype(np.int64)))
+        for stream, some, model, own in zip(streams, numbers, models, without, strict=True)
     ]
     states = {
         MAIN[0]: [bundle.states for bundle in coded],
@@ -89,12 +105,12 @@ def encode_natively(
         return stored_section(own, first, np.array([len(part) for part in words]), np.concatenate(words))
 
     numbers_of = [number for number, key in enumerate(ORDER) if key in values]
-    stored = dict(zip([ORDER[number] for number in numbers_of], run(section, numbers_of), strict=True))
-    report(1.0)
-    return stored
+    return dict(zip([ORDER[number] for number in numbers_of], run(section, numbers_of), strict=True))
 
 
-def narrow(values: Mapping[Key, Sequence[NDArray[np.integer]]], run: Run = map) -> dict[Key, list[I32]] | None:
+def narrow(
+    values: Mapping[Property, Sequence[NDArray[np.integer]]], run: Run = map
+) -> dict[Property, list[I32]] | None:
     """The integers as the native path takes them; None if one is too large for it."""
 
     def narrowed(stream: NDArray[np.integer]) -> I32 | None:

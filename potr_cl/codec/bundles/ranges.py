@@ -1,7 +1,6 @@
 """Range coding (rANS, Duda 2013) of the lanes of bundles, each bundle with words of its own, by NumPy.
 
-As in :mod:`potr_cl.codec.rans` every lane has a state, and the lanes of a bundle share a sequence of 16-bit words. Here
-the bundles are coded side by side, each from its own sequence: where a lane needs a word, that is the next of its
+The bundles are coded side by side, each from its own sequence: where a lane needs a word, that is the next of its
 bundle, lane after lane. docs/format.md, "Bundles", is the normative description.
 """
 
@@ -14,9 +13,9 @@ from numpy.typing import NDArray
 
 from potr_cl.codec.bundles.description import Fitted
 from potr_cl.codec.bundles.layout import LANES, Layout
-from potr_cl.codec.context.model import LARGEST_SIZE
-from potr_cl.codec.context.tokens import DIRECT, extra_bits, largest_integer
-from potr_cl.codec.rans import CONTEXT_SHIFT, LOWEST, PRECISION, TOTAL, no_words_left
+from potr_cl.codec.bundles.model import LARGEST_SIZE
+from potr_cl.codec.bundles.rans import CONTEXT_SHIFT, LOWEST, PRECISION, TOTAL, no_words_left
+from potr_cl.codec.bundles.tokens import DIRECT, extra_bits, largest_integer
 
 I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]

@@ -17,27 +17,18 @@ from numpy.typing import NDArray
 from potr_cl.codec.bundles.description import Fitted, read_description, write_description
 from potr_cl.codec.bundles.layout import Bundles
 from potr_cl.codec.bundles.ranges import Words
+from potr_cl.codec.bundles.rans import LOWEST
 from potr_cl.codec.bundles.streams import streams_of
-from potr_cl.codec.context.tokens import largest_integer
+from potr_cl.codec.bundles.tokens import largest_integer
 from potr_cl.codec.native.bundles import SectionWords, StreamModel, fits
-from potr_cl.codec.rans import LOWEST
-from potr_cl.codec.sections import Property
+from potr_cl.codec.sections import SH, Property
 from potr_cl.errors import DataError
-
-Key = tuple[Property, int]
 
 #: Of a section's bytes: how many describe its streams.
 _HEAD = struct.Struct("<I")
-#: The chain of sections whose states follow each other, by property and index; the first one has the states.
-MAIN: tuple[Key, ...] = (
-    (Property.OPACITY, 0),
-    (Property.SCALE, 0),
-    (Property.SH, 0),
-    (Property.SH, 3),
-    (Property.SH, 12),
-    (Property.SH, 27),
-)
-ROTATION: Key = (Property.ROTATION, 0)
+#: The chain of sections whose states follow each other; the first one has the states.
+MAIN = (Property.OPACITY, Property.SCALE, *SH)
+ROTATION = Property.ROTATION
 #: All sections, in the order of decoding.
 ORDER = (*MAIN, ROTATION)
 
@@ -46,7 +37,7 @@ class Section:
     """A section's bytes, taken apart.
 
     Args:
-        key: property and index.
+        key: its property.
         stored: the bytes; nothing in them is trusted.
         bundles: of the file.
         what: for messages.
@@ -55,7 +46,7 @@ class Section:
         DataError: damaged.
     """
 
-    def __init__(self, key: Key, stored: memoryview, bundles: Bundles, what: str) -> None:
+    def __init__(self, key: Property, stored: memoryview, bundles: Bundles, what: str) -> None:
         self.key, self.what = key, what
         states = int(bundles.lanes.sum()) if key in (MAIN[0], ROTATION) else 0
         number = bundles.number
@@ -65,7 +56,7 @@ class Section:
         at = _HEAD.size + described
         if at + 4 * (states + number) > len(stored):
             raise self._damaged("ends too early")
-        self.streams: list[Fitted] = read_description(stored[_HEAD.size : at], streams_of(*key), what)
+        self.streams: list[Fitted] = read_description(stored[_HEAD.size : at], streams_of(key), what)
         self.states = np.frombuffer(stored, "<u4", states, at)
         if (self.states < LOWEST).any():
             raise self._damaged("holds an impossible state")

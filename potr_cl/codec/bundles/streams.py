@@ -13,8 +13,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.context.tokens import SIZES, token_floors
-from potr_cl.codec.sections import Property
+from potr_cl.codec.bundles.tokens import SIZES, token_floors
+from potr_cl.codec.sections import SH, Property
 from potr_cl.codec.steps.rule import CLASSES
 
 I32 = NDArray[np.int32]
@@ -25,8 +25,6 @@ COUNT_SIZE, CHROMA_SIZE = 32, 128
 STEP_SIZE = 4
 #: Patterns: bits 0, 1, 2 for Y, Co, Cg.
 PATTERNS = 8
-#: The first coefficient of each degree, and the one after the last.
-BANDS = ((0, 1), (1, 4), (4, 9), (9, 16))
 
 _CHANNELS = range(3)
 _OPACITY = ("opacity",)
@@ -77,7 +75,7 @@ _NONZERO_SIZES = _nonzero_sizes()
 
 
 @lru_cache
-def streams_of(prop: Property, index: int) -> tuple[Stream, ...]:
+def streams_of(prop: Property) -> tuple[Stream, ...]:
     """The streams of a section, in the order of decoding."""
     if prop == Property.OPACITY:
         return (Stream("opacity", (), SIZES[False]),)
@@ -86,9 +84,9 @@ def streams_of(prop: Property, index: int) -> tuple[Stream, ...]:
     if prop == Property.ROTATION:
         known = _SCALES + _DIFFERENCES
         return tuple(Stream(name, known + _ROTATIONS[:a], SIZES[True]) for a, name in enumerate(_ROTATIONS))
-    if index == 0:
+    if prop is Property.SH0:
         return tuple(Stream(name, _OPACITY + _SCALES + _STEP + _DC[:c], SIZES[True]) for c, name in enumerate(_DC))
-    first, end = band(index)
+    first, end = band(prop)
     number = end - first
     masks = np.array([COUNT_SIZE * mask.bit_count() for mask in range(1 << number)], np.int32)
     patterns = np.where(np.arange(PATTERNS) > 1, CHROMA_SIZE, 0).astype(np.int32)
@@ -100,9 +98,10 @@ def streams_of(prop: Property, index: int) -> tuple[Stream, ...]:
     )
 
 
-def band(index: int) -> tuple[int, int]:
-    """The first AC coefficient of a section by its index, and the one after the last."""
-    return next(limits for limits in BANDS if 3 * limits[0] == index)
+def band(prop: Property) -> tuple[int, int]:
+    """The first SH coefficient of a section, and the one after the last."""
+    degree = SH.index(prop)
+    return degree**2, (degree + 1) ** 2
 
 
 def step_terms(classes: NDArray[np.int8]) -> NDArray[np.int64]:

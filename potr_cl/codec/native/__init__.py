@@ -5,18 +5,15 @@ It gives the same bits as the NumPy modules around it, which are its definition 
 its twin in Python:
 
 ====================  =========================================================================================
-``context.c``         :mod:`potr_cl.codec.context`: tokens of lanes, and what they stand for
-``encode.c``          :mod:`potr_cl.codec.context`, :mod:`potr_cl.codec.rans`: an encoder's contexts and range coding
 ``bundles.c``         :mod:`potr_cl.codec.bundles`: a bundle's integers
 ``steps.c``           :mod:`potr_cl.codec.steps.rule`: classes of the steps of colours
 ``bundles_tokens.c``  :mod:`potr_cl.codec.bundles.ranges`: tokens of the streams of a bundle
-``bundles_values.c``  :mod:`potr_cl.codec.bundled_scene`: their values, while they are in a cache
-``bundles_share.c``   :mod:`potr_cl.codec.bundled_scene`: how threads share bundles out
+``bundles_values.c``  :mod:`potr_cl.codec.dequantizer`: their values, while they are in a cache
+``bundles_share.c``   :mod:`potr_cl.codec.dequantizer`: how threads share bundles out
 ``prediction.h``      :mod:`potr_cl.codec.steps.prediction`: DC from what its prediction has left
 ``bundles_encode.c``  :mod:`potr_cl.codec.bundles.encoder`: what contexts are fitted to, and range coding
 ``bundles_fit.c``     :mod:`potr_cl.codec.bundles.fitting`: contexts from counts
 ``octree.c``          :mod:`potr_cl.codec.octree`: streams to centres
-``dequantize.c``      :mod:`potr_cl.codec.quantize`, :mod:`potr_cl.codec.byte_planes`: levels to values
 ``module.c``          nothing: it makes a Python module of the library, so that it is built and found as one
 ====================  =========================================================================================
 

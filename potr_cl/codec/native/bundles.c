@@ -1,4 +1,4 @@
-/* Coder 4 (docs/format.md, "Bundles"): a bundle's integers from the words of its sections.
+/* Bundles (docs/format.md): a bundle's integers from the words of its sections.
  *
  * All streams of a bundle are decoded one after another while what they need of each other stays in a cache. Arrays of
  * an item a splat are in *rows*: the lanes of a step side by side, so that loops over lanes become vectors; splat s is

@@ -1,4 +1,4 @@
-/* What the decoder and the encoder of coder 4 share (docs/format.md, "Bundles"). */
+/* What the decoder and the encoder of bundles share (docs/format.md, "Bundles"). */
 
 #ifndef POTR_BUNDLES_H
 #define POTR_BUNDLES_H
@@ -60,7 +60,7 @@ typedef struct {
     int32_t powers[2], offsets[2], scales[3], knots[KNOTS];
 } colour_steps;
 
-/* A file's sections of coder 4. */
+/* A block's sections of bundles. */
 typedef struct {
     stream_model streams[STREAMS];
     const uint8_t *words[SECTIONS];   /* NULL where there is no such section */

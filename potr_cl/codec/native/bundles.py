@@ -1,4 +1,4 @@
-"""Bundles by C: :class:`BundledFile` is a file's sections of coder 4 as C takes them.
+"""Bundles by C: :class:`BundledFile` is a block's sections of bundles as C takes them.
 
 C trusts what it is told: that is made here, of arrays whose sizes are checked.
 """

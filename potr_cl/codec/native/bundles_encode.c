@@ -1,4 +1,4 @@
-/* The encoder's half of coder 4 (docs/format.md, "Bundles"): what contexts are fitted to, and range coding.
+/* The encoder's half of bundles (docs/format.md): what contexts are fitted to, and range coding.
  *
  * A bundle is gone through three times: for the sums of which weights are the least squares' solution, for counts of
  * tokens by expected size, and for its words. Its streams are made anew each time, which takes less than to keep them.

@@ -1,4 +1,4 @@
-/* Coder 4 (docs/format.md, "Bundles"): the tokens of a stream, row by row.
+/* Bundles (docs/format.md): the tokens of a stream, row by row.
  *
  * The loops stand twice: in plain C, and for processors with vectors of 512 bits, which look up the tokens of sixteen
  * lanes at a time. Both give the same integers. */

@@ -1,4 +1,4 @@
-/* The tokens of a stream of coder 4. */
+/* The tokens of a stream of bundles. */
 
 #ifndef POTR_BUNDLES_TOKENS_H
 #define POTR_BUNDLES_TOKENS_H

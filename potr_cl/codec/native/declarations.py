@@ -10,13 +10,6 @@ _REAL = ctypes.c_float
 
 #: Argument types and result of each function, in the order of the C declarations.
 _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
-    "potr_context_table": (_NUMBER, [_POINTER, _SIZE, _SIZE, _POINTER]),
-    "potr_context_stream": (
-        _NUMBER,
-        [_POINTER, _SIZE, *[_POINTER] * 3, _SIZE, *[_POINTER] * 6, _SIZE, _POINTER, _POINTER],
-    ),
-    "potr_context_beside": (_WORD, [_POINTER, _SIZE, _POINTER]),
-    "potr_context_join": (None, [_POINTER, _SIZE, _SIZE, _POINTER]),
     "potr_octree_levels": (
         _NUMBER,
         [_POINTER, _SIZE, _POINTER, _SIZE, _NUMBER, _NUMBER, _POINTER, _POINTER, _POINTER],
@@ -26,10 +19,7 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
         _SIZE,
         [_POINTER, _SIZE, _POINTER, _NUMBER, _POINTER, _WORD, _WORD, _POINTER, _WORD, _SIZE, _POINTER],
     ),
-    "potr_octree_leaves": (
-        _NUMBER,
-        [_POINTER, _POINTER, _NUMBER, *[_POINTER] * 3, _NUMBER, *[_POINTER] * 3],
-    ),
+    "potr_octree_leaves": (None, [_POINTER, _POINTER, _NUMBER, *[_POINTER] * 6]),
     "potr_octree_padding": (_NUMBER, [_POINTER, _POINTER]),
     "potr_octree_centres": (None, [_POINTER] * 9),
     "potr_octree_bounds": (None, [_POINTER, _SIZE, _POINTER, _SIZE, _POINTER, _POINTER]),
@@ -47,10 +37,6 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
         None,
         [_POINTER, _SIZE, _SIZE, _NUMBER, *[_POINTER] * 4, _SIZE, _SIZE, _POINTER],
     ),
-    "potr_encode_recent": (None, [_POINTER, _SIZE, _SIZE, _POINTER]),
-    "potr_encode_cells": (None, [_POINTER, _SIZE, _POINTER, _POINTER, _SIZE, ctypes.c_int32, _POINTER]),
-    "potr_encode_count": (None, [_POINTER, _SIZE, _POINTER]),
-    "potr_encode_stream": (_SIZE, [_POINTER, _SIZE, _SIZE, _POINTER, _POINTER, _POINTER]),
     "potr_bundles_table": (_NUMBER, [_POINTER, _SIZE, _SIZE, *[_POINTER] * 3]),
     "potr_bundles_vectors": (_NUMBER, []),
     "potr_bundles_work": (_SIZE, []),
@@ -91,31 +77,7 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
     "potr_predicted": (None, [_POINTER, _SIZE, _SIZE, _SIZE, *[_POINTER] * 4]),
     "potr_nonzero_levels": (_NUMBER, [_POINTER, _SIZE, _SIZE, ctypes.c_double, ctypes.c_double, _POINTER]),
     "potr_unit_factors": (None, [_POINTER, _SIZE, _SIZE, _SIZE, _SIZE, _REAL, _POINTER]),
-    "potr_widen": (None, [_POINTER, _SIZE, _NUMBER, _POINTER]),
 }
-#: Those that there are for several kinds of integers, by what their names begin with.
-_OF_KINDS: dict[str, tuple[Any, list[Any], tuple[str, ...]]] = {
-    "potr_context_integers_": (
-        _NUMBER,
-        [_POINTER, _SIZE, _SIZE, _POINTER, _WORD, _WORD, _NUMBER, _NUMBER, _POINTER, _POINTER],
-        ("medium", "wide"),
-    ),
-    "potr_join_planes_": (None, [_POINTER, _SIZE, ctypes.c_uint, _NUMBER, _POINTER], ("medium", "wide")),
-    "potr_colours_of_": (
-        None,
-        [_POINTER, _POINTER, _POINTER, _SIZE, _POINTER, _NUMBER, _POINTER, _POINTER, _POINTER],
-        ("narrow", "medium", "wide"),
-    ),
-    "potr_dc_of_": (None, [_POINTER, _POINTER, _POINTER, _SIZE, *[_POINTER] * 7], ("narrow", "medium", "wide")),
-    "potr_look_up_": (_WORD, [_POINTER, _SIZE, _POINTER, _SIZE, _POINTER, _SIZE], ("narrow", "medium", "wide")),
-    "potr_rotations_of_": (
-        None,
-        [_POINTER, _POINTER, _POINTER, _SIZE, _POINTER, _SIZE, _POINTER],
-        ("narrow", "medium", "wide"),
-    ),
-}
-
-
 #: Those that take some microseconds, however large a file is. They keep the interpreter: to get it back among threads
 #: that all want it takes longer than they do.
 _SHORT = {
@@ -141,8 +103,4 @@ def declared(path: str) -> dict[str, Any]:
     for name, (result, arguments) in _DECLARATIONS.items():
         functions[name] = (keeping if name in _SHORT else library)[name]
         functions[name].restype, functions[name].argtypes = result, arguments
-    for start, (result, arguments, kinds) in _OF_KINDS.items():
-        for name in (start + kind for kind in kinds):
-            functions[name] = library[name]
-            functions[name].restype, functions[name].argtypes = result, arguments
     return functions

@@ -260,17 +260,15 @@ static INLINE unsigned bits_from(const uint8_t *bits, uint64_t at, unsigned numb
     return found;
 }
 
-/* Levels of the tail of a leaf with a lone splat; negative if it leads too deep. */
-static INLINE int tail_of(uint8_t length, int level, int depth, int absolute)
+/* Levels of the tail of a leaf with a lone splat. */
+static INLINE int tail_of(uint8_t leaf_level, int level)
 {
-    if (absolute)
-        return length > depth ? -1 : length > level ? length - level : 0;
-    return length + level > depth ? -1 : length;
+    return leaf_level > level ? leaf_level - level : 0;
 }
 
-static INLINE int walk_leaves(
+static INLINE void walk_leaves(
     const uint8_t *occupancy, const uint8_t *several, int depth, const cut *from, const cut *to,
-    const uint8_t *tail_lengths, int absolute, const uint64_t *multiplicities, int wide, const leaves *out,
+    const uint8_t *leaf_levels, const uint64_t *multiplicities, int wide, const leaves *out,
     uint64_t *counts)
 {
     uint64_t number = to->singles + to->crowded - from->singles - from->crowded;
@@ -278,16 +276,14 @@ static INLINE int walk_leaves(
     if (from->level < 0) { /* a tree of one leaf */
         for (; number; number--) {
             const int is_crowded = to->crowded > from->crowded;
-            const int tail = is_crowded ? CROWDED : tail_of(tail_lengths[single], 0, depth, absolute);
-            if (tail < 0)
-                return 1;
+            const int tail = is_crowded ? CROWDED : tail_of(leaf_levels[single], 0);
             if (!is_crowded)
                 counts[tail]++;
             put_cell(out, wide, splat, 0, 0, 0);
             out->levels[splat] = 0;
             out->tails[splat] = (uint8_t)tail;
         }
-        return 0;
+        return;
     }
     uint64_t nodes[DEEPEST + 1], children[DEEPEST + 1], path[DEEPEST + 1][3];
     unsigned lefts[DEEPEST + 1], crowds[DEEPEST + 1];
@@ -334,28 +330,25 @@ static INLINE int walk_leaves(
             splat += multiplicities[packed++];
             continue;
         }
-        const int tail = tail_of(tail_lengths[single++], level + 1, depth, absolute);
-        if (tail < 0)
-            return 1;
+        const int tail = tail_of(leaf_levels[single++], level + 1);
         counts[tail]++;
         out->tails[splat++] = (uint8_t)tail;
     }
-    return 0;
 }
 
 /* The cells of a part's leaves, and how many have a tail of each length.
  *
- * What potr_octree_cuts takes and gives. tail_lengths: one a leaf with a lone splat. out: filled where the part's splats
- * are, of those in one place at the first. counts: (53), filled. Returns 0, or 1 if a tail leads too deep. */
-POTR_EXPORT int potr_octree_leaves(
+ * What potr_octree_cuts takes and gives. leaf_levels: one a leaf with a lone splat, at most `depth`. out: filled where the
+ * part's splats are, of those in one place at the first. counts: (53), filled. */
+POTR_EXPORT void potr_octree_leaves(
     const uint8_t *occupancy, const uint8_t *several, int depth, const cut *from, const cut *to,
-    const uint8_t *tail_lengths, int absolute, const uint64_t *multiplicities, const leaves *out, uint64_t *counts)
+    const uint8_t *leaf_levels, const uint64_t *multiplicities, const leaves *out, uint64_t *counts)
 {
     memset(counts, 0, (MOST_TAIL + 1) * sizeof *counts);
     if (out->cells)
-        return walk_leaves(
-            occupancy, several, depth, from, to, tail_lengths, absolute, multiplicities, 1, out, counts);
-    return walk_leaves(occupancy, several, depth, from, to, tail_lengths, absolute, multiplicities, 0, out, counts);
+        walk_leaves(occupancy, several, depth, from, to, leaf_levels, multiplicities, 1, out, counts);
+    else
+        walk_leaves(occupancy, several, depth, from, to, leaf_levels, multiplicities, 0, out, counts);
 }
 
 /* Where the planes of each step of the tails begin, and their bytes; counts: (53) of tails of each length, of all

@@ -72,9 +72,9 @@ class OctreeFunctions:
         )
         return None if wrong else Tree(occupancy, several, depth, levels, singles.value, crowded.value)
 
-    def walk(self, tree: Tree, tail_lengths: U8, absolute: bool, multiplicities: U64, splats: int, parts: int) -> Walk:
+    def walk(self, tree: Tree, leaf_levels: U8, multiplicities: U64, splats: int, parts: int) -> Walk:
         """A walk through a tree's leaves, see :class:`Walk`."""
-        return Walk(self._c, tree, tail_lengths, absolute, multiplicities, splats, parts)
+        return Walk(self._c, tree, leaf_levels, multiplicities, splats, parts)
 
 
 class _Leaves(ctypes.Structure):
@@ -89,8 +89,7 @@ class Walk:
     Args:
         functions: of the library.
         tree: sound.
-        tail_lengths: one a leaf with a lone splat.
-        absolute: as of :class:`potr_cl.codec.octree.OctreeStreams`.
+        leaf_levels: one a leaf with a lone splat, none beyond the tree's depth.
         multiplicities: of the other leaves; with these there are ``splats``, N.
         splats: N.
         parts: at most so many.
@@ -107,17 +106,18 @@ class Walk:
         self,
         functions: Mapping[str, Any],
         tree: Tree,
-        tail_lengths: U8,
-        absolute: bool,
+        leaf_levels: U8,
         multiplicities: U64,
         splats: int,
         parts: int,
     ) -> None:
-        self._c, self._tree, self._absolute = functions, tree, absolute
-        self._tail_lengths, self._multiplicities = tail_lengths, multiplicities
+        if len(leaf_levels) and int(leaf_levels.max()) > tree.depth:
+            raise TypeError("the native path was given leaves below the octree")
+        self._c, self._tree = functions, tree
+        self._leaf_levels, self._multiplicities = leaf_levels, multiplicities
         self._size = functions["potr_octree_cut"]()
         self._cuts = np.empty((parts + 1) * self._size // 8, np.uint64)
-        self._lengths_at = address(tail_lengths, np.uint8, tree.singles)
+        self._levels_at = address(leaf_levels, np.uint8, tree.singles)
         self._multiplicities_at = address(multiplicities, np.uint64, tree.crowded)
         self._occupancy_at = address(tree.occupancy, np.uint8, len(tree.occupancy))
         self._several_at = address(tree.several, np.uint8, len(tree.several))
@@ -148,28 +148,27 @@ class Walk:
             shapes + splats,
         )
         self._counts = np.zeros((self.parts, _LEVELS), np.uint64)
-        self._deep = np.zeros(self.parts, bool)
         self._tails: U8 | None = None
 
     def leaves(self, part: int) -> None:
         """Find a part's leaves."""
         cuts = self._cuts_of(part)
-        self._deep[part] = self._c["potr_octree_leaves"](
+        self._c["potr_octree_leaves"](
             self._occupancy_at,
             self._several_at,
             self._tree.depth,
             *cuts,
-            self._lengths_at,
-            self._absolute,
+            self._levels_at,
             self._multiplicities_at,
             ctypes.byref(self._leaves),
             address(self._counts[part], np.uint64, _LEVELS, True),
         )
 
     @property
-    def counts(self) -> U64 | None:
-        """(53,) leaves with a tail of each length, once all leaves are found; None if one leads below the depth."""
-        return None if self._deep.any() else self._counts.sum(axis=0, dtype=np.uint64)
+    def counts(self) -> U64:
+        """(53,) leaves with a tail of each length, once all leaves are found."""
+        total: U64 = self._counts.sum(axis=0, dtype=np.uint64)
+        return total
 
     def check_tails(self, tails: U8) -> bool:
         """Whether the padding of the planes of ``tails``, the bytes that :attr:`counts` ask for, is zero.
@@ -178,8 +177,8 @@ class Walk:
             TypeError: these are another number of bytes, or leaves are still to be found.
         """
         counts = self.counts
-        reach = np.cumsum((np.zeros(_LEVELS, np.uint64) if counts is None else counts)[::-1].astype(np.int64))[::-1]
-        if counts is None or reach[0] != self._tree.singles or len(tails) != int((3 * ((reach[1:] + 7) // 8)).sum()):
+        reach = np.cumsum(counts[::-1].astype(np.int64))[::-1]
+        if reach[0] != self._tree.singles or len(tails) != int((3 * ((reach[1:] + 7) // 8)).sum()):
             raise TypeError("the native path was given tails of another size than their lengths ask for")
         self._all_counts = counts
         # Leaves with a tail of each length come after all that have longer ones, and after those of the parts before.

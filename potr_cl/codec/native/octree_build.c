@@ -215,10 +215,10 @@ POTR_EXPORT void potr_octree_survey(
 /* The streams.
  *
  * What potr_octree_survey takes and gives. All that follows is 0, and filled: occupancy: a byte a node. several: a bit a
- * child. multiplicities: (packed). tail_lengths: (singles), the wanted levels. tails: their bit planes. */
+ * child. multiplicities: (packed). leaf_levels: (singles), the wanted levels. tails: their bit planes. */
 POTR_EXPORT void potr_octree_streams(
     const uint64_t *words, size_t n, size_t number, int depth, const int64_t *order, const int8_t *wanted,
-    const sizes *found, uint8_t *occupancy, uint8_t *several, uint64_t *multiplicities, uint8_t *tail_lengths,
+    const sizes *found, uint8_t *occupancy, uint8_t *several, uint64_t *multiplicities, uint8_t *leaf_levels,
     uint8_t *tails)
 {
     uint64_t node[LEVELS], child[LEVELS], rank[LEVELS], plane[LEVELS], plane_bytes[LEVELS];
@@ -250,7 +250,7 @@ POTR_EXPORT void potr_octree_streams(
         }
         if (alone <= depth) {
             const int asked = wanted[order[i]], tail = tail_of(asked, alone);
-            tail_lengths[single++] = (uint8_t)asked;
+            leaf_levels[single++] = (uint8_t)asked;
             const uint64_t at = tail ? rank[tail]++ : 0;
             for (int step = 1; step <= tail; step++) {
                 const unsigned octant = octant_of(words, n, i, (unsigned)(alone + step - 1));

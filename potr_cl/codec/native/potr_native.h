@@ -2,8 +2,8 @@
  * NumPy modules beside this folder are the reference: both give the same integers and floats, bit for bit.
  *
  * Rules: nothing that comes from a file is trusted; every function is told how long its arrays are, and the Python
- * that calls it (binding.py) has checked that they are as long as it says. No function allocates memory, keeps state
- * between calls, or knows of Python: binding.py calls them through ctypes, which leaves the interpreter free meanwhile.
+ * that calls it has checked that they are as long as it says. No function allocates memory, keeps state
+ * between calls, or knows of Python, which calls them through ctypes, which leaves the interpreter free meanwhile.
  */
 
 #ifndef POTR_NATIVE_H

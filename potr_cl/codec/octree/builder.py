@@ -114,9 +114,8 @@ def _build_in_numpy(
         occupancy=occupancy,
         several=several,
         multiplicities=multiplicities.astype(np.uint64),
-        tail_lengths=wanted[single].astype(np.uint8) if absolute else lengths,
+        leaf_levels=(wanted if absolute else leaf_level)[single].astype(np.uint8),
         tails=tails,
-        absolute=absolute,
     )
     return streams, order
 
@@ -143,7 +142,7 @@ def _begin_natively(functions: OctreeBuilding, means: NDArray[np.float32], toler
 
     def streams() -> OctreeStreams:
         found = functions.streams(words, depth, order, wanted)
-        return OctreeStreams(origin, side, depth, *found, absolute=True)
+        return OctreeStreams(origin, side, depth, *found)
 
     def decoded(run: Run) -> NDArray[np.float32]:
         sides = np.ldexp(side, -np.arange(depth + 1))

@@ -69,18 +69,14 @@ def parse(streams: OctreeStreams, splats: int, run: Run = map, parts: int = 1) -
         if number < depth:
             path = [p[level.several] for p in path]
 
-    lengths = streams.tail_lengths
-    if streams.absolute:
-        alone = alone_level if is_crowded is None else alone_level[~is_crowded]
-        _check_leaf_levels(streams)
-        lengths = np.maximum(lengths, alone) - alone
+    alone = alone_level if is_crowded is None else alone_level[~is_crowded]
+    _check_leaf_levels(streams)
+    lengths = np.maximum(streams.leaf_levels, alone) - alone
     if is_crowded is not None:
         of_singles = lengths
         lengths = np.zeros(leaves, np.uint8)
         lengths[~is_crowded] = of_singles
     level_of = alone_level.astype(np.uint16) + lengths
-    if leaves and int(level_of.max()) > depth:
-        raise _too_deep(depth)
     _append_tails(coordinates, lengths, streams.tails)
 
     cell = np.ldexp(streams.side, -np.arange(depth + 1))
@@ -108,20 +104,16 @@ def _parse_natively(
     if tree is None:
         raise _no_tree()
     _check_leaves(streams, tree.singles, tree.crowded, splats)
-    if streams.absolute:
-        _check_leaf_levels(streams)
+    _check_leaf_levels(streams)
     walk = functions.octree.walk(
         tree,
-        streams.tail_lengths,
-        streams.absolute,
+        streams.leaf_levels,
         streams.multiplicities,
         splats,
         max(1, min(parts, splats // _PART)),
     )
     list(run(walk.leaves, range(walk.parts)))
     counts = walk.counts
-    if counts is None:
-        raise _too_deep(depth)
     _check_tail_size(np.cumsum(counts[::-1].astype(np.int64))[::-1], len(streams.tails))
     if not walk.check_tails(streams.tails):
         raise _padded_wrongly()
@@ -143,14 +135,14 @@ def _crowded_root(streams: OctreeStreams) -> bool:
 
 def _check_leaves(streams: OctreeStreams, singles: int, crowded: int, splats: int) -> None:
     total = int(singles) + int(np.minimum(streams.multiplicities, np.uint64(splats + 1)).sum(dtype=np.float64))
-    if len(streams.multiplicities) != crowded or len(streams.tail_lengths) != singles:
+    if len(streams.multiplicities) != crowded or len(streams.leaf_levels) != singles:
         raise DataError("positions: the octree's leaves do not match its multiplicities and tails")
     if total != splats or (streams.multiplicities < 2).any():
         raise DataError(f"positions: the octree holds {total} splats, the header says {splats}")
 
 
 def _check_leaf_levels(streams: OctreeStreams) -> None:
-    if len(streams.tail_lengths) and int(streams.tail_lengths.max()) > streams.depth:
+    if len(streams.leaf_levels) and int(streams.leaf_levels.max()) > streams.depth:
         raise DataError(f"positions: a leaf lies below the octree's deepest level {streams.depth}")
 
 
@@ -163,10 +155,6 @@ def _check_tail_size(reach: NDArray[np.int64], size: int) -> None:
 
 def _no_tree() -> DataError:
     return DataError("positions: the octree's nodes do not add up")
-
-
-def _too_deep(depth: int) -> DataError:
-    return DataError(f"positions: a tail leads below the octree's deepest level {depth}")
 
 
 def _padded_wrongly() -> DataError:

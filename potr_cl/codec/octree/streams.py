@@ -31,8 +31,8 @@ class OctreeStreams:
         several: uint8, bits packed with the first in the lowest bit: one a child in the order of ``occupancy``, set if
             the child holds several splats.
         multiplicities: uint64, number of splats of each leaf at ``depth`` that holds several, in Morton order.
-        tail_lengths: uint8, one a leaf with a single splat, in Morton order: levels below the one where it is alone; if
-            ``absolute``, the level itself, which is not reached where the splat is still in company there.
+        leaf_levels: uint8, one a leaf with a single splat, in Morton order: the level that its tail leads to; there is
+            no tail where the splat is still in company at that level.
         tails: uint8, bit planes: for level 1, 2, … of the tails and axis x, y, z one plane, padded to whole bytes
             (first bit lowest), of the leaves whose tail reaches that level, longest tail first, then Morton order.
     """
@@ -43,9 +43,8 @@ class OctreeStreams:
     occupancy: U8
     several: U8
     multiplicities: U64
-    tail_lengths: U8
+    leaf_levels: U8
     tails: U8
-    absolute: bool = False
 
 
 def check_centres(origin: tuple[float, float, float], side: float, means: NDArray[np.float32]) -> None:

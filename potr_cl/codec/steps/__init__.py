@@ -1,4 +1,4 @@
-"""Steps of colours that fit each splat (version 3 of the format): finer where an error shows more.
+"""Steps of colours that fit each splat: finer where an error shows more.
 
 :mod:`potr_cl.codec.steps.rule` has what a file says and what follows from it, :mod:`potr_cl.codec.steps.fitting` finds
 it for a scene, and :mod:`potr_cl.codec.steps.prediction` predicts colours whose steps differ.

@@ -9,7 +9,7 @@ from potr_cl.formats.declaration import SceneFormat
 FORMAT = SceneFormat(
     name="potr_cl",
     suffixes=(".potr",),
-    note="this package's own: what `encode` makes of a scene in any of these formats; files of every version are read",
+    note="this package's own: what `encode` makes of a scene in any of these formats",
     load=decode,
     not_written="a .potr file is made by the command encode, which reads all that convert reads",
     starts=(MAGIC,),

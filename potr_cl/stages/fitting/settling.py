@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from potr_cl.codec.geometry import Geometry
-from potr_cl.codec.versions import VERSIONS, Version2
+from potr_cl.codec.quantisers import QUANTISERS, Balanced
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
@@ -123,7 +123,7 @@ def settle(
         scene = fitted(_with_chosen(state, bench, looking), settling.choosing, settling.gentle, still)
         state = dataclasses.replace(state, scene=scene, geometry=None).having_learnt("chosen", bench.parameters)
     rounded = bench.output.geometry(state.scene, bench.request(state)) if settling.rounding else None
-    if not isinstance(rounded, Geometry) or not VERSIONS[rounded.parameters.version].quantises_splats_as(Version2):
+    if not isinstance(rounded, Geometry) or not isinstance(QUANTISERS[rounded.parameters.quantiser], Balanced):
         return state, tuple(errors)
     world = rounded.parameters
     factors = Factors(world.sf_scale, world.sf_rotation, world.sf_opacity)

@@ -16,9 +16,10 @@ import zstandard
 
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.quantize import HyperParameters
+from potr_cl.codec.sections import ORDER
+from tests.reference.file_parts import STREAMS, File, Section
 from tests.reference.scenes import random_scene
 from tools.stress.hostile import (
-    blocked_files,
     camera_files,
     picture_files,
     ply_files,
@@ -28,79 +29,76 @@ from tools.stress.hostile import (
     spz_files,
 )
 from tools.stress.hostile.formats import Files
-from tools.stress.hostile.potr_files import File, Section
 
-_RAW, _ZSTD, _DEFLATE, _CONTEXT, _BUNDLES = range(5)
-_METADATA, _OCCUPANCY, _SEVERAL, _MULTIPLICITY, _TAIL_LENGTH, _TAIL = range(6)
-_SCALE, _ROTATION, _OPACITY, _SH = range(16, 20)
 _LONG = 1 << 26
+_ORDER = [prop.value for prop in ORDER]
 
 
 # .potr ---------------------------------------------------------------------------------------------------------------
 
 
-def _potr(splats: int, depth: int, sections: list[Section], degree: int = 0, version: int = 2) -> Files:
-    file = File.of(potr_files.originals()[4])
-    file.version, file.splats, file.depth, file.degree = version, splats, depth, degree
-    if version == 1:
-        file.factor = bytes(8)
-    if not any(section.prop == _OPACITY for section in sections):
-        sections = [*sections, _run(_OPACITY, 0, 0, splats)]
-    file.sections = sections
-    return {"a.potr": file.bytes()}
+def _potr(splats: int, depth: int, sections: list[Section], degree: int = 0, blocks: int = 1) -> Files:
+    """A file of equal blocks of the plain coder."""
+    file = File.of(potr_files.originals()[3])
+    block = dataclasses.replace(file.blocks[0], splats=splats, depth=depth, side=0.0)
+    block.reals = [*(-9.0,) * 3, *(9.0,) * 3, 0.0, 0.0, 0.0, 0.0]
+    if not any(section.name == b"OPAC" for section in sections):
+        sections = [*sections, Section(b"OPAC", b"\0", 1)]
+    block.sections = sorted(sections, key=lambda section: _ORDER.index(section.name.decode()))
+    return {"a.potr": dataclasses.replace(file, degree=degree, blocks=[block] * blocks).bytes()}
 
 
-def _run(prop: int, index: int, value: int, size: int, planes: int = 1, coder: int = _ZSTD) -> Section:
+def _run(name: bytes, value: int, size: int, before: bytes = b"") -> Section:
     """A section that holds one byte over and over."""
-    raw = bytes([value]) * size
-    stored = zstandard.ZstdCompressor(level=3).compress(raw) if coder == _ZSTD else zlib.compress(raw, 9)
-    return Section(prop, index, coder, planes, size, stored)
+    raw = before + bytes([value]) * size
+    return Section(name, zstandard.ZstdCompressor(level=3).compress(raw), len(raw))
 
 
-def _one_splat(prop: int, value: int, planes: int = 1, coder: int = _ZSTD) -> Callable[[], Files]:
-    return lambda: _potr(1, 52, [_run(prop, 0, value, _LONG, planes, coder)], version=1)
+def _one_splat(name: bytes, value: int) -> Callable[[], Files]:
+    return lambda: _potr(1, 52, [_run(name, value, _LONG)])
 
 
 def _one_leaf(splats: int, depth: int = 0) -> list[Section]:
     crowded = np.packbits(np.ones(depth, bool), bitorder="little").tobytes()
-    tree = [
-        Section(_OCCUPANCY, 0, _RAW, 1, depth, b"\1" * depth),
-        Section(_SEVERAL, 0, _RAW, 1, len(crowded), crowded),
-    ]
-    return [*(tree if depth else []), Section(_MULTIPLICITY, 0, _RAW, 8, 8, splats.to_bytes(8, "little"))]
+    tree = [Section(b"OCCU", b"\1" * depth, depth), Section(b"SEVE", crowded, len(crowded))]
+    return [*(tree if depth else []), Section(b"MULT", splats.to_bytes(4, "little"), 4)]
 
 
 def _leaf(splats: int) -> Files:
     return _potr(splats, 0, _one_leaf(splats))
 
 
-def _equal_splats(version: int) -> Files:
+def _equal_splats() -> Files:
     alike = random_scene(1, 0).subset(np.zeros(400_000, np.int64))
-    parameters = dataclasses.replace(HyperParameters.from_quality(0.5, "best"), version=version)
-    return {"a.potr": b"".join(code_scene(alike, parameters).pieces)}
+    return {"a.potr": b"".join(code_scene(alike, HyperParameters.from_quality(0.5, "best")).pieces)}
 
 
-def _blocks(blocks: int, own: int = 65_536, **claims: Any) -> Files:
-    """A file of equal blocks, each a leaf of its own splats; ``claims`` replace what its header says."""
-    body = _potr(own, 0, _one_leaf(own), version=3)["a.potr"]
-    table = [blocked_files.Block((-9.0,) * 3 + (9.0,) * 3, own, body)] * blocks
-    file = blocked_files.File(4, 0, blocks * own, 0, bytes(3), 0, b"", table)
-    return {"a.potr": dataclasses.replace(file, **claims).bytes()}
+def _long_description() -> Files:
+    """A description, whose stored size opens the section."""
+    file = File.of(potr_files.originals()[8])
+    section = next(section for section in file.blocks[0].sections if section.name == b"OPAC")
+    (described,) = struct.unpack_from("<I", section.stored)
+    packed = zstandard.ZstdCompressor(level=3).compress(bytes(_LONG))
+    section.stored = struct.pack("<I", len(packed)) + packed + section.stored[4 + described :]
+    section.raw = len(section.stored)
+    return {"a.potr": file.bytes()}
 
 
-def _long_description(coder: int) -> Files:
-    """A description, whose stored size opens the section, followed in coder CONTEXT by a second size."""
-    for data in reversed(potr_files.originals()):
-        file = File.of(data)
-        for section in file.sections:
-            if section.coder == coder:
-                head = 8 if coder == _CONTEXT else 4
-                (described,) = struct.unpack_from("<I", section.stored)
-                packed = zstandard.ZstdCompressor(level=3).compress(bytes(_LONG))
-                rest = section.stored[4:head] + packed + section.stored[head + described :]
-                section.stored = struct.pack("<I", len(packed)) + rest
-                return {"a.potr": file.bytes()}
-    raise RuntimeError(f"no original has a section of coder {coder}")
+def _long_metadata() -> Files:
+    file = File.of(potr_files.originals()[3])
+    file.sections = [_run(b"meta", 32, _LONG)]
+    return {"a.potr": file.bytes()}
+
+
+def _blocks_of_one_splat(number: int) -> Callable[[], Files]:
+    """Each costs time of its own."""
+
+    def made() -> Files:
+        file = File.of(potr_files.originals()[4])
+        file.blocks = file.blocks * number
+        return {"a.potr": file.bytes()}
+
+    return made
 
 
 def _all_cells() -> Files:
@@ -111,9 +109,9 @@ def _all_cells() -> Files:
     several = np.packbits(np.arange(cells) < cells - splats, bitorder="little").tobytes()
     packer = zstandard.ZstdCompressor(level=3)
     sections = [
-        Section(_OCCUPANCY, 0, _ZSTD, 1, len(occupancy), packer.compress(occupancy)),
-        Section(_SEVERAL, 0, _ZSTD, 1, len(several), packer.compress(several)),
-        _run(_TAIL_LENGTH, 0, 0, splats),
+        Section(b"OCCU", packer.compress(occupancy), len(occupancy)),
+        Section(b"SEVE", packer.compress(several), len(several)),
+        _run(b"LEAF", 0, splats),
     ]
     return _potr(splats, levels + 40, sections)
 
@@ -122,12 +120,15 @@ def _as_much_as_is_let_through(planes: int) -> Callable[[], Files]:
     """The most splats that a file may claim, with every attribute as long as can be."""
 
     def made() -> Files:
-        padding = b'{"a": "' + np.random.default_rng(0).integers(97, 123, 8_000, np.uint8).tobytes() + b'"}'
         splats = 64_000 + 8 * 8_000
-        sections = [Section(_METADATA, 0, _RAW, 1, len(padding), padding), *_one_leaf(splats, 52)]
-        sections += [_run(prop, i, 255, planes * splats, planes) for prop in (_SCALE, _ROTATION) for i in range(3)]
-        sections += [_run(_SH, i, 255, planes * splats, planes) for i in range(48)]
-        return _potr(splats, 52, sections, degree=3)
+        sections = _one_leaf(splats, 52)
+        for name in (b"SCAL", b"ROTA", b"SHC0", b"SHC1", b"SHC2", b"SHC3"):
+            streams = STREAMS[name]
+            sections.append(_run(name, 255, planes * splats * streams, bytes([planes] * streams)))
+        file = File.of(_potr(splats, 52, sections, degree=3)["a.potr"])
+        noise = np.random.default_rng(0).integers(0, 256, 8_000, np.uint8).tobytes()
+        file.blocks[0].sections.append(Section(b"junk", noise, len(noise)))
+        return {"a.potr": file.bytes()}
 
     return made
 
@@ -289,29 +290,21 @@ def _jpeg(side: int) -> Files:
 #: By format and name.
 BOMBS: dict[str, dict[str, Callable[[], Files]]] = {
     "potr": {
-        "one splat, long several": _one_splat(_SEVERAL, 0),
-        "one splat, long multiplicity": _one_splat(_MULTIPLICITY, 0),
-        "one splat, long multiplicity of 8 planes": _one_splat(_MULTIPLICITY, 2, 8),
-        "one splat, long occupancy": _one_splat(_OCCUPANCY, 1),
-        "one splat, long tail lengths": _one_splat(_TAIL_LENGTH, 0),
-        "one splat, long tails": _one_splat(_TAIL, 0),
-        "one splat, long several, deflate": _one_splat(_SEVERAL, 0, coder=_DEFLATE),
-        "one splat, long metadata": _one_splat(_METADATA, 32),
-        "a leaf of 10 million splats": lambda: _leaf(10_000_000),
+        "one splat, long several": _one_splat(b"SEVE", 0),
+        "one splat, long multiplicity": _one_splat(b"MULT", 0),
+        "one splat, long occupancy": _one_splat(b"OCCU", 1),
+        "one splat, long leaf levels": _one_splat(b"LEAF", 0),
+        "one splat, long tails": _one_splat(b"TAIL", 0),
+        "one splat, long metadata": _long_metadata,
+        "a leaf of 4 million splats": lambda: _leaf(1 << 22),
         "a leaf of 65,536 splats": lambda: _leaf(65_536),
-        "400,000 equal splats, context coder": lambda: _equal_splats(2),
-        "400,000 equal splats, bundles": lambda: _equal_splats(3),
-        "a long description, context coder": lambda: _long_description(_CONTEXT),
-        "a long description, bundles": lambda: _long_description(_BUNDLES),
+        "400,000 equal splats": _equal_splats,
+        "a long description": _long_description,
         "1.3 million cells above 32,768 splats": _all_cells,
         "the most splats that are let through": _as_much_as_is_let_through(1),
-        "the most splats, 8 planes each": _as_much_as_is_let_through(8),
-    },
-    "potr-blocks": {
-        "2³² - 1 blocks claimed": lambda: _blocks(1, count=(1 << 32) - 1),
-        "2⁶³ splats claimed": lambda: _blocks(1, splats=1 << 63),
-        "1,000 blocks of 65,536 splats": lambda: _blocks(1000),
-        "a block of 10 million splats": lambda: _blocks(1, 10_000_000),
+        "the most splats, 7 planes each": _as_much_as_is_let_through(7),
+        "1,000 blocks of 65,536 splats": lambda: _potr(65_536, 0, _one_leaf(65_536), blocks=1000),
+        "2,000 blocks of a splat": _blocks_of_one_splat(2000),
     },
     "ply": {
         "2³¹ splats claimed, binary": lambda: _ply_count("binary_little_endian", 1 << 31),

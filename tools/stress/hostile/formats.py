@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from potr_cl.codec.decoder import open_file, scene_of_file
+from potr_cl.codec.decoder import open_file
 from potr_cl.errors import PotrError
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.formats.images import image_size, read_ground_truth
@@ -19,7 +19,6 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.report.file import file_report, format_report
 from tools.stress.hostile import (
-    blocked_files,
     camera_files,
     gltf_files,
     gzip_files,
@@ -74,7 +73,7 @@ class Format:
 def read_potr(path: Path) -> Scene:
     """What the commands decode and info do with a file."""
     file = open_file(path)
-    scene = scene_of_file(file, threads=1)
+    scene = file.scene(threads=1)
     report = file_report(file)
     json.dumps(report, allow_nan=False).encode()
     format_report(report).encode()
@@ -149,9 +148,6 @@ def _picture(name: str, good: Callable[[], list[bytes]], changed: Callable[[Rand
 #: By name. docs/security.md states the costs.
 FORMATS: dict[str, Format] = {
     "potr": _single("a.potr", potr_files.originals, potr_files.changed, read_potr, 64 * MIB, 8192, twice=True),
-    "potr-blocks": _single(
-        "a.potr", blocked_files.originals, blocked_files.changed, read_potr, 64 * MIB, 8192, twice=True
-    ),
     "ply": _single("a.ply", ply_files.plain_originals, ply_files.changed_plain, read_scene, 32 * MIB, 64, twice=True),
     "compressed.ply": _single(
         "a.compressed.ply", ply_files.compressed_originals, ply_files.changed_compressed, read_scene, 32 * MIB, 64,

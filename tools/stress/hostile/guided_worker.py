@@ -18,7 +18,8 @@ from random import Random
 import atheris
 
 with atheris.instrument_imports(include=["potr_cl"]):
-    from tools.stress.hostile import picture_files, potr_files
+    from tests.reference import file_parts
+    from tools.stress.hostile import picture_files
     from tools.stress.hostile.formats import FORMATS
     from tools.stress.hostile.judge import Judge
     from tools.stress.hostile.worker import Job, keep
@@ -85,7 +86,7 @@ def _png(data: bytes) -> bytes:
 
 #: By format: what is changed in a file, and how the file is made whole again.
 _SEALS: dict[str, tuple[Callable[[bytes], bytes], Callable[[bytes], bytes]]] = {
-    "potr": (_as_it_is, potr_files.sealed),
+    "potr": (_as_it_is, file_parts.sealed),
     "spz": (_inflated, _deflated),
     "png": (_as_it_is, _png),
 }

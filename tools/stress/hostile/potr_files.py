@@ -1,6 +1,6 @@
-"""Changed .potr files: header, section table, and every stream behind its coder, mostly with checksums made right.
+"""Changed .potr files: header, table of blocks, and every stream behind its coder, mostly with checksums made right.
 
-The layout is that of docs/format.md and is written out here anew, so that a mistake in the package's own is not shared.
+They are taken apart by :mod:`tests.reference.file_parts`, which shares no mistake with the package's own reader.
 """
 
 from __future__ import annotations
@@ -11,163 +11,80 @@ import struct
 import zlib
 from functools import cache
 from random import Random
-from unittest.mock import patch
 
 import numpy as np
 import zstandard
 
-from potr_cl.codec import encoder
+from potr_cl.codec.blocks.geometry import GeometryOfBlocks, quantise
+from potr_cl.codec.blocks.splitting import blocks_of
 from potr_cl.codec.container import EntropyCoder
-from potr_cl.codec.encoder import code_scene
-from potr_cl.codec.geometry import quantise_geometry
+from potr_cl.codec.encoder import Level, code_levels
 from potr_cl.codec.quantize import HyperParameters, Preset
 from potr_cl.codec.steps.fitting import fit_steps
 from potr_cl.codec.steps.rule import ColourSteps
 from potr_cl.model.scene import Scene
+from tests.reference.file_parts import STREAMS, File, Section
 from tests.reference.scenes import random_scene, ring_of_cameras
 from tools.stress.hostile.changes import damaged, damaged_json, interesting, interesting_double
 
-_HEADER = struct.Struct("<8sHHIQQBBHI8d8s8s")
-_ENTRY = struct.Struct("<BBBBIQQ")
 _CRC = struct.Struct("<I")
-_RAW, _ZSTD, _DEFLATE, _CONTEXT, _BUNDLES = range(5)
-_METADATA, _OCCUPANCY, _SEVERAL, _MULTIPLICITY, _TAIL_LENGTH, _TAIL, _STEPS = range(7)
-_SCALE, _ROTATION, _OPACITY, _SH = range(16, 20)
-_FIRST_PER_SPLAT = 16
-_HEAD = struct.Struct("<II")
-#: Entropy, splats, SH degree, preset and version of the files that are changed: all coders and versions; few splats, as
-#: a file should take no more than a millisecond.
-_ORIGINALS: list[tuple[str, int, int, Preset, int]] = [
-    ("zstd", 7, 3, "paper", 1),
-    ("npz", 24, 1, "paper", 1),
-    ("zstd", 30, 0, "paper", 1),
-    ("npz", 1, 0, "paper", 1),
-    ("npz", 5, 1, "best", 2),
-    ("zstd", 9, 0, "best", 2),
-    ("context", 1, 0, "best", 2),
-    ("context", 12, 1, "best", 2),
-    ("context", 5, 3, "best", 2),
-    ("context", 300, 0, "best", 2),
-    ("zstd", 9, 1, "best", 3),
-    ("context", 1, 0, "best", 3),
-    ("context", 12, 1, "best", 3),
-    ("context", 20, 3, "best", 3),
-    ("context", 300, 0, "best", 3),
-]
-#: Of these: the one of most work least.
-_HOW_OFTEN = (2, 4, 4, 2, 4, 4, 4, 8, 4, 1, 4, 4, 12, 8, 2)
-#: Numbers that tell contexts before the models in a description of coder 4.
+_BYTES = (b"OCCU", b"SEVE", b"MULT", b"LEAF", b"TAIL", b"STEP")
+#: Numbers that tell contexts before the models in a description of bundles.
+_AC = 13 + 7 + 8 + 9 + 10
 _NUMBERS = {
-    (_OPACITY, 0): 2,
-    (_SCALE, 0): 9,
-    (_ROTATION, 0): 27,
-    (_SH, 0): 24,
-    (_SH, 3): 13 + 7 + 8 + 9 + 10 + 4 * 3,
-    (_SH, 12): 13 + 7 + 8 + 9 + 10 + 4 * 5,
-    (_SH, 27): 13 + 7 + 8 + 9 + 10 + 4 * 7,
-}
-
-
-@dataclasses.dataclass
-class Section:
-    """A table entry and what belongs to it."""
-
-    prop: int
-    index: int
-    coder: int
-    number: int
-    size: int
-    stored: bytes
-    crc: int | None = None  # another than the right one
-
-
-@dataclasses.dataclass
-class File:
-    """A .potr file in parts that can be changed one by one; :meth:`bytes` makes sizes and checksums right again."""
-
-    magic: bytes
-    version: int
-    flags: int
-    splats: int
-    degree: int
-    depth: int
-    reserved: int
-    doubles: list[float]
-    factor: bytes
-    tail: bytes
-    sections: list[Section]
-
-    @staticmethod
-    def of(data: bytes) -> File:
-        fields = _HEADER.unpack_from(data)
-        magic, version, flags, start, _, splats, degree, depth, count, reserved = fields[:10]
-        sections = []
-        for i in range(count):
-            prop, index, coder, number, _, size, stored = _ENTRY.unpack_from(data, _HEADER.size + i * _ENTRY.size)
-            sections.append(Section(prop, index, coder, number, size, data[start : start + stored]))
-            start += stored
-        doubles = list(fields[10:18])
-        return File(magic, version, flags, splats, degree, depth, reserved, doubles, fields[18], fields[19], sections)
-
-    def bytes(self) -> bytes:
-        start = _HEADER.size + _ENTRY.size * len(self.sections) + _CRC.size
-        fixed = _HEADER.pack(
-            self.magic, self.version, self.flags, start, start + sum(len(s.stored) for s in self.sections), self.splats,
-            self.degree, self.depth, len(self.sections), self.reserved, *self.doubles, self.factor, self.tail,
-        )  # fmt: skip
-        table = b"".join(
-            _ENTRY.pack(
-                s.prop, s.index, s.coder, s.number, zlib.crc32(s.stored) if s.crc is None else s.crc,
-                s.size, len(s.stored),
-            )
-            for s in self.sections
-        )  # fmt: skip
-        return fixed + table + _CRC.pack(zlib.crc32(fixed + table)) + b"".join(s.stored for s in self.sections)
+    b"OPAC": 2, b"SCAL": 9, b"ROTA": 27, b"SHC0": 24, b"SHC1": _AC + 12, b"SHC2": _AC + 20, b"SHC3": _AC + 28,
+}  # fmt: skip
+#: Splats, SH degree, preset, coder, most splats of a block, and levels of the files that are changed: few splats, as a
+#: file should take no more than a millisecond.
+_ORIGINALS: list[tuple[int, int, Preset, str, int, int]] = [
+    (7, 3, "paper", "zstd", 99, 1),
+    (30, 0, "paper", "zstd", 99, 1),
+    (1, 0, "paper", "zstd", 99, 1),
+    (9, 1, "best", "zstd", 99, 1),
+    (1, 0, "best", "bundles", 99, 1),
+    (12, 1, "best", "bundles", 99, 1),
+    (20, 3, "best", "bundles", 99, 1),
+    (300, 0, "best", "bundles", 999, 1),
+    (300, 2, "best", "bundles", 999, 1),
+    (12, 1, "best", "bundles", 5, 1),
+    (40, 0, "best", "zstd", 8, 1),
+    (20, 1, "best", "bundles", 20, 2),
+]
+#: Of these: the ones of most work least.
+_HOW_OFTEN = (3, 4, 3, 5, 4, 12, 8, 2, 2, 4, 4, 4)
 
 
 @cache
 def originals() -> list[bytes]:
     """Good files, some hundred bytes each, with and without splats in one place."""
     files = []
-    # The encoder takes coders of streams where they pay, which is not in files as small as these.
-    with patch.object(encoder, "_FEW", 0):
-        for number, (entropy, splats, degree, preset, version) in enumerate(_ORIGINALS):
-            scene = random_scene(splats, degree, seed=number)
-            if number in (1, 4, 7, 12):  # splats in the same place
-                scene = scene.subset(np.r_[np.arange(splats), np.arange(splats // 3), [3, 3]])
-            files.append(file_of(scene, entropy, HyperParameters.from_quality(0.5, preset), version))
-            coders = {section.coder for section in File.of(files[-1]).sections if section.prop >= _FIRST_PER_SPLAT}
-            if (entropy == "context") != (coders == {_CONTEXT if version == 2 else _BUNDLES}):
-                raise RuntimeError(f"the encoder takes other coders than {entropy} for what is to be changed")
+    for number, (splats, degree, preset, entropy, most, levels) in enumerate(_ORIGINALS):
+        scene = random_scene(splats, degree, seed=number)
+        if number in (1, 4, 5):  # splats in the same place
+            scene = scene.subset(np.r_[np.arange(splats), np.arange(splats // 3), [0, 0]])
+        scenes = [scene, *(scene.subset(np.arange(0, splats, 2)) for _ in range(levels - 1))]
+        files.append(file_of(scenes, HyperParameters.from_quality(0.5, preset), entropy, most))
+        coders = {block.coder for block in File.of(files[-1]).blocks}
+        if coders != {int(entropy == "bundles")}:
+            raise RuntimeError(f"the encoder takes another coder than {entropy} for what is to be changed")
     return files
 
 
-def file_of(scene: Scene, entropy: str, parameters: HyperParameters, version: int) -> bytes:
-    """A scene as it is in a file of a version, if that has them with steps of colours."""
-    parameters = dataclasses.replace(parameters, version=version)
-    views = ring_of_cameras(2)
-    geometry = quantise_geometry(scene, parameters, views)
-    if version == 3:
-        effects = np.exp(np.random.default_rng(1).normal(size=len(scene)))
-        steps = fit_steps(geometry.scales, geometry.opacities, geometry.parameters.sf_opacity, effects)
-        groups = np.arange(-(-len(scene) >> 2)).astype(np.int8) % 7 - 3
-        few = ColourSteps(2, 3, 1, (8, 5), (20, -900), (188, -86, 55), tuple(range(-160, 180, 20)), groups)
-        geometry = dataclasses.replace(geometry, steps=steps or few)
+def file_of(scenes: list[Scene], parameters: HyperParameters, entropy: str, most: int) -> bytes:
+    """Scenes as the levels of a file, the finest first, in blocks of so few splats."""
+    levels = []
+    for number, scene in enumerate(scenes):
+        rows = blocks_of(scene.means, most) if len(scene) > most else None
+        geometry = quantise(scene, parameters, ring_of_cameras(2), rows=rows)
+        if parameters.quantiser and not isinstance(geometry, GeometryOfBlocks):
+            effects = np.exp(np.random.default_rng(1).normal(size=len(scene)))
+            steps = fit_steps(geometry.scales, geometry.opacities, geometry.parameters.sf_opacity, effects)
+            groups = np.arange(-(-len(scene) >> 2)).astype(np.int8) % 7 - 3
+            few = ColourSteps(2, 3, 1, (8, 5), (20, -900), (188, -86, 55), tuple(range(-160, 180, 20)), groups)
+            geometry = dataclasses.replace(geometry, steps=steps or few)
+        levels.append(Level(scene, geometry, 0.5 * number))
     metadata = b'{"encoder": "potr_cl", "preset": "best", "quality": 0.5}'
-    coder = EntropyCoder(entropy, 3)
-    return b"".join(code_scene(scene, parameters, views, metadata, coder, 1, geometry=geometry).pieces)
-
-
-def sealed(data: bytes) -> bytes:
-    """A file with sizes and checksums made right for whatever its header and its table say now."""
-    count = min(int.from_bytes(data[34:36], "little"), 200)
-    start = _HEADER.size + _ENTRY.size * count + _CRC.size
-    try:
-        return File.of(
-            data[:12] + struct.pack("<I", start) + data[16:34] + struct.pack("<H", count) + data[36:]
-        ).bytes()
-    except struct.error:  # too short
-        return data
+    return b"".join(code_levels(levels, metadata, EntropyCoder(entropy, 3), 1).pieces)
 
 
 def changed(rng: Random) -> bytes:
@@ -177,164 +94,179 @@ def changed(rng: Random) -> bytes:
         for _ in range(1 + rng.randrange(3)):
             data = damaged(data, rng)
         return data
+    if rng.random() < 0.05:  # anywhere in the header, made right
+        size = int.from_bytes(data[12:16], "little")
+        head = _flipped(data[8 : size - 4], rng)
+        return data[:8] + head + _CRC.pack(zlib.crc32(data[:8] + head)) + data[size:]
     file = File.of(data)
     for _ in range(1 + rng.choice((0, 0, 1, 2))):
         rng.choice(_CHANGES)(file, rng)
     try:
         out = file.bytes()
-    except struct.error:  # a field took a number that it cannot hold
+    except (struct.error, OverflowError):  # a field took a number that it cannot hold
         return damaged(data, rng)
     return out if rng.random() < 0.97 else damaged(out, rng)
 
 
 def _header(file: File, rng: Random) -> None:
-    kind = rng.randrange(9)
+    kind = rng.randrange(6)
     if kind == 0:
-        file.version = rng.choice((0, 1, 2, 3, 4, interesting(rng, 2)))
+        file.version = rng.choice((0, 1, 2, interesting(rng, 2)))
     elif kind == 1:
-        file.splats = rng.choice((interesting(rng, 8), interesting(rng, 2), file.splats + 1, file.splats - 1))
+        file.quantiser = rng.choice((0, 1, 2, interesting(rng, 1)))
     elif kind == 2:
         file.degree = rng.choice((0, 1, 2, 3, 4, interesting(rng, 1)))
     elif kind == 3:
-        file.depth = rng.choice((0, 1, 52, 53, file.depth + 1, max(file.depth - 1, 0), interesting(rng, 1)))
+        file.flags = rng.choice((0, 1, 2, 3, 4, interesting(rng, 1)))
     elif kind == 4:
-        file.flags, file.reserved = interesting(rng, 2), interesting(rng, 4)
-    elif kind == 5:
-        file.factor = struct.pack("<d", interesting_double(rng))
-    elif kind == 6:
-        file.tail = rng.randbytes(8)
+        file.reserved = interesting(rng, 2)
     else:
-        file.doubles[rng.randrange(8)] = interesting_double(rng)
+        file.count = rng.choice((0, len(file.blocks) + 1, interesting(rng, 4)))
+
+
+def _block(file: File, rng: Random) -> None:
+    """What a block says of itself."""
+    if not file.blocks:
+        return
+    block = rng.choice(file.blocks)
+    kind = rng.randrange(9)
+    if kind == 0:
+        block.level = rng.choice((0, 1, 2, 255))
+    elif kind == 1:
+        block.coder = rng.choice((0, 1, 2, 255))
+    elif kind == 2:
+        block.depth = rng.choice((0, 1, 52, 53, block.depth + 1, max(block.depth - 1, 0), interesting(rng, 1)))
+    elif kind <= 4:
+        block.splats = rng.choice((interesting(rng, 4), interesting(rng, 2), block.splats + 1, block.splats - 1, 0))
+    elif kind == 5:
+        block.reals[rng.randrange(10)] = rng.choice((float("nan"), float("inf"), -1e38, 0.0, 1e38, -3.4e38, 1.0))
+    elif kind == 6:
+        block.side = interesting_double(rng)
+    elif kind == 7:
+        block.factors[rng.randrange(5)] = rng.choice((0.0, 9e-4, 1e-3, 1.0, 1e9, 2e9, float("nan"), -1.0))
+    else:
+        block.count = rng.choice((0, len(block.sections) + 1, max(len(block.sections) - 1, 0), 32, 33, 255))
 
 
 def _table(file: File, rng: Random) -> None:
     """An entry that says something else of the same bytes."""
-    section = rng.choice(file.sections)
-    kind = rng.randrange(7)
+    _, section = rng.choice(file.all_sections())
+    kind = rng.randrange(5)
     if kind == 0:
-        section.prop = rng.choice((*range(7), *range(16, 20), interesting(rng, 1)))
+        names = (*STREAMS, *_BYTES, b"meta", b"newA", b"NewB", b"\0\0\0\0", b"a\x1b[m", rng.randbytes(4))
+        section.name = rng.choice(names)
     elif kind == 1:
-        section.index = rng.choice((0, 1, 2, 3, 12, 27, 47, 48, interesting(rng, 1)))
+        section.raw = rng.choice((interesting(rng, 4), interesting(rng, 2), section.raw + 1, section.raw * 2 % 2**32))
     elif kind == 2:
-        section.coder = rng.choice((0, 1, 2, 3, 4, 5, 255))
-    elif kind == 3:
-        section.number = rng.choice((0, 1, 2, 3, 8, 9, 15, 21, interesting(rng, 1)))
-    elif kind == 4:
-        section.size = rng.choice((interesting(rng, 8), interesting(rng, 3), section.size + 1, section.size * 2))
-    elif kind == 5:
         section.crc = interesting(rng, 4)
+    elif kind == 3:
+        section.size = rng.choice((interesting(rng, 4), len(section.stored) + 1, max(len(section.stored) - 1, 0)))
     else:
         section.stored = damaged(section.stored, rng)
 
 
 def _order(file: File, rng: Random) -> None:
-    """Sections that lack, stand twice, are another file's or in another order."""
-    kind = rng.randrange(5)
-    at = rng.randrange(len(file.sections))
+    """Sections and blocks that lack, stand twice, are another file's or in another order; and new ones."""
+    kind = rng.randrange(8)
+    block = rng.choice(file.blocks) if file.blocks else None
+    if block is None or not block.sections:
+        return
+    at = rng.randrange(len(block.sections))
     if kind == 0:
-        del file.sections[at]
-        if not file.sections:
-            file.sections.append(Section(18, 0, _RAW, 1, file.splats, bytes(min(file.splats, 1000))))
+        del block.sections[at]
     elif kind == 1:
-        file.sections.append(dataclasses.replace(file.sections[at]))
+        block.sections.append(dataclasses.replace(block.sections[at]))
     elif kind == 2:
-        rng.shuffle(file.sections)
+        rng.shuffle(block.sections)
     elif kind == 3:
-        file.sections[at] = rng.choice(File.of(rng.choice(originals())).sections)
+        block.sections[at] = rng.choice(File.of(rng.choice(originals())).all_sections())[1]
+    elif kind == 4:
+        new = Section(rng.choice((b"newA", b"NewB", b"zzz1")), rng.randbytes(9), rng.choice((9, 9, 10, 1 << 20)))
+        rng.choice((file.sections, block.sections)).insert(0, new)
+    elif kind == 5:
+        file.blocks.append(dataclasses.replace(block, level=rng.choice((0, block.level))))
+    elif kind == 6:
+        rng.shuffle(file.blocks)
     else:
-        file.sections.append(Section(rng.choice((0, 5, 18, 19)), rng.randrange(4), _RAW, 1, 3, rng.randbytes(3)))
+        other = File.of(rng.choice(originals()))
+        file.blocks = rng.choice((file.blocks[1:], file.blocks + other.blocks, other.blocks + file.blocks))
 
 
 def _claim(file: File, rng: Random) -> None:
-    """Another number of splats, which all streams claim to fit."""
-    file.splats = max(1, interesting(rng, rng.randrange(1, 6)))
-    for section in file.sections:
-        if section.prop >= _FIRST_PER_SPLAT:
-            section.size = file.splats * max(1, section.number) % (1 << 64)
+    """Another number of splats, which all plain streams claim to fit."""
+    if not file.blocks:
+        return
+    block = rng.choice(file.blocks)
+    block.splats = max(1, interesting(rng, rng.randrange(1, 4)))
+    for section in block.sections:
+        if section.name in STREAMS and block.coder == 0:
+            section.raw = (STREAMS[section.name] * (1 + rng.randrange(6) * block.splats)) % 2**32
 
 
 def _behind_the_coder(file: File, rng: Random) -> None:
-    """Other integers in a stream, coded anew."""
-    plain = [section for section in file.sections if section.coder < _CONTEXT]
+    """Another content of a section, coded anew."""
+    plain = [(b, s) for b, s in file.all_sections() if b is None or b.coder == 0 or s.name not in STREAMS]
     if not plain:
-        _in_a_coder_of_streams(file, rng)
         return
-    section = rng.choice(plain)
-    raw = _decoded(section)
-    if section.prop == _METADATA:
+    block, section = rng.choice(plain)
+    raw = _content(section)
+    if section.name == b"meta":
         raw = damaged_json(raw, rng)
-    elif section.prop >= _FIRST_PER_SPLAT and rng.random() < 0.5:
-        section.number = rng.randrange(1, 9)
+    elif section.name in STREAMS and block is not None and rng.random() < 0.5:
+        widths = bytes(rng.choice((0, 1, 2, 3, 4, 5, 5, 6)) for _ in range(STREAMS[section.name]))
         pattern = rng.choice((b"\0", b"\xff", b"\x7f", b"\x80", rng.randbytes(5)))
-        size = section.number * min(file.splats, 1000)
-        raw = (pattern * size)[:size]
-    elif section.prop == _MULTIPLICITY and rng.random() < 0.5:
-        section.number = rng.randrange(1, 9)
-        raw = b"".join(rng.choice((b"\0", b"\1", b"\2", b"\3", b"\xff")) for _ in range(section.number * 2))
-    elif section.prop in (_OCCUPANCY, _SEVERAL, _TAIL_LENGTH, _TAIL, _STEPS) and raw and rng.random() < 0.5:
+        size = sum(widths) * min(block.splats, 1000)
+        raw = widths + (pattern * size)[:size]
+    elif section.name == b"MULT" and rng.random() < 0.5:
+        raw = b"".join(struct.pack("<I", rng.choice((0, 1, 2, 3, 2**31, 2**32 - 1))) for _ in range(rng.randrange(4)))
+    elif section.name in _BYTES and raw and rng.random() < 0.5:
         values = bytearray(raw)
         for _ in range(1 + rng.randrange(3)):
             values[rng.randrange(len(values))] = rng.choice((0, 1, 2, 3, 52, 53, 128, 255, rng.randrange(256)))
         raw = bytes(values)
     else:
-        raw = damaged(raw, rng)
-    size = len(raw)
-    if section.prop >= _FIRST_PER_SPLAT and rng.random() < 0.7:  # else it is told by the table alone
-        wanted = file.splats * max(1, section.number)
-        raw = (raw + bytes(min(wanted, 4000)))[: min(wanted, 4000)]
-        size = len(raw)
-    section.coder = rng.choice((_RAW, _ZSTD, _DEFLATE))
-    section.stored = _coded(raw, section.coder, rng)
-    section.size = size if rng.random() < 0.9 else interesting(rng, 2)
+        raw = damaged(raw, rng) if rng.random() < 0.5 or not raw else _flipped(raw, rng)
+    section.stored = _coded(raw, rng)
+    section.raw = len(raw) if rng.random() < 0.9 else interesting(rng, 2)
 
 
-def _decoded(section: Section) -> bytes:
-    try:
-        if section.coder == _ZSTD:
+def _content(section: Section) -> bytes:
+    if len(section.stored) != section.raw:
+        try:
             return zstandard.ZstdDecompressor().decompress(section.stored, max_output_size=1 << 20)
-        if section.coder == _DEFLATE:
-            return zlib.decompressobj().decompress(section.stored, 1 << 20)
-    except (zstandard.ZstdError, zlib.error, MemoryError):
-        pass
+        except (zstandard.ZstdError, MemoryError):
+            pass
     return section.stored
 
 
-def _coded(raw: bytes, coder: int, rng: Random) -> bytes:
-    if coder == _ZSTD:
-        odd = rng.random()
-        packer = zstandard.ZstdCompressor(level=1, write_checksum=odd < 0.1, write_content_size=not 0.1 < odd < 0.2)
-        stored = packer.compress(raw)
-        if odd > 0.95:
-            stored += stored
-        elif odd > 0.9:
-            stored = b"\x50\x2a\x4d\x18\x04\0\0\0skip" + stored
-    elif coder == _DEFLATE:
-        stored = zlib.compress(raw, rng.choice((0, 1, 9)))
-    else:
+def _coded(raw: bytes, rng: Random) -> bytes:
+    if rng.random() < 0.4:
         return raw
+    odd = rng.random()
+    packer = zstandard.ZstdCompressor(level=1, write_checksum=odd < 0.1, write_content_size=not 0.1 < odd < 0.2)
+    stored = packer.compress(raw)
+    if odd > 0.95:
+        stored += stored
+    elif odd > 0.9:
+        stored = b"\x50\x2a\x4d\x18\x04\0\0\0skip" + stored
     return stored if rng.random() < 0.9 else damaged(stored, rng)
 
 
-def _in_a_coder_of_streams(file: File, rng: Random) -> None:
-    if any(section.coder == _BUNDLES for section in file.sections):
-        _in_bundles(file, rng)
-    else:
-        _in_the_context_coder(file, rng)
-
-
 def _in_bundles(file: File, rng: Random) -> None:
-    """Description, states, counts or words of a section of coder 4."""
-    section = rng.choice([section for section in file.sections if section.coder == _BUNDLES])
-    if len(section.stored) <= 4:
+    """Description, states, counts or words of a section of bundles."""
+    coded = [(b, s) for b in file.blocks if b.coder == 1 for s in b.sections if s.name in STREAMS and len(s.stored) > 4]
+    if not coded:
+        _behind_the_coder(file, rng)
         return
+    block, section = rng.choice(coded)
     (described,) = struct.unpack_from("<I", section.stored)
-    start, bundles = 4 + described, min(-(-file.splats // 8192), 100)
-    lanes = min(-(-file.splats // 256), 8192) if section.prop in (_OPACITY, _ROTATION) else 0
+    start, bundles = 4 + described, min(-(-block.splats // 8192), 100)
+    lanes = min(-(-block.splats // 256), 8192) if section.name in (b"OPAC", b"ROTA") else 0
     ends = [4, start, start + 4 * lanes, start + 4 * (lanes + bundles), len(section.stored)]
     parts = [section.stored[a:b] for a, b in itertools.pairwise(ends)]
-    kind = rng.randrange(7)
-    if kind <= 1:
-        parts[0] = _changed_description(parts[0], 2 * _NUMBERS.get((section.prop, section.index), 2), rng)
+    kind = rng.randrange(8)
+    if kind <= 1 and parts[0]:
+        parts[0] = _changed_description(parts[0], 2 * _NUMBERS[section.name], rng)
     elif kind == 2 and lanes:
         which = 4 * rng.randrange(lanes)
         state = rng.choice((0, 1, 65535, 65536, 65537, 2**32 - 1, rng.randrange(2**32)))
@@ -344,10 +276,13 @@ def _in_bundles(file: File, rng: Random) -> None:
         parts[2] = struct.pack("<I", len(parts[3]) // 2) + parts[2][4:]
     elif kind == 4:
         parts[2] = damaged(parts[2], rng)
+    elif kind == 5:  # models that decoders know, for words of others
+        parts[0] = b""
     elif parts[3]:
         parts[3] = damaged(parts[3], rng) if rng.random() < 0.3 else _flipped(parts[3], rng)
     head = struct.pack("<I", len(parts[0]) if rng.random() < 0.95 else interesting(rng, 4))
     section.stored = head + b"".join(parts)
+    section.raw = len(section.stored)
 
 
 def _flipped(data: bytes, rng: Random) -> bytes:
@@ -356,44 +291,6 @@ def _flipped(data: bytes, rng: Random) -> bytes:
     for _ in range(1 + rng.randrange(3)):
         changed_bytes[rng.randrange(len(data))] = rng.randrange(256)
     return bytes(changed_bytes)
-
-
-def _in_the_context_coder(file: File, rng: Random) -> None:
-    """Description, extra bits, states or words of a section of the context coder."""
-    coded = [section for section in file.sections if section.coder == _CONTEXT and len(section.stored) > _HEAD.size]
-    if not coded:
-        _behind_the_coder_again(file, rng)
-        return
-    section = rng.choice(coded)
-    described, beside = _HEAD.unpack_from(section.stored)
-    start = _HEAD.size + described
-    lanes = min(-(-file.splats // 256), 8192)
-    parts = [
-        section.stored[_HEAD.size : start],
-        section.stored[start : start + beside],
-        section.stored[start + beside : start + beside + 4 * lanes],
-        section.stored[start + beside + 4 * lanes :],
-    ]
-    kind = rng.randrange(6)
-    if kind <= 1:
-        parts[0] = _changed_description(parts[0], 14 * section.number, rng)
-    elif kind <= 4:
-        part = parts[kind - 1]
-        if kind == 3 and rng.random() < 0.5 and lanes < 100:
-            part = b"".join(
-                struct.pack("<I", rng.choice((0, 1, 65535, 65536, 65537, 2**32 - 1, rng.randrange(2**32))))
-                for _ in range(lanes)
-            )
-        parts[kind - 1] = damaged(part, rng)
-    head = _HEAD.pack(len(parts[0]), len(parts[1]))
-    if kind == 5:
-        head = _HEAD.pack(*(rng.choice((len(part), interesting(rng, 4), len(part) + 1)) for part in parts[:2]))
-    section.stored = head + b"".join(parts)
-
-
-def _behind_the_coder_again(file: File, rng: Random) -> None:
-    if any(section.coder < _CONTEXT for section in file.sections):
-        _behind_the_coder(file, rng)
 
 
 def _changed_description(stored: bytes, weights: int, rng: Random) -> bytes:
@@ -424,11 +321,11 @@ def _changed_description(stored: bytes, weights: int, rng: Random) -> bytes:
         raw = bytearray(damaged(bytes(raw), rng))
     else:
         raw[weights:weights] = raw[weights : weights + 40]
-    return _coded(bytes(raw), _ZSTD, rng)
+    return zstandard.ZstdCompressor(level=1).compress(bytes(raw))
 
 
 _CHANGES = (
-    _header, _header, _table, _table, _order, _claim,
-    _behind_the_coder, _behind_the_coder, _behind_the_coder,
-    _in_a_coder_of_streams, _in_a_coder_of_streams, _in_a_coder_of_streams, _in_a_coder_of_streams,
+    _header, _block, _block, _block, _table, _table, _order, _order, _claim,
+    _behind_the_coder, _behind_the_coder, _behind_the_coder, _behind_the_coder,
+    _in_bundles, _in_bundles, _in_bundles, _in_bundles, _in_bundles,
 )  # fmt: skip

@@ -1,0 +1,165 @@
+"""The plain coder of splats' integers: a section a property, its streams one after another, then zstd.
+
+As short as it can be: what the paper does, and for readers that have a zstd library and nothing else. docs/format.md,
+"Plain streams", is the normative description.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.codec import container
+from potr_cl.codec.bundles.layout import BUNDLE, Bundles
+from potr_cl.codec.bundles.levels import Levels
+from potr_cl.codec.container import MOST_PLANES, CodedSection, EntropyCoder
+from potr_cl.codec.sections import SH, Property
+from potr_cl.codec.steps.rule import ColourSteps
+from potr_cl.errors import DataError
+from potr_cl.host.threads import Run
+
+U8 = NDArray[np.uint8]
+Integers = NDArray[np.integer]
+
+
+def pack(streams: Sequence[Integers], signed: bool) -> bytes:
+    """The content of a section: bytes an integer of each stream, then each one's integers, lowest bytes first.
+
+    Args:
+        streams: (n,) each, below 2^56 once they are mapped to unsigned.
+        signed: whether they may be negative, and so are zig-zag mapped: 0, −1, 1, −2, …
+    """
+    widths, planes = bytearray(), []
+    for stream in streams:
+        wide = stream.astype(np.int64)
+        mapped = ((wide << 1) ^ (wide >> 63)).view(np.uint64) if signed else wide.view(np.uint64)
+        widths.append((int(mapped.max(initial=0)).bit_length() + 7) // 8)
+        columns = mapped.astype("<u8", copy=False).view(np.uint8).reshape(-1, 8)
+        planes += [columns[:, p].tobytes() for p in range(widths[-1])]
+    return bytes(widths) + b"".join(planes)
+
+
+def unpack(planes: U8, signed: bool, start: int, stop: int) -> Integers:
+    """Integers ``start`` to ``stop`` of byte planes (planes, n), in a narrow type that holds as many."""
+    if not len(planes):
+        return np.zeros(stop - start, np.int8)
+    dtype = np.uint8 if len(planes) == 1 else np.uint16 if len(planes) == 2 else np.uint64
+    mapped: NDArray[np.unsignedinteger] = planes[-1, start:stop].astype(dtype)
+    for plane in planes[-2::-1]:
+        mapped <<= dtype(8)
+        mapped |= plane[start:stop]
+    if not signed:
+        return mapped.view(np.int64) if dtype is np.uint64 else mapped
+    sign = dtype(0) - (mapped & dtype(1))  # wraps round to all ones, as it should
+    return ((mapped >> dtype(1)) ^ sign).view(f"i{mapped.itemsize}")
+
+
+def encode(
+    values: Mapping[Property, Sequence[Integers]], coder: EntropyCoder, run: Run = map
+) -> list[CodedSection] | None:
+    """The sections of a block's integers; none of those that are all 0, but for opacity. None: one is too large.
+
+    Args:
+        values: of each property, (n,) each; DC's as they are.
+        coder: its level of zstd counts.
+        run: in place of :func:`map`, to work with several threads.
+    """
+
+    def section(prop: Property, streams: Sequence[Integers]) -> CodedSection | None:
+        if prop is Property.SH0:
+            streams = [stream - np.append(0, stream[:-1]) for stream in (own.astype(np.int64) for own in streams)]
+        raw = pack(streams, prop.signed)
+        return None if max(raw[: len(streams)]) > MOST_PLANES else coder.section(prop, raw)
+
+    kept = [
+        (prop, streams) for prop, streams in values.items() if prop is Property.OPACITY or any(map(np.any, streams))
+    ]
+    coded = list(run(lambda item: section(*item), kept))
+    return coded if all(coded) else None
+
+
+class Reader:
+    """A block's integers; what it offers is that of :class:`potr_cl.codec.bundles.decoder.Reader`.
+
+    Args:
+        splats: n of the block.
+        open_section: gives the content of a section, None if the block has none; called when it is needed.
+        open_steps: gives the steps of colours, None if the block has none; called when they are needed.
+    """
+
+    def __init__(
+        self,
+        splats: int,
+        open_section: Callable[[Property], U8 | None],
+        open_steps: Callable[[], ColourSteps | None],
+    ) -> None:
+        self.bundles = Bundles(splats)
+        self._open, self._open_steps = open_section, open_steps
+        self._planes: dict[Property, list[U8]] = {}
+
+    @cached_property
+    def steps(self) -> ColourSteps | None:
+        """The steps of colours. Raises DataError if damaged."""
+        return self._open_steps()
+
+    def open(self, sh_count: int, scales: bool, rotations: bool) -> None:
+        """Unpack what :meth:`levels` will be asked for. Raises DataError if damaged."""
+        degrees = SH[: round(sh_count**0.5)]
+        if degrees and self.steps is not None:
+            scales = True
+        shapes = [*([Property.SCALE] if scales else []), *([Property.ROTATION] if rotations else [])]
+        for prop in (Property.OPACITY, *shapes, *degrees):
+            self._planes[prop] = self._planes.get(prop) or self._streams(prop)
+        if degrees:
+            _ = self._dc
+
+    def _streams(self, prop: Property) -> list[U8]:
+        """The planes of each stream of a property."""
+        raw = self._open(prop)
+        if raw is None:
+            return [np.empty((0, self.bundles.splats), np.uint8)] * prop.streams
+        widths = raw[: prop.streams].astype(np.int64)
+        if (
+            len(widths) < prop.streams
+            or int(widths.max()) > MOST_PLANES
+            or len(raw) != prop.streams + self.bundles.splats * int(widths.sum())
+        ):
+            raise DataError(f"section '{prop.title}' does not hold an integer of each splat")
+        parts = np.split(raw[prop.streams :], np.cumsum(widths)[:-1] * self.bundles.splats)
+        return [part.reshape(-1, self.bundles.splats) for part in parts]
+
+    @cached_property
+    def _dc(self) -> list[NDArray[np.int64]]:
+        """(n,) Y, Co, Cg: sums of what is stored."""
+        return [
+            np.cumsum(unpack(planes, True, 0, self.bundles.splats), dtype=np.int64)
+            for planes in self._planes[Property.SH0]
+        ]
+
+    def levels(self, first: int, last: int) -> Levels:
+        """Of some bundles: the first one, and the one behind the last; what was opened of them."""
+        start, stop = first * BUNDLE, min(last * BUNDLE, self.bundles.splats)
+
+        def some(prop: Property) -> list[Integers]:
+            return [unpack(planes, prop.signed, start, stop) for planes in self._planes.get(prop, [])]
+
+        levels = Levels(start, stop, some(Property.OPACITY)[0], predicted=False)
+        levels.scales, levels.rotations = some(Property.SCALE) or None, some(Property.ROTATION) or None
+        if Property.SH0 in self._planes:
+            levels.dc = [channel[start:stop] for channel in self._dc]
+        rest = [stream for prop in SH[1:] for stream in some(prop)]
+        levels.dense = [rest[m : m + 3] for m in range(0, len(rest), 3)]
+        return levels
+
+
+def opened(data: bytes | memoryview, block: container.Block, open_steps: Callable[[], ColourSteps | None]) -> Reader:
+    """Of a block's bytes."""
+
+    def content(prop: Property) -> U8 | None:
+        section = block.find(prop)
+        return None if section is None else container.read_section(data, section)
+
+    return Reader(block.splats, content, open_steps)

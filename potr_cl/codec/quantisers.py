@@ -1,0 +1,182 @@
+"""The quantisers that a file can have been made with, one class each: :data:`QUANTISERS`.
+
+A quantiser says what integers are made of a scene's values and what values are made of the integers again: widths of
+steps, rotations, opacities, the octree's leaf levels. Everything else that reads or writes files asks it and never
+compares its number. docs/format.md is the normative description. Which one is taken follows from the hyper-parameters
+(:class:`potr_cl.codec.quantize.HyperParameters`).
+"""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.codec import quantize
+from potr_cl.codec.median import median
+from potr_cl.codec.quantize import F32, F64, HyperParameters, Integers
+from potr_cl.host.threads import Run
+from potr_cl.model.scene import Scene
+
+Levels = NDArray[np.integer]
+
+#: How many times as many steps the scales of antialiased scenes have, with :class:`Balanced`.
+ANTIALIASED_SCALE_STEPS = 2
+
+
+class Quantiser(abc.ABC):
+    """What sets a quantiser apart.
+
+    Attributes:
+        number: that stands in the file.
+        absolute_leaf_levels: whether the levels of leaves are chosen by the tolerance alone (``absolute`` of
+            :func:`potr_cl.codec.octree.build`).
+        colour_steps: whether a file may give each splat the steps of its colours (:mod:`potr_cl.codec.steps`); and
+            whether coder BUNDLES is for it.
+    """
+
+    number: ClassVar[int]
+    absolute_leaf_levels: ClassVar[bool]
+    colour_steps: ClassVar[bool]
+
+    @abc.abstractmethod
+    def in_world_units(
+        self, parameters: HyperParameters, scene: Scene, nearest: F64, run: Run = map
+    ) -> HyperParameters:
+        """Hyper-parameters whose β is a part of the distance to the nearest camera, and γ and SF_scale in world units.
+
+        Args:
+            parameters: as asked for.
+            scene: that is to be coded.
+            nearest: (N,) float64 distance of each splat to the nearest view, world units; 0 where there is no view.
+            run: in place of :func:`map`, to work with several threads.
+        """
+
+    def quantize_scales(self, log_scales: F64, sf_scale: float) -> Integers:
+        """(N,) natural logarithms of standard deviations along one axis to levels, >= 0."""
+        return quantize.quantize_scales(log_scales, sf_scale)
+
+    def dequantize_scales(self, levels: Levels, sf_scale: float) -> F32:
+        """(N,) levels of one axis to natural logarithms of standard deviations."""
+        return quantize.dequantize_scales(levels, sf_scale)
+
+    @abc.abstractmethod
+    def quantize_rotations(
+        self, imaginary: F64, scales: Sequence[Levels], sf_rotation: float, run: Run
+    ) -> Iterable[Integers]:
+        """(N, 3) imaginary parts of unit quaternions to levels of x, y and z, (N,) each; ``scales`` as quantised."""
+
+    @abc.abstractmethod
+    def rotation_factors(self, scales: Sequence[Levels], sf_rotation: float) -> F32:
+        """Scale factors of the rotations of some splats, for :func:`potr_cl.codec.quantize.dequantize_rotations`.
+
+        Args:
+            scales: levels of the scales, (N,) for each axis.
+            sf_rotation: scale factor.
+
+        Returns:
+            float32: (N,), or (1,) if all are the same.
+        """
+
+    @abc.abstractmethod
+    def quantize_opacities(self, logits: F64, sf_opacity: float) -> Integers:
+        """(N,) logits of opacities to levels, >= 0."""
+
+    @abc.abstractmethod
+    def dequantize_opacities(self, levels: Levels, sf_opacity: float) -> F32:
+        """(N,) levels to logits of opacities."""
+
+
+class Paper(Quantiser):
+    """The paper's: uniform steps of every activated value, lengths in world units."""
+
+    number = 0
+    absolute_leaf_levels = False
+    colour_steps = False
+
+    def in_world_units(
+        self, parameters: HyperParameters, scene: Scene, nearest: F64, run: Run = map
+    ) -> HyperParameters:
+        return parameters
+
+    def quantize_rotations(
+        self, imaginary: F64, scales: Sequence[Levels], sf_rotation: float, run: Run
+    ) -> Iterable[Integers]:
+        return run(lambda part: quantize.quantize_rotations(part, sf_rotation), imaginary.T)
+
+    def rotation_factors(self, scales: Sequence[Levels], sf_rotation: float) -> F32:
+        return np.full(1, sf_rotation, np.float32)
+
+    def quantize_opacities(self, logits: F64, sf_opacity: float) -> Integers:
+        return quantize.quantize_opacities(logits, sf_opacity)
+
+    def dequantize_opacities(self, levels: Levels, sf_opacity: float) -> F32:
+        return quantize.dequantize_opacities(levels, sf_opacity)
+
+
+class Balanced(Quantiser):
+    """Steps of equal worth: finer rotations for longer splats, opacities as logits, lengths in sizes of a splat."""
+
+    number = 1
+    absolute_leaf_levels = True
+    colour_steps = True
+
+    def in_world_units(
+        self, parameters: HyperParameters, scene: Scene, nearest: F64, run: Run = map
+    ) -> HyperParameters:
+        """β and SF_scale are given in sizes of a typical splat, so that the scene's unit of length does not matter.
+
+        A splat's size is its largest standard deviation, the typical one their median; seen from the views, the median
+        of size over distance.
+
+        Scales of antialiased scenes have finer steps: their splats' opacity follows the area on screen, so that an
+        error in a thin splat's width is seen as one in its opacity.
+        """
+        sizes, seen = np.empty(len(nearest)), np.empty(len(nearest))
+
+        def look(start: int) -> None:
+            rows = slice(start, start + _ROWS)
+            first, second, third = scene.log_scales[rows].T
+            largest = np.maximum(np.maximum(first, second), third)
+            np.exp(np.clip(largest.astype(np.float64), -60, 60), out=sizes[rows])
+            with np.errstate(divide="ignore"):  # where there is no view
+                np.divide(sizes[rows], nearest[rows], out=seen[rows])
+
+        list(run(look, range(0, len(nearest), _ROWS)))
+        whole = bool((nearest > 0).all())
+        size, ratio = run(median, (sizes, seen if whole else seen[nearest > 0]))
+        assert size is not None  # there is a splat
+        finer = ANTIALIASED_SCALE_STEPS if scene.antialiased else 1
+        sf_scale = min(max(finer * parameters.sf_scale / size, 1e-3), 1e9)
+        if ratio is not None:
+            return replace(parameters, beta=parameters.beta * ratio, sf_scale=sf_scale)
+        return replace(parameters, gamma=max(parameters.gamma, parameters.beta * size), sf_scale=sf_scale)
+
+    def quantize_rotations(
+        self, imaginary: F64, scales: Sequence[Levels], sf_rotation: float, run: Run
+    ) -> Iterable[Integers]:
+        factors = quantize.rotation_factors(scales, sf_rotation)
+        # A splat that is decoded as a ball has no direction.
+        ball = (scales[0] == scales[1]) & (scales[1] == scales[2])
+        return run(lambda part: np.where(ball, 0, quantize.quantize_rotations(part, factors)), imaginary.T)
+
+    def rotation_factors(self, scales: Sequence[Levels], sf_rotation: float) -> F32:
+        return quantize.rotation_factors(scales, sf_rotation)
+
+    def quantize_opacities(self, logits: F64, sf_opacity: float) -> Integers:
+        return quantize.quantize_logits(logits, sf_opacity)
+
+    def dequantize_opacities(self, levels: Levels, sf_opacity: float) -> F32:
+        return quantize.dequantize_logits(levels, sf_opacity)
+
+
+#: Splats worked on at a time.
+_ROWS = 1 << 15
+
+
+#: All of them, by their number.
+QUANTISERS: dict[int, Quantiser] = {quantiser.number: quantiser for quantiser in (Paper(), Balanced())}
