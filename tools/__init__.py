@@ -27,7 +27,6 @@ study.ablation             what does each part of the codec contribute?
 study.compare_formats      what would people use instead?
 study.output_formats       how small are encodes to the formats that viewers open, and what do others read of them?
 study.frames               which cameras in another frame are found, and what do unseen splats cost?
-study.decoder_roads        which road to a quick decoder: compiled C or OpenCL kernels? (for bench.decode --part roads)
 =========================  =============================================================================================
 
 What happens at the limits (``stress``):
@@ -41,6 +40,7 @@ stress.guided       the same of files that are changed towards code that none ha
 stress.bombs        what do files take that unpack to far more than they are, or claim to?
 stress.signals      what is left of a command that is told to end, at any moment?
 stress.determinism  does every command write the same bytes the second time?
+stress.page         is the viewer's server upset by any message, or by many?
 stress.native       does the compiled decoder touch memory not its own, or differ from NumPy's, on changed files?
 ==================  ====================================================================================================
 
@@ -49,6 +49,7 @@ What tests and pages are made of (``make``):
 ====================  ==================================================================================================
 make.large_scene      a scene of any size with the statistics of a real one
 make.city             copies of trained scenes side by side, any number of splats and views
+make.places           houses, streets and sites out of trained scenes, with views from where people stand
 make.test_data        the excerpts in tests/data
 make.release          a wheel and an sdist that are ready for a package index
 make.readme_picture   the picture at the top of the README

@@ -32,7 +32,7 @@ import pyopencl as cl
 
 import potr_cl
 from potr_cl.clustering.kmeans import cluster
-from potr_cl.codec import encoder
+from potr_cl.codec.bundles import encoder
 from potr_cl.codec.decoder import open_file
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.native.library import VARIABLE
