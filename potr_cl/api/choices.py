@@ -25,7 +25,7 @@ class PruneChoices(TypedDict, total=False):
     turns: int | None
     damping: float | None
     mapping_a: float | None
-    unseen: Literal["keep", "drop"] | None
+    unseen: Literal["keep", "drop", "protect"] | None
 
 
 class CompactChoices(TypedDict, total=False):
@@ -60,6 +60,7 @@ class EncodeChoices(PruneChoices, CompactChoices, total=False):
     sf_opacity: float | None
     sf_rotation: float | None
     sf_scale: float | None
+    block_splats: int | None
 
 
 def with_choices(choices: type[Any]) -> Callable[[_Function], _Function]:
