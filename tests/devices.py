@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.metadata
 from typing import Any, cast
 
@@ -10,6 +11,7 @@ import pytest
 from potr_cl.errors import DeviceError
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import DeviceInfo, Family, choose_device, compiler_fault, list_devices
+from potr_cl.opencl.verdict import kept, tried
 
 
 def _is_of_pip(info: DeviceInfo) -> bool:
@@ -40,6 +42,13 @@ if _POCL is not None:
     KERNELS += [pytest.param(f"{family}-pocl", marks=pytest.mark.slow) for family in ("cpu", "gpu")]
 
 
+@functools.cache
+def _fault(info: DeviceInfo) -> str | None:
+    """What is wrong with a device, tried in another process: some versions of PoCL crash on some CPUs."""
+    decided, fault = kept(info)
+    return fault if decided else tried(info)
+
+
 def skip_without_cpu() -> None:
     """Skip the test where there is only a GPU."""
     try:
@@ -52,6 +61,8 @@ def open_device(kernels: str) -> Device:
     """The device of one of :data:`KERNELS`; skips the test if it cannot run that family."""
     family, _, runtime = kernels.partition("-")
     info = _POCL if runtime and _POCL is not None else choose_device()
+    if runtime and (fault := _fault(info)) is not None:
+        pytest.skip(f"{info} cannot be tested here: {fault}")
     if family == "cpu" and info.family == "gpu" and info.kind == "cpu":
         pytest.skip(f"{info} does not run the row kernels: it ends long loops early")
     return Device(info, family=cast(Family, family))

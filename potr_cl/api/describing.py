@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from potr_cl.api.inputs import SceneSource, bytes_of_source, encoded_bytes, name_of, scene_of
-from potr_cl.codec.decoder import open_file
+from potr_cl.codec.decoder import PotrFile, open_file
 from potr_cl.errors import UsageError
 from potr_cl.formats import load_scene, registry
 from potr_cl.formats.declaration import SceneFormat
@@ -70,21 +70,23 @@ def info(file: SceneSource, trust: bool = False) -> SceneInfo:
     told = {"trust": True} if trust else {}
     data = encoded_bytes(file)
     if data is not None:
-        opened = open_file(data, trust)
-    elif not isinstance(file, (str, os.PathLike)):
+        return SceneInfo({**own, **_file_facts(open_file(data, trust))})
+    if not isinstance(file, (str, os.PathLike)):
         scene, mended = _as_it_would_be_read(file if isinstance(file, Scene) else scene_of(file))
         return SceneInfo({**own, **scene_report(scene, mended)})
-    else:
-        # A gzipped file is unpacked once, for both to tell its format and to read it.
-        with plain(Path(file), trust) as path:
-            kind = _format_of(path)
-            if kind is not POTR:
-                with noting_mends() as mends:
-                    scene = load_scene(path, **told)
-                return SceneInfo({**own, "format": kind.name, **scene_report(scene, mends)})
-            opened = open_file(path, trust)
-    # Two reports of one file: what it says itself of counts and bounds is the same as what the scene says.
-    return SceneInfo({**own, "format": POTR.name, **file_report(opened), **scene_report(opened.scene())})
+    # A gzipped file is unpacked once, for both to tell its format and to read it.
+    with plain(Path(file), trust) as path:
+        kind = _format_of(path)
+        if kind is POTR:
+            return SceneInfo({**own, **_file_facts(open_file(path, trust))})
+        with noting_mends() as mends:
+            scene = load_scene(path, **told)
+        return SceneInfo({**own, "format": kind.name, **scene_report(scene, mends)})
+
+
+def _file_facts(opened: PotrFile) -> dict[str, Any]:
+    """Two reports of one file: what it says itself of counts and bounds is the same as what the scene says."""
+    return {"format": POTR.name, **file_report(opened), **scene_report(opened.scene())}
 
 
 def _as_it_would_be_read(scene: Scene) -> tuple[Scene, list[CleanReport]]:

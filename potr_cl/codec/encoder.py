@@ -94,9 +94,9 @@ def code_scene(
         DataError: a value too large to quantise.
     """
     report = progress or (lambda stage, done: None)
+    report("octree", 0.0)
     if geometry is None:
         with thread_pool(threads) as pool:
-            report("octree", 0.0)
             geometry = quantise(scene, parameters, views, pool.map)
     report("octree", 1.0)
     return code_levels([Level(scene, geometry)], metadata, entropy, threads, progress)

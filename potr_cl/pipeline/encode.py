@@ -11,6 +11,7 @@ from potr_cl.model.camera import Camera, train_views, within_photographs
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encoded import Encoded
+from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.frame import check_frame, frame_checked_beside
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.run import Run
@@ -113,7 +114,9 @@ def cameras_or_virtual(
     check_frame(scene, cameras, options.cameras_anyway or in_frame)
     if cameras is None and options.look_at_views(scene):
         watch("place cameras", 0.0)
-        cameras = place_cameras(scene, device=device)
+        cameras, _ = on_device(
+            device or Device(), options.memory, lambda opened, _: place_cameras(scene, device=opened)
+        )
         watch("place cameras", 1.0)
     if cameras is not None and any(getattr(stage, "ground_truth", None) is not None for stage in options.stages):
         return within_photographs(cameras)

@@ -78,16 +78,18 @@ class Run:
 
     def _guarded(self, state: State) -> State:
         """The state that knows what no view has resolved, where nothing may be lost of that."""
-        unseen = next((each.unseen for each in self._options.stages if isinstance(each, Prune)), None)
-        wanted = unseen == "protect" or (unseen == "keep" and is_virtual(state.views))
+        prune = next((each for each in self._options.stages if isinstance(each, Prune)), Prune())
+        placed = is_virtual(state.views) and prune.keep is None and prune.count is None
+        wanted = prune.unseen == "protect" or (prune.unseen == "keep" and placed)
         if not wanted or UNRESOLVED in state.learnt or not state.views or not self._options.look_at_views(state.source):
             return state
-        self._watch("place cameras", 1.0)
+        self._watch("place cameras", 0.0)
 
         def found(device: Device, memory: int | None) -> NDArray[np.bool_]:
             return unresolved(device, state.source, state.views)
 
-        splats, self.device = on_device(self.device or self._given or Device(), self._options.memory, found)
+        splats, _ = on_device(self.device or self._given or Device(), self._options.memory, found)
+        self._watch("place cameras", 1.0)
         area = in_background(part_of_area, state.source, splats).result if splats.any() else float
         return state.having_learnt(UNRESOLVED, Unresolved(splats, area))
 

@@ -29,6 +29,7 @@ from potr_cl.codec.geometry import Geometry
 from potr_cl.errors import UnreachableError, UsageError
 from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
+from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.coded_scene import CodedScene
 from potr_cl.pipeline.encode import cameras_or_virtual, tell_left_out, tell_losses
@@ -215,7 +216,8 @@ class _Search(AbstractContextManager["_Search"]):
             if q in self._encoded:
                 break
         if best is None:
-            raise UnreachableError(f"{target} cannot be reached: {self._extremes()}")
+            hint = "; --unseen drop gives up what no view shows well, too" if is_virtual(self._views) else ""
+            raise UnreachableError(f"{target} cannot be reached: {self._extremes()}{hint}")
         encoded = best.encoded or self._code(best.reduced, best.options)
         return Found(encoded, best.options, best.value, self._tries)
 

@@ -42,7 +42,7 @@ _NEAREST, _FARTHEST, _FAR_PLACES, _OVERVIEW = 0.5, 1.5, 4, 6.0
 #: The part of the free way from its point that a place is away at most, and the cells that it is away from matter.
 _OF_WAY, _CLEAR = 0.7, 2
 #: The longest lens, as a part of the usual field of view.
-_LONGEST = 0.01
+_LONGEST = 1e-6
 #: What is seen from farther than this many times the distance at which it is resolved hardly counts.
 _HARDLY = 6.0
 #: The SH energy towards a view, as a part of the same splats' highest: below the first it was never trained, above the
@@ -200,7 +200,9 @@ def _places(
 def _aims(places: F64, seeds: F64, starts: NDArray[np.int64], towards: F32, worth: F32) -> F64:
     """(P, A, 3) directions to look in: at the place's own target, at the middle of what is seen, and at some of it."""
     first = seeds - places
-    aims = np.repeat(first[:, None] / np.linalg.norm(first, axis=1)[:, None, None], AIMS, axis=1)
+    length = np.linalg.norm(first, axis=1, keepdims=True)
+    first = np.where(length > 0, first / np.maximum(length, 1e-300), [1.0, 0.0, 0.0])
+    aims = np.repeat(first[:, None], AIMS, axis=1)
     some = np.flatnonzero(np.diff(starts))
     if len(some):
         # Empty parts give what stands at their start: they are left out.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+from collections import deque
 
 import numpy as np
 
@@ -54,13 +55,17 @@ def drawn(candidates: Candidates, count: int) -> list[int]:
     seen = worth[worth > 0]
     plain = (worth >= _PLAIN * np.median(seen) if len(seen) else np.ones(len(worth), bool)).reshape(AIMS, -1)
     places = plain.shape[1]
-    rooms = np.count_nonzero(candidates.enclosed[:places]) >= _ROOMS * places
-    found: list[int] = []
-    indoors = 0
+    rooms = bool(np.count_nonzero(candidates.enclosed[:places]) >= _ROOMS * places)
+    waiting: dict[bool, deque[int]] = {True: deque(), False: deque()}
     for place in range(places):
         good = [aim for aim in ((place + turn) % AIMS for turn in range(AIMS)) if plain[aim, place]]
-        inside = bool(candidates.enclosed[place])
-        if good and (not rooms or inside == (indoors < _JUDGE_ROOMS * (len(found) + 1))):
-            found.append(good[0] * places + place)
-            indoors += inside
-    return found[:count]
+        if good:
+            waiting[rooms and bool(candidates.enclosed[place])].append(good[0] * places + place)
+    found: list[int] = []
+    indoors = 0
+    while len(found) < count and (waiting[True] or waiting[False]):
+        inside = indoors < _JUDGE_ROOMS * (len(found) + 1)
+        inside = inside if waiting[inside] else not inside
+        found.append(waiting[inside].popleft())
+        indoors += inside
+    return found

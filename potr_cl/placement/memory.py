@@ -74,7 +74,8 @@ class Memory:
         total = np.maximum(weights.sum(axis=1), 1e-6)
         own = np.einsum("pk,pk->p", weights, self._energies(places)) / total
         best = np.quantile(weights @ self.best.T / total[:, None], _BEST, axis=1)
-        found: F64 = own / np.maximum(best, 1e-12)
+        # Of a place that shows none of them nothing is known.
+        found: F64 = np.where(weights.any(axis=1), own / np.maximum(best, 1e-12), 1.0)
         return found
 
     def _energies(self, places: F64) -> F32:

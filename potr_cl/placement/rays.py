@@ -84,6 +84,8 @@ def resolved_by(
         cameras: the views.
         pixels: that a size must have in a view.
     """
+    if not len(points):
+        return np.zeros(0, np.uint8)
     lookers = np.zeros(len(cameras), struct_dtype(_SOURCE, "Looker"))
     for looker, camera in zip(lookers, cameras, strict=True):
         looker["rotation"] = camera.rotation.ravel()

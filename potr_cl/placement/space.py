@@ -17,15 +17,16 @@ F32 = NDArray[np.float32]
 
 #: Splats that are looked at at most, evenly taken; and points on them besides one for each, as far as this from their
 #: centres, in standard deviations.
-_TAKEN, _POINTS, _WIDE = 400_000, 200_000, 1.5
+_TAKEN, _POINTS, _WIDE = 400_000, 400_000, 1.5
 #: A splat's opacity from which it counts as matter.
 OPAQUE = 0.1
 #: Optical depth from which a cell is taken for matter: haze and lone floaters are free.
 _BLOCKING = 0.5
 #: Cells of the grid at most, and points for each occupied one at least: with fewer, surfaces would have holes.
 _CELLS, _POINTS_A_CELL = 4_000_000, 5
-#: The part of the points on either side of each axis that lie outside of the grid: floaters and far backdrops.
-_OUTSIDE = 0.004
+#: The part of the splats on either side of each axis that lie outside of the grid, floaters and backdrops; and how far
+#: it reaches at most, in their median distance from their middle.
+_OUTSIDE, _FARTHEST = 0.005, 30
 #: Cells along a side of the blocks in which splats are taken to be of like size.
 _BLOCK = 6
 #: Free cells around the grid; and the farthest that is known of a free cell, in cells.
@@ -70,18 +71,26 @@ class Space:
         if (solid := scene.opacities[taken] > OPAQUE).any():
             taken = taken[solid]
         scales = np.exp(np.clip(scene.log_scales[taken].astype(np.float64), -60, 60))
-        areas = every * opacity_weighted(scales, scene.opacities[taken].astype(np.float64))
+        means = scene.means[taken].astype(np.float64)
+        middle = np.median(means, axis=0)
+        usual = float(np.median(np.linalg.norm(means - middle, axis=1)))
+        low, high = np.quantile(means, [_OUTSIDE, 1 - _OUTSIDE], axis=0)
+        low, high = np.maximum(low, middle - _FARTHEST * usual), np.minimum(high, middle + _FARTHEST * usual)
+        # A backdrop, whose splats are as wide as all that stands before it, is no matter.
+        widest = scales.max(axis=1)
+        matter = widest <= max(usual, 3 * float(np.median(widest)))
+        areas = every * opacity_weighted(scales, scene.opacities[taken].astype(np.float64)) * matter
         # One point for each splat, and more the larger it is.
         more = np.minimum(areas, 1000 * areas.mean())
         copies = 1 + (more * (_POINTS / max(float(more.sum()), 1e-300))).astype(np.int64)
         rows = np.repeat(np.arange(len(taken)), copies)
         points = _WIDE * (2 * low_discrepancy(len(rows), 3) - 1) * scales[rows]
         points = turned(points, scene.quaternions[taken[rows]].astype(np.float64))
-        points += scene.means[taken[rows]]
+        points += means[rows]
         weights = (areas / copies)[rows]
 
-        low, high = np.quantile(points, [_OUTSIDE, 1 - _OUTSIDE], axis=0)
-        extent = np.maximum(high - low, 1e-3 * max(float((high - low).max()), 1e-9))
+        most = max(float((high - low).max()), float(np.median(widest)), 1e-6 * float(np.abs(middle).max()), 1e-12)
+        extent = np.maximum(high - low, 1e-3 * most)
         low, high = low - 0.02 * extent, high + 0.02 * extent
         inside = np.flatnonzero(np.all((points >= low) & (points <= high), axis=1))
         offsets, weights = points[inside] - low, weights[inside]
@@ -90,10 +99,12 @@ class Space:
             x, y, z = (int(n) + 1 + 2 * _MARGIN for n in (high - low) / cell)
             shape = (x, y, z)
             keys = _keys((offsets / cell).astype(np.int64) + _MARGIN, shape)
-            # What is far wider than a cell is haze, or a backdrop.
+            fine = weights <= cell**2
             depth = np.bincount(keys, np.where(weights < 4 * cell**2, weights, 0), math.prod(shape)) / cell**2
             occupied = depth >= _BLOCKING
-            if np.count_nonzero(occupied) * _POINTS_A_CELL <= len(rows):
+            # Else surfaces have holes: a cell has too few points, or points stand for more than a cell.
+            dense = weights[fine].sum() >= 0.5 * weights.sum()
+            if dense and np.count_nonzero(occupied) * _POINTS_A_CELL <= len(rows):
                 break
             cell *= 1.25
         distance = _distances(occupied.reshape(shape)).reshape(-1)
@@ -151,9 +162,10 @@ class Space:
         Returns:
             (n,) the way until the first cell with matter; the whole length where there is none.
         """
-        start = ((starts - self.origin) / self.cell).astype(np.float32)
+        # Far from the grid single precision is too coarse.
+        start, skipped = self._nearer(starts, directions)
         along = directions.astype(np.float32)
-        whole = (lengths / self.cell).astype(np.float32)
+        whole = (lengths / self.cell - skipped).astype(np.float32)
         with np.errstate(divide="ignore", invalid="ignore"):
             over = 1 / along
             near, far = -start * over, (np.array(self.shape, np.float32) - start) * over
@@ -175,7 +187,15 @@ class Space:
             done = way[left] >= end[left]
             way[left[done]] = whole[left[done]]
             left = left[~done]
-        return np.minimum(way, whole).astype(np.float64) * self.cell
+        return (np.minimum(way, whole) + skipped) * self.cell
+
+    def _nearer(self, starts: F64, directions: F64) -> tuple[F32, F64]:
+        """Where rays begin, in cells, (n, 3), those from far away nearer to the grid; and by how much nearer, (n,)."""
+        start = (starts - self.origin) / self.cell
+        reach = float(np.linalg.norm(self.shape))
+        away = np.linalg.norm(start - np.array(self.shape) / 2, axis=1)
+        skipped = np.maximum(away - 2 * reach, 0)
+        return (start + skipped[:, None] * directions).astype(np.float32), skipped
 
     def in_cells(self, points: F64, besides: F64) -> F32:
         """(n, 4) points, (n, 3), in cells from the grid's lowest corner, and a fourth number, (n,)."""

@@ -48,7 +48,7 @@ _SAMPLE, _OPAQUE = 20000, 0.1
 #: Half the field of view of the turntable's pictures; how high it runs above what it turns around; the part of the
 #: opaque splats that its pictures should hold; how much farther away it may stand for that.
 _HALF_VIEW, _LOWEST, _HIGHEST = math.radians(25), math.radians(10), math.radians(35)
-_HELD, _FARTHER = 0.9, 1.3
+_HELD, _FARTHER, _WIDEST = 0.9, 1.3, 0.9
 
 
 def look_around(
@@ -109,9 +109,10 @@ def turntable(
     solid = scene.means[scene.opacities > _OPAQUE] if (scene.opacities > _OPAQUE).any() else scene.means
     held = float(np.quantile(np.linalg.norm(solid.astype(np.float64) - middle, axis=1), _HELD))
     radius = min(max(held / math.sin(_HALF_VIEW), usual), _FARTHER * usual)
-    # The tangent of half the standpoints' field of view: smaller than usual in scenes so small that the near plane
-    # would cut them off, which are looked at through a longer lens.
-    half = standpoints[0].width / 2 / standpoints[0].fx
+    # Half the field of view: smaller than usual in scenes so small that the near plane would cut them off, which are
+    # looked at through a longer lens; but wide enough for what the pictures should hold.
+    half = float(np.median([camera.width / 2 / camera.fx for camera in standpoints]))
+    half = max(half, min(math.tan(math.asin(min(held / radius, _WIDEST))), math.tan(_HALF_VIEW)))
     first = np.eye(3)[np.abs(top).argmin()]
     first = first - (first @ top) * top
     first /= np.linalg.norm(first)

@@ -21,6 +21,8 @@ from potr_cl.placement.space import Space
 #: Targets for each view that is placed, and at least; places to stand for each view, and for each that judges; splats
 #: that say which way the scene lies.
 _TARGETS, _LEAST_TARGETS, _PLACES, _JUDGED, _FRAME = 32, 2000, 6, 16, 100_000
+#: So many at most, for the memory that all pairs of them take.
+_MOST_TARGETS, _MOST_PLACES, _MOST_JUDGED = 20_000, 6000, 1024
 #: Where in the sequence of places those begin that judge: far behind those that are tried to place views.
 _OTHERS = 1 << 16
 
@@ -51,7 +53,8 @@ def place_cameras(
     """
     ground = _Ground.of(scene, count, size, field, device)
     planned = ground.planned
-    candidates = ground.candidates(_PLACES * planned.training, 0)
+    tried = max(min(_PLACES * planned.training, _MOST_PLACES), 2 * planned.training)
+    candidates = ground.candidates(tried, 0)
     picked = [ground.camera(candidates, view, "train") for view in pick(candidates, planned.training)]
     return _named([*picked, *ground.judges(planned.test)])
 
@@ -89,7 +92,7 @@ class _Ground:
         planned = plan(len(scene), count, size, opened.info.kind == "cpu")
         half_view = math.tan(math.radians(field / 2))
         space = Space.of(scene)
-        wanted = min(_TARGETS * plan(len(scene)).training, max(len(scene) // 10, _LEAST_TARGETS))
+        wanted = min(_TARGETS * plan(len(scene)).training, max(len(scene) // 10, _LEAST_TARGETS), _MOST_TARGETS)
         targets = Targets.of(scene, space, wanted)
         pixels, memory = resolution(opened, scene, space, targets, planned.size / 2 / half_view)
         frame = frame_of(scene.subset(np.arange(0, len(scene), max(len(scene) // _FRAME, 1))))
@@ -104,7 +107,8 @@ class _Ground:
     def judges(self, count: int) -> list[Camera]:
         if not count:
             return []
-        judges = self.candidates(_JUDGED * max(count, 8), _OTHERS)
+        tried = max(min(_JUDGED * max(count, 8), _MOST_JUDGED), 3 * count)
+        judges = self.candidates(tried, _OTHERS)
         return [self.camera(judges, view, "test") for view in drawn(judges, count)]
 
     def camera(self, candidates: Candidates, view: int, split: str) -> Camera:

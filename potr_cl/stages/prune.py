@@ -194,7 +194,18 @@ class Prune(Stage):
         return self._pruned(told, bench, sights, seen, hidden)
 
     def _guarded(self, state: State, bench: Workbench) -> State:
-        """Prune, but for what no view has resolved."""
+        """Prune, but for what no view has resolved.
+
+        Raises:
+            UsageError: fewer splats are asked for than that.
+        """
+        spared = int(np.count_nonzero(state.learnt[UNRESOLVED].among(state.survivors)))
+        wanted = self._schedule(0.0, len(state.scene)).count
+        if wanted is not None and wanted < spared:
+            raise UsageError(
+                f"{wanted:,} splats are fewer than the {spared:,} that no view shows from near enough: keep more, or "
+                "give --unseen keep instead of protect"
+            )
         with thread_pool(bench.threads) as pool:
             likely = seen_part(state.scene, state.views) <= LIKELY
             groups = groups_of_large(state.scene, pool.map) if likely else None

@@ -7,7 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from potr_cl.model.camera import Camera, resized
+from potr_cl.errors import UsageError
+from potr_cl.model.camera import Camera, resized, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
@@ -15,6 +16,7 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.run import Run
 from potr_cl.pipeline.stopwatch import Stopwatch
 from potr_cl.placement.guard import unresolved
+from potr_cl.placement.virtual import place_cameras
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.code import Code
 from potr_cl.stages.guarded import UNRESOLVED
@@ -22,7 +24,7 @@ from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions
 from potr_cl.stages.stage import State
-from tests.cases.surfaces import box
+from tests.cases.surfaces import box, sphere
 from tests.devices import FAMILIES, open_device
 from tests.reference.captures import looking
 from tests.reference.surfaces import together
@@ -70,8 +72,9 @@ def test_the_room_that_nobody_looked_into_is_unresolved(device):
     assert np.mean(found[:_EACH]) < 0.3, "but what is between the pictures"
 
 
-def options(unseen: str, **changes) -> EncodeOptions:
-    return EncodeOptions.for_preset("best", prune={"iterations": 4, "unseen": unseen}, between={"views": 0}, **changes)
+def options(unseen: str, prune_count: int | None = None) -> EncodeOptions:
+    prune = {"iterations": 4, "unseen": unseen, "count": prune_count}
+    return EncodeOptions.for_preset("best", prune=prune, between={"views": 0})
 
 
 def kept(device: Device, unseen: str, **changes) -> State:
@@ -102,6 +105,21 @@ def test_without_the_guard_they_are_lost(device):
     plain = kept(device, "keep")
     assert UNRESOLVED not in plain.learnt, "given cameras say where people look"
     assert np.count_nonzero(plain.survivors >= _EACH) < _EACH / 2
+
+
+@pytest.mark.one_runtime
+def test_small_units_do_not_keep_everything(device):
+    ball = sphere(8000, 2.0, 0.05)
+    small = dataclasses.replace(
+        ball, means=ball.means * np.float32(1e-4), log_scales=ball.log_scales + np.float32(np.log(1e-4))
+    )
+    assert np.mean(unresolved(device, small, train_views(place_cameras(small, 100, 300, device=device)))) < 0.2
+
+
+@pytest.mark.one_runtime
+def test_fewer_splats_than_must_stay_are_refused(device):
+    with pytest.raises(UsageError, match="that no view shows from near enough: keep more"):
+        kept(device, "protect", prune_count=100)
 
 
 def test_a_file_holds_what_was_kept(device):

@@ -90,6 +90,54 @@ def test_haze_and_backdrops_are_no_matter():
     assert np.mean(space.free(inside[np.linalg.norm(inside, axis=1) > 1]) > 0) > 0.97
 
 
+def terrain(splats: int, height: float, overlap: float):
+    """100 x 100 of hills, so often covered."""
+    rng = np.random.default_rng(0)
+    place = rng.uniform(-50, 50, (splats, 2))
+    points = np.column_stack([place, height * np.sin(place[:, 0] / 9) * np.cos(place[:, 1] / 7)])
+    size = np.sqrt(overlap * 1e4 / (2 * np.pi * splats))
+    return flat_splats(points, np.tile([0.0, 0, 1], (splats, 1)), size)
+
+
+@pytest.mark.parametrize(("splats", "height", "overlap"), [(100_000, 5, 5), (50_000, 5, 8), (20_000, 1, 5)])
+def test_wide_ground_is_matter(splats, height, overlap):
+    ground = terrain(splats, height, overlap)
+    space = Space.of(ground)
+    rng = np.random.default_rng(1)
+    above = np.column_stack([rng.uniform(-45, 45, (1000, 2)), np.full(1000, 20.0)])
+    way = space.reach(above, np.tile([0.0, 0, -1], (1000, 1)), np.full(1000, 40.0))
+    assert np.mean(way < 40) > 0.97, "rays from above meet it"
+
+
+def far_sky(count: int, radius: float):
+    normals = np.random.default_rng(7).normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return flat_splats(radius * normals, normals, radius / 10)
+
+
+@pytest.mark.parametrize("radius", [100, 1000])
+def test_a_few_splats_of_sky_do_not_coarsen_the_grid(radius):
+    ball = sphere(20_000, 2.0, 0.05)
+    alone, under = Space.of(ball), Space.of(together(ball, far_sky(100, radius)))
+    assert under.cell < 2 * alone.cell
+    assert np.mean(under.free(ball.means.astype(np.float64)) == 0) > 0.9
+
+
+@pytest.mark.parametrize(("count", "at", "log_scale"), [(1, 1e3, -40), (5, 1e3, -35), (1, 1e6, -25), (4, 1e20, -3)])
+def test_splats_that_coincide_far_from_the_origin(count, at, log_scale):
+    scene = flat_splats(np.full((count, 3), at), np.tile([0.0, 0, 1], (count, 1)), 1.0)
+    scene = dataclasses.replace(scene, log_scales=np.full((count, 3), log_scale, np.float32))
+    space = Space.of(scene)
+    assert space.cell > 0
+    assert np.isfinite(space.reach(np.zeros((1, 3)), np.array([[0.0, 0, 1]]), np.array([5.0]))).all()
+
+
+def test_a_ray_from_far_away_ends(space):
+    start, ahead = np.array([[2e7, 0, 0.3]]), np.array([[-1.0, 0, 0]])
+    way = space.reach(start, ahead, np.array([1e9]))
+    assert way == pytest.approx(2e7 - 3, abs=0.5)
+
+
 def test_what_is_seen_from_where_is_what_rays_reach(space, device):
     rng = np.random.default_rng(2)
     places = rng.uniform(-1, 1, (20, 3)) * (6, 8, 4)

@@ -207,6 +207,12 @@ def test_an_object_in_a_room():
     assert seen.min() >= 1
 
 
+def test_a_scene_that_is_only_looked_at_from_inside_has_all_its_judges():
+    rng = np.random.default_rng(4)
+    from_inside = trained(ROOM, -WALLS, rng.uniform(-0.6, 0.6, (60, 3)) * INSIDE_ROOM)
+    assert len(judging_views(from_inside, 12, 200)) == 12
+
+
 def upper_centres(count: int, distance: float) -> np.ndarray:
     rng = np.random.default_rng(3)
     centres = rng.normal(size=(count, 3))
@@ -255,6 +261,7 @@ DEGENERATE = {
     "plane": flat_splats(PLANE, UP, 0.05),
     "tiny units": scaled(BALL, 1e-6),
     "small units": scaled(BALL, 0.02),
+    "minute units": scaled(BALL, 1e-4),
     "huge units": scaled(BALL, 1e9),
     "far from the origin": dataclasses.replace(BALL, means=BALL.means + np.float32(1e5)),
     "transparent": dataclasses.replace(BALL, opacity_logits=BALL.opacity_logits - 60),
