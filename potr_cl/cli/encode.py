@@ -53,7 +53,7 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.presets import DEFAULT, PRESETS, PURPOSE
 from potr_cl.pipeline.proof import Proved, proved
 from potr_cl.pipeline.search import encode_to_target
-from potr_cl.pipeline.stopwatch import Stopwatch
+from potr_cl.pipeline.stopwatch import Stopwatch, added_up
 from potr_cl.pipeline.target import Target
 from potr_cl.quality.evaluator import EvaluationViews
 from potr_cl.quality.ground_truth import GroundTruth
@@ -210,7 +210,7 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Row
             )
         elif cameras is None:
             quality = "not judged: there are no cameras to look from"
-        seconds = placing.seconds | encoded.seconds | watch.seconds | {"total": time.perf_counter() - began}
+        seconds = added_up(placing.seconds, encoded.seconds, watch.seconds) | {"total": time.perf_counter() - began}
         photographs = None
         if shared.ground_truth is not None and cameras is not None:
             photographs = _photographs(

@@ -103,5 +103,8 @@ def virtual_cameras(args: argparse.Namespace, scene: Scene, progress: Progress, 
     better = (
         f"--cameras beside takes those in '{folder}'" if folder else "with the real cameras the file would be smaller"
     )
-    note(f"no --cameras given: {describe(cameras)}; {better}")
+    if getattr(args, "cameras", None) is not None:  # "beside", where there are none
+        note(f"no cameras beside '{scene_file}': {describe(cameras)}; {better}", "warning")
+    else:
+        note(f"no --cameras given: {describe(cameras)}; {better}")
     return cameras

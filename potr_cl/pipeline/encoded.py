@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.quantize import HyperParameters
+from potr_cl.errors import UsageError
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
+from potr_cl.outputs.registry import OUTPUTS
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.stages.fit import LeftOut
 from potr_cl.stages.fitting.fit import Fitted
@@ -81,12 +84,18 @@ class Encoded:
         return self.options.output.read(self.data, trust=True)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the file, whole or not at all; its name does not tell its kind, ``options.output`` does.
+        """Write the file, whole or not at all. Its kind is the one that was encoded to, ``options.output``.
 
         Raises:
-            UsageError: it cannot be written there.
+            UsageError: it cannot be written there, or the name is that of another kind of file.
             PotrError: the system failed to write.
         """
+        suffix, own = "".join(Path(path).suffixes[-2:]).lower(), self.options.output.suffixes()
+        others = {each for kind in OUTPUTS for each in kind.suffixes()} - set(own)
+        if not any(suffix.endswith(each) for each in own) and any(suffix.endswith(each) for each in others):
+            raise UsageError(
+                f"'{path}' is no name for a {own[0]} file: encode with to='{Path(path).suffix}', or name it *{own[0]}"
+            )
         with replacing(path) as file:
             for piece in self.pieces:
                 file.write(piece)

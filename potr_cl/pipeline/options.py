@@ -15,6 +15,7 @@ from potr_cl.model.scene import Scene
 from potr_cl.outputs.output import Output
 from potr_cl.outputs.potr import Potr
 from potr_cl.pipeline.presets import DEFAULT, PRESETS
+from potr_cl.stages.code import Code
 from potr_cl.stages.stage import Stage, parameters
 
 S = TypeVar("S", bound=Stage)
@@ -59,6 +60,9 @@ class EncodeOptions:
         object.__setattr__(self, "q", float(self.q))
         if not self.stages:
             object.__setattr__(self, "stages", PRESETS[self.preset])
+        code = next((stage for stage in self.stages if isinstance(stage, Code)), None)
+        if self.preset == "paper" and code is not None and code.entropy == "bundles":
+            raise UsageError("--entropy bundles is not for preset paper, whose steps are stored as plain streams")
 
     @staticmethod
     def for_preset(preset: Preset = DEFAULT, **changes: Any) -> EncodeOptions:

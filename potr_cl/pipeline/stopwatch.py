@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from potr_cl.stages.stage import Progress
 
 _log = logging.getLogger("potr_cl")
+
+
+def added_up(*parts: Mapping[str, float]) -> dict[str, float]:
+    """Seconds by stage of several stopwatches together."""
+    found: dict[str, float] = {}
+    for part in parts:
+        for stage, seconds in part.items():
+            found[stage] = found.get(stage, 0.0) + seconds
+    return found
 
 
 class Stopwatch:

@@ -195,3 +195,18 @@ def test_views_that_see_nothing(device):
 def test_options_out_of_range(device, plush_excerpt, views, bad):
     with pytest.raises(UsageError):
         reduced(plush_excerpt, views, FEW.changed(**bad), device)
+
+
+def test_a_file_is_not_saved_under_the_name_of_another_kind(device, tmp_path, plush_excerpt, views):
+    encoded = encode(plush_excerpt, views, EncodeOptions.for_preset("fast", prune={"iterations": 2}), device=device)
+    for name in ("a.ply", "a.spz", "a.compressed.ply"):
+        with pytest.raises(UsageError, match=r"is no name for a \.potr file: encode with to='\."):
+            encoded.save(tmp_path / name)
+    for name in ("a.potr", "no_suffix", "a.part"):
+        encoded.save(tmp_path / name)
+        assert (tmp_path / name).read_bytes() == encoded.data
+
+
+def test_the_papers_steps_go_into_no_bundles():
+    with pytest.raises(UsageError, match="--entropy bundles is not for preset paper"):
+        EncodeOptions.for_preset("paper", code={"entropy": "bundles"})

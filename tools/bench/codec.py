@@ -149,7 +149,7 @@ def bench_decode(splats: int, folder: Path) -> None:
     plain = as_it_is("paper", EntropyCoder("zstd", 9))
     _bench_decode("paper's steps, zstd 9", plain, splats, folder)
     context = as_it_is("best")
-    _bench_decode("preset best, context coder", context, splats, folder)
+    _bench_decode("preset best, bundles", context, splats, folder)
 
 
 def _bench_decode(name: str, options: EncodeOptions, splats: int, folder: Path) -> None:

@@ -72,7 +72,7 @@ def presets_table() -> str:
         colours = f"re-fitted together in {refit.steps} steps" if refit.steps else "as they are"
         if compact.on:
             colours = "compacted splat by splat"
-        # The file's version that goes with the paper's steps has no context coder.
+        # The paper's steps are stored as plain streams.
         coder = "zstd" if name == "paper" else code.entropy
         coder += f" {code.zstd_level}" if coder == "zstd" else ""
         mark = " (default)" if name == DEFAULT else ""

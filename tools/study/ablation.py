@@ -5,7 +5,7 @@
 
 The steps are those of the paper's table "Ablation study": serialisation and quantisation, entropy coding, pruning,
 SH compaction, YCoCg; those before YCoCg quantise R, G and B. The others are ours: the re-fit with steps of equal worth
-and the context coder; and views between the training views, which make the preset best. A second table has the bytes a
+and bundles; and views between the training views, which make the preset best. A second table has the bytes a
 splat of each property, compared with the float32 values of a PLY (normals left out). ``report`` prints both, and --json
 keeps them for docs/benchmarks.
 """
@@ -64,7 +64,7 @@ def _figures(evaluator: EvaluatedScene, data: bytes, rgb: bool = False) -> dict[
     decoded = from_channels(file.scene()) if rgb else file.scene()
     figures: dict[str, Any] = {"splats": splats, "bytes": len(data), **evaluator(decoded)}
     columns = ["bytes"]
-    # The context coder codes integers that were never bytes.
+    # Bundles code integers that were never bytes.
     if all(section["serialised_bytes"] is not None for section in sections.values()):
         figures["serialised_bytes"] = sum(section["serialised_bytes"] for section in sections.values())
         columns.append("serialised_bytes")
