@@ -23,10 +23,11 @@ BEYOND = """
 import ctypes, sys
 import numpy as np
 library = ctypes.CDLL(sys.argv[1])
-levels, table, out = np.zeros(5, np.uint8), np.zeros(256, np.float32), np.zeros(5 + int(sys.argv[2]), np.float32)
-where = [array.ctypes.data_as(ctypes.c_void_p) for array in (levels, table, out)]
+rows = 5 + int(sys.argv[2])
+points, others, out = np.zeros((5, 3), np.float32), np.zeros((1, 3)), np.zeros(rows)
+where = [array.ctypes.data_as(ctypes.c_void_p) for array in (points, others, out)]
 size = ctypes.c_size_t
-library.potr_look_up_narrow(where[0], size(5 + int(sys.argv[2])), where[1], size(256), where[2], size(1))
+library.potr_nearest(where[0], size(rows), where[1], size(1), where[2])
 """
 
 
