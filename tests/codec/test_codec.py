@@ -119,12 +119,6 @@ def test_balanced_steps_do_not_depend_on_the_unit_of_length():
     assert np.abs(again.log_scales.max() - millimetres.log_scales.max()) < 0.1
 
 
-def test_the_papers_quantiser_has_no_bundles():
-    data = joined(encode(random_scene(200), options=as_it_is(entropy=EntropyCoder())))
-    assert open_file(data).blocks[0].quantiser == 0
-    assert open_file(data).blocks[0].coder == Coder.PLAIN
-
-
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("entropy", [FAST])
 @pytest.mark.parametrize("q", [0.0, 0.5, 1.0])
