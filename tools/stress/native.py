@@ -322,7 +322,7 @@ class _Worker:
             # What the library is given is copied to memory of its own; what was freed waits in a cache's worth.
             "ASAN_OPTIONS": "detect_leaks=0:abort_on_error=1:allocator_may_return_null=1:quarantine_size_mb=16",
             "UBSAN_OPTIONS": "print_stacktrace=1",
-            "PYTHONPATH": str(ROOT),
+            "PYTHONPATH": os.pathsep.join([str(ROOT), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]),
             "OPENBLAS_NUM_THREADS": "1",
             "POTR_STRESS_AT": str(self._at),
         }
