@@ -146,21 +146,6 @@ def test_channels_without_a_value_and_full_ones(path, density):
     assert_same(values, reader_of(stored, 600).levels(0, 1))
 
 
-@pytest.mark.parametrize("splats", [1, 300, 8200, 20000])
-@pytest.mark.parametrize("spread", [3, 300])
-def test_both_paths_write_the_same_bytes(monkeypatch, splats, spread):
-    monkeypatch.delenv(VARIABLE, raising=False)
-    if native() is None:
-        pytest.skip("the compiled library is not there")
-    values = integers(splats, spread, spread=spread)
-    classes = classes_of(values, steps_of(splats))
-    coded = []
-    for way in "01":
-        monkeypatch.setenv(VARIABLE, way)
-        coded.append(encoder.encode(values, classes))
-    assert coded[0] == coded[1]
-
-
 def test_streams_that_several_threads_ask_for_first(monkeypatch):
     """Each may get its own, as where blocks are coded side by side; the bytes are the same."""
     monkeypatch.delenv(VARIABLE, raising=False)
