@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec import container, dequantizer
+from potr_cl.codec import container, dequantizer, quantize
 from potr_cl.codec.bundles.decoder import Reader, Wanted, check_said
 from potr_cl.codec.bundles.layout import BUNDLE
 from potr_cl.codec.bundles.sections import MAIN
@@ -184,7 +184,7 @@ class BlockValues:
         block, activation = self.block, self.activation
         levels = np.arange(self._largest_level(MAIN[1]) + 1)
         classes = np.arange(-CLASSES, CLASSES).astype(np.int8)
-        scales = block.rules.dequantize_scales(levels, block.sf_scale)
+        scales = quantize.dequantize_scales(levels, block.sf_scale)
         opacities = block.rules.dequantize_opacities(np.arange(self._largest_level(MAIN[0]) + 1), block.sf_opacity)
         return Tables(
             scales if activation is None else activation.scales(scales),

@@ -84,7 +84,7 @@ def _fill(arrays: ValueArrays, block: Block, levels: Levels, steps: ColourSteps 
         own.logits[...] = rules.dequantize_opacities(levels.opacities, block.sf_opacity)
     if own.log_scales is not None:
         for axis, level in enumerate(scales):
-            own.log_scales[:, axis] = rules.dequantize_scales(level, block.sf_scale)
+            own.log_scales[:, axis] = quantize.dequantize_scales(level, block.sf_scale)
     if own.quaternions is not None and levels.rotations is not None:
         quantize.dequantize_rotations(
             levels.rotations, rules.rotation_factors(scales, block.sf_rotation), own.quaternions

@@ -81,7 +81,7 @@ class Geometry:
             part = slice(start, min(start + BLOCK, n))
             rows, scales = order[part], [axis[part] for axis in self.scales]
             scene.means[rows] = found[part]
-            log_scales = [rules.dequantize_scales(levels, parameters.sf_scale) for levels in scales]
+            log_scales = [quantize.dequantize_scales(levels, parameters.sf_scale) for levels in scales]
             scene.log_scales[rows] = np.stack(log_scales, axis=1)
             turned = np.empty((len(rows), 4), np.float32)
             factors = rules.rotation_factors(scales, parameters.sf_rotation)

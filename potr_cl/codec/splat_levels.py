@@ -54,7 +54,7 @@ def splat_levels(scene: Scene, order: I64, world: quantize.HyperParameters, run:
     """
     rules = QUANTISERS[world.quantiser]
     imaginary, log_scales = _canonical(scene, order, run)
-    scales = list(run(lambda part: rules.quantize_scales(part.astype(np.float64), world.sf_scale), log_scales.T))
+    scales = list(run(lambda part: quantize.quantize_scales(part.astype(np.float64), world.sf_scale), log_scales.T))
     logits = scene.opacity_logits[order].astype(np.float64)
     rotations = rules.quantize_rotations(imaginary, scales, world.sf_rotation, run)
     opacities = rules.quantize_opacities(logits, world.sf_opacity)
