@@ -106,7 +106,7 @@ def main() -> None:
                     folder: _measured(folder, list(map(str, arguments))) for folder in folders[:: 1 if turn % 2 else -1]
                 }
                 before, now = (found[folder] for folder in folders)
-                table.put(
+                table.add(
                     scene.stem, now["splats"], preset, q, before["bytes"], now["bytes"],
                     100 * (now["bytes"] / before["bytes"] - 1),
                     "yes" if before["sha256"] == now["sha256"] else "no",
