@@ -4,8 +4,9 @@
     python -m tools.bench.recoded ../before SCENE [SCENE …] [--preset P …] [--q Q …] [--runs R] [--device] [--json FILE]
 
 Nothing is pruned or fitted: what differs is the coder. SCENEs are .ply files, such as decoded .potr files: so their
-splats and colours are those that an encode keeps; cameras lie beside each, with the ending .json. The checkouts take turns, and who begins alternates; times are the
-least of R, in processor time on one thread, which other work on the machine disturbs least.
+splats and colours are those that an encode keeps; cameras lie beside each, with the ending .json. The checkouts take
+turns, and who begins alternates; times are the least of R, in processor time on one thread, which other work on the
+machine disturbs least.
 """
 
 from __future__ import annotations
@@ -100,7 +101,8 @@ def main() -> None:
     for scene in args.scenes:
         for preset in args.presets or ["best"]:
             for q in args.qualities or [0.5]:
-                arguments = [scene.resolve(), scene.with_suffix('.json').resolve(), preset, q, args.runs, int(args.device)]
+                cameras = scene.with_suffix(".json").resolve()
+                arguments = [scene.resolve(), cameras, preset, q, args.runs, int(args.device)]
                 turn += 1
                 found = {
                     folder: _measured(folder, list(map(str, arguments))) for folder in folders[:: 1 if turn % 2 else -1]
