@@ -295,27 +295,6 @@ def test_states_that_no_encoder_leaves_are_refused(path, small):
 # ------------------------------------------------------------------------------------------------ files
 
 
-def of_bundles(plush_excerpt) -> bytes:
-    return b"".join(code_scene(plush_excerpt, HyperParameters.from_quality(0.5, "best")).pieces)
-
-
-@pytest.mark.parametrize("threads", [1, 3])
-def test_threads_and_paths_decode_the_same_bits(monkeypatch, plush_excerpt, threads):
-    monkeypatch.delenv(VARIABLE, raising=False)
-    data = of_bundles(plush_excerpt)
-    scenes = []
-    for way in "01" if native() is not None else "0":
-        monkeypatch.setenv(VARIABLE, way)
-        scenes.append(open_file(data).scene(threads))
-    for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
-        assert all(np.array_equal(getattr(scenes[0], name), getattr(scene, name)) for scene in scenes)
-    alone = open_file(data).body(0)
-    assert np.array_equal(alone.quaternions(), scenes[0].quaternions)
-    assert np.array_equal(alone.log_scales(), scenes[0].log_scales)
-    assert np.array_equal(alone.opacity_logits(), scenes[0].opacity_logits)
-    assert np.array_equal(alone.sh(1), scenes[0].sh[:, :4])
-
-
 def test_levels_beyond_what_is_looked_up(monkeypatch, plush_excerpt):
     """Scales and opacities of so many steps that the native path leaves some values to NumPy."""
     monkeypatch.delenv(VARIABLE, raising=False)
