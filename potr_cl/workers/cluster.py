@@ -38,8 +38,9 @@ _POLL_GROWS, _MOST_POLL = 1.5, 1.0
 _NEW = 2.0
 #: Seconds in which the handle of a part arrives once it is made.
 _FETCH = 30.0
-#: Seconds in which the scheduler says who is alive: at once, unless it stands still, or the client is closed meanwhile.
-_WHO = 15.0
+#: Seconds in which the scheduler says who is alive, and how often it is asked before it counts as gone: it answers at
+#: once, unless it stands still, or the client is closed meanwhile; but this process may have stood still itself.
+_WHO, _ASKED = 7.0, 2
 #: Threads that wait for workers.
 _MOST_WAITING = 256
 
@@ -67,6 +68,7 @@ class ClusterPool(Pool):
         self._waiting = ThreadPoolExecutor(_MOST_WAITING, thread_name_prefix="potr_cl cluster")
         self._workers: list[_ClusterWorker] = []
         self._here: DeviceThread | None = None
+        self._is_gone = False  # the scheduler
         self._refused: set[str] = set()
         self._meeting = threading.Lock()
         self._owned = ExitStack()
@@ -129,10 +131,11 @@ class ClusterPool(Pool):
 
     def _alive(self) -> set[str]:
         """Addresses of the workers that the scheduler knows."""
-        # With the connection Dask gives up all that it has on workers, also if it can be made again.
-        if self.client.status == "running":
-            with suppress(Exception):
-                return set(self.client.sync(self.client.scheduler.ncores, callback_timeout=_WHO))
+        for _ in range(_ASKED):
+            # With the connection Dask gives up all that it has on workers, also if it can be made again.
+            if self.client.status == "running" and not self._is_gone:
+                with suppress(Exception):
+                    return set(self.client.sync(self.client.scheduler.ncores, callback_timeout=_WHO))
         raise WorkerLost("the cluster's scheduler does not answer any more")
 
     def wait_for(self, answer: Any, address: str, most: float = math.inf) -> Any:
@@ -154,7 +157,7 @@ class ClusterPool(Pool):
                 raise WorkerLost(f"{address} does not answer")
             if self._closing.is_set():
                 raise WorkerLost(f"{address} is not waited for any more")
-            if self.client.status != "running" or time.monotonic() - looked > _ALIVE:
+            if self._is_gone or self.client.status != "running" or time.monotonic() - looked > _ALIVE:
                 looked = time.monotonic()
                 if address not in self._alive():
                     raise WorkerLost(f"{address} is gone")
@@ -225,13 +228,17 @@ class ClusterPool(Pool):
         self._take_in(workers)
 
     def _meet_others(self) -> None:
-        """Meet those that come, until the cluster is left."""
+        """Meet those that come, until the cluster is left or its scheduler is gone."""
         # One that dies as it is asked would be started again and again by Dask.
         lost: set[str] = set()
         while not self._closing.wait(_NEW):
-            with suppress(WorkerLost):  # whoever waits for an answer says so
-                known = {worker.name for worker in self._workers}
-                come = self._alive() - known - self._refused
+            try:
+                alive = self._alive()
+            except WorkerLost as error:
+                self._give_up(str(error))
+                return
+            with suppress(WorkerLost):  # the scheduler is gone: the next look tells
+                come = alive - {worker.name for worker in self._workers} - self._refused
                 for worker in self._invited({address for address in come if _host(address) not in lost}):
                     try:
                         worker.meet()
@@ -245,6 +252,14 @@ class ClusterPool(Pool):
                     else:
                         _log.warning("worker %s has come: it gets views from the next stage on", worker.name)
                         self._take_in([worker])
+
+    def _give_up(self, why: str) -> None:
+        """Leave workers whose scheduler is gone, though they may answer for a while."""
+        self._is_gone = True
+        for worker in self._workers:
+            worker.lost = True
+        if not self._closing.is_set():
+            self._goes_on_here(why)
 
     def _invited(self, addresses: set[str]) -> list[_ClusterWorker]:
         """Workers that have begun to say which device they take: those of one computer take its devices in turn."""
