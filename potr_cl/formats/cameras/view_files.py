@@ -213,7 +213,7 @@ def _tell_of_lenses(path: Path, whole: Sequence[bool | None]) -> None:
     widest = 2 * math.degrees(MOST_HALF_FIELD)
     beyond = f"; of {cut} the edges are left out, beyond {widest:.0f} degrees or what the lens's formula describes"
     _log.warning(
-        "'%s': %d of %d views have lens distortion: pinhole views that cover the same field stand for them%s",
+        "'%s': %d of %d views have lens distortion: replaced by pinhole views that cover the same area%s",
         path, bent, len(whole), beyond if cut else "",
     )  # fmt: skip
 
