@@ -15,7 +15,6 @@ bench.decode           how fast does a file decode, by compiled code, NumPy or O
 bench.codec            speed, memory and size of the codec alone
 bench.virtual_cameras  what does encoding without cameras cost, and what is left of places?
 bench.paired           are whole encodes faster or slower than those of another checkout?
-bench.memory           host memory of one encode, stage by stage
 bench.scaling          time and memory against splats, views and workers: with which exponents?
 =====================  =================================================================================================
 
@@ -24,9 +23,7 @@ What a choice costs or brings, against the alternatives (``study``):
 =========================  =============================================================================================
 study.rate_distortion      size against quality: the curves that other studies compare with
 study.ablation             what does each part of the codec contribute?
-study.compare_formats      what would people use instead?
-study.output_formats       how small are encodes to the formats that viewers open, and what do others read of them?
-study.frames               which cameras in another frame are found, and what do unseen splats cost?
+study.formats              how small are encodes to the formats that viewers open, and what do others make of scenes?
 =========================  =============================================================================================
 
 What happens at the limits (``stress``):
@@ -61,10 +58,8 @@ make.docs             the pages and tables of README and docs that are made from
 make.benchmarks       the tables and plots of docs/benchmarks, from the results beside them
 ====================  ==================================================================================================
 
-Shared: :mod:`tools.results` (tables that say what they are of), :mod:`tools.workloads` (scenes, views, repeated work),
-:mod:`tools.study.evaluation` (what a candidate loses to its scene), :mod:`tools.study.curves` (points of several runs
-as one curve), :mod:`tools.study.pruning_baselines` (the orders of other pruners), :mod:`tools.stress.cases` (inputs at
-their worst), :mod:`tools.stress.precise` (what they give in float64). Tools import the package and the float64
+Shared: :mod:`tools.results` (tables that say what they are of), :mod:`tools.workloads` (command lines, scenes, time and
+memory), :mod:`tools.study.evaluation` (what a candidate loses to its scene). Tools import the package and the float64
 definitions (:mod:`tests.reference`), no other tests; kernels of their own are given to a
 :class:`potr_cl.opencl.device.Device` as variants. Their own tests are in tools/tests.
 """

@@ -14,12 +14,11 @@ Times are the clock's on GPUs, and of processors together on CPUs, which other w
 
 from __future__ import annotations
 
+import argparse
 import itertools
-import time
 from collections.abc import Callable, Sequence
 
 import numpy as np
-import pyopencl as cl
 
 from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
@@ -37,7 +36,7 @@ from potr_cl.stages.refitting.targets import RenderedTargets
 from tests.reference.derivatives import gradient
 from tests.reference.scenes import ring_of_cameras, visible_scene
 from tools.results import Column, Results
-from tools.workloads import read, reduced, scene_parser
+from tools.workloads import in_turn, read, reduced, scene_parser
 
 #: Steps so small that the scene, and with it the work, stays what it is.
 _RATES = Rates(1e-9, 1e-9, 1e-9, 1e-9, 1e-9, 1e-9)
@@ -65,61 +64,51 @@ def main() -> None:
     results = Results(device.info, args.json)
     parts = ("views", *dict.fromkeys(_PARTS.values()))
     steps = results.table(
-        "steps", "Steps of the fit", Column("scene"), Column("splats", "", ",d"), Column("pixels of a view", "", ",d"),
-        Column("views a step"), Column("steps a second", "", ".1f"),
+        "steps", "Steps of the fit", "scene; splats||,d; pixels of a view||,d; views a step; steps a second||.1f",
         *(Column(f"of a step: {part}", "ms", ".2f") for part in parts),
     )  # fmt: skip
     for folder in args.scenes:
         scene, cameras = read(folder)
         train = train_views(cameras)[: args.views]
-        load = folder.name, scene, _left(scene, train, args, plain), train
+        load = scene, _left(scene, train, args, plain), train
         for batch in args.batches:
             steps.add(
-                folder.name, len(load[2]), train[0].width * train[0].height, batch,
+                folder.name, len(load[1]), train[0].width * train[0].height, batch,
                 *_steps(plain, device, load, batch, args.steps),
             )  # fmt: skip
     errors = results.table(
         "errors", "Error of derivatives against float64, and their time",
-        Column("kernels"), Column("differences", "", "g"), Column("unit", "", "g"),
-        Column("relative error of Jᵀ r", "", ".1e"),
-        Column("time of a view", "ms", ".3f"),
+        "kernels; differences||g; unit||g; relative error of Jᵀ r||.1e; time of a view|ms|.3f",
     )  # fmt: skip
     for family in ("cpu", "gpu") if device.info.family == "cpu" else ("gpu",):
         for size, unit in itertools.product(_DIFFERENCES, _UNITS):
             errors.add(family, size, unit, *_error(Device(args.device, family=family), size, unit))
 
 
-Load = tuple[str, Scene, Scene, list[Camera]]
+Load = tuple[Scene, Scene, list[Camera]]
 
 
-def _left(scene: Scene, train: Sequence[Camera], args: object, device: Device) -> Scene:
-    every, keep = getattr(args, "every", None), float(getattr(args, "keep", 1.0))
-    if every:
-        return scene.subset(np.arange(0, len(scene), every))
-    changes = {"prune": {"count": round(keep * len(scene))}, "compact": False, "refit": False, "between": {"views": 0}}
-    return reduced(scene, train, EncodeOptions.for_preset("fast", **changes), device)
-
-
-def _now(device: Device) -> float:
-    return time.process_time() if device.info.kind == "cpu" else time.perf_counter()
+def _left(scene: Scene, train: Sequence[Camera], args: argparse.Namespace, device: Device) -> Scene:
+    if args.every:
+        return scene.subset(np.arange(0, len(scene), args.every))
+    count = round(args.keep * len(scene))
+    changes = {"prune": {"count": count}, "compact": False, "refit": False, "between": {"views": 0}}
+    return reduced(scene, train, EncodeOptions.for_preset("fast", **changes), device).scene
 
 
 def _least(device: Device, work: Callable[[], None]) -> float:
     """Seconds of some work, after a run that is not counted."""
-    work()
-    device.queue.finish()
-    times = []
-    for _ in range(_REPEATS):
-        began = _now(device)
+
+    def whole() -> None:
         work()
         device.queue.finish()
-        times.append(_now(device) - began)
-    return min(times)
+
+    return min(in_turn({"": whole}, _REPEATS)[""][device.info.kind == "cpu"])
 
 
 def _steps(plain: Device, profiled: Device, load: Load, batch: int, count: int) -> tuple[float, ...]:
     """Steps a second without profiling, and milliseconds a step of each part of the device's work with it."""
-    _, scene, left, train = load
+    scene, left, train = load
     count = max(count // batch, 1)
     found: dict[str, float] = {}
     rate = 0.0
@@ -165,7 +154,12 @@ def _error(device: Device, size: float, unit: float) -> tuple[float, float]:
         target = memory.upload(wanted, "the target")
         derivatives.add([camera], target, unit=unit)
         found = derivatives.read().astype(np.float64)
-        seconds = _least(device, lambda: _some_views(derivatives, camera, target, unit))
+
+        def some_views() -> None:
+            for _ in range(16):
+                derivatives.add([camera], target, unit=unit)
+
+        seconds = _least(device, some_views)
     exact = gradient(scene, camera, INRIA, (picture - wanted).astype(np.float64))
     weight = REFERENCE_PIXELS / (camera.width * camera.height)
     parts = np.split(found, [3, 6, 10, 11], axis=1)
@@ -174,11 +168,6 @@ def _error(device: Device, size: float, unit: float) -> tuple[float, float]:
         float(np.linalg.norm(part - array) / np.linalg.norm(array)) for part, array in zip(parts, arrays, strict=True)
     )
     return worst, 1e3 * seconds / 16
-
-
-def _some_views(derivatives: PictureDerivatives, camera: Camera, target: cl.Buffer, unit: float) -> None:
-    for _ in range(16):
-        derivatives.add([camera], target, unit=unit)
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ from potr_cl.model.camera import Camera, camera_centres, focus, test_views, trai
 from potr_cl.model.scene import Scene
 from tests.reference.captures import looking
 from tests.reference.frames import moved
-from tools.cameras_json import entry
+from tools.workloads import camera_entry
 
 F64 = NDArray[np.float64]
 
@@ -149,7 +149,7 @@ def write_city(folder: Path, city: City, cameras: Sequence[Camera]) -> None:
 
 def write_cameras(folder: Path, cameras: Sequence[Camera]) -> None:
     """Write cameras.json alone."""
-    (folder / "cameras.json").write_text(json.dumps([entry(number, view) for number, view in enumerate(cameras)]))
+    (folder / "cameras.json").write_text(json.dumps([camera_entry(n, view) for n, view in enumerate(cameras)]))
 
 
 def _yaw(turn: int) -> F64:

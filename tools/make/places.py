@@ -26,7 +26,7 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene, joined
 from tests.reference.captures import looking
 from tests.reference.frames import moved
-from tools.cameras_json import entry
+from tools.workloads import camera_entry
 
 F64 = NDArray[np.float64]
 
@@ -301,7 +301,7 @@ def main() -> None:
     )
     args.output.mkdir(parents=True, exist_ok=True)
     scene.save(args.output / "point_cloud.ply")
-    (args.output / "cameras.json").write_text(json.dumps([entry(n, camera) for n, camera in enumerate(cameras)]))
+    (args.output / "cameras.json").write_text(json.dumps([camera_entry(n, camera) for n, camera in enumerate(cameras)]))
     print(f"{len(scene):,} splats and {len(cameras)} views in {args.output}")
 
 
