@@ -20,7 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from potr_cl.errors import PotrError
-from tools.stress.hostile.formats import Files, Format, WrongResult, parts_of
+from tools.stress.hostile.changes import Files
+from tools.stress.hostile.formats import Format, WrongResult, parts_of
 
 #: A file that takes longer hangs: seconds of processor time, and, should it wait for something, how many times as many
 #: of the clock, for other processes may keep the processor busy.

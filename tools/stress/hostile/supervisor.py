@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from tools.results import ROOT
-from tools.stress.hostile.formats import Files
+from tools.stress.hostile.changes import Files
 from tools.stress.hostile.judge import LONGEST, Verdict
 from tools.stress.hostile.worker import Job, Tally, keep
 
@@ -70,8 +70,11 @@ def attack(form: str, seed: int, first: int, count: int, seconds: float, finding
             if code != 0:
                 crashes += 1
                 verdict = _ending(code, said)
-                tally.findings += 1
-                if not (verdict.kind == "hang" and _in_time(job, _files(folder), tally.number)):
+                kind = _alone(job, _files(folder), tally.number) if verdict.kind == "hang" else verdict.kind
+                tally.read += kind == "read"
+                tally.refused += kind == "refused"
+                if kind not in ("read", "refused"):
+                    tally.findings += 1
                     keep(findings, job, tally.number, _files(folder), verdict)
                 tally.number += 1
         _add(total, tally, tally.number - number)
@@ -163,11 +166,11 @@ def _ending(code: int, said: str) -> Verdict:
     return Verdict("crash", f"{name}\n{said}", 0.0, 0)
 
 
-def _in_time(job: Job, files: Files, number: int) -> bool:
-    """Whether a file that seemed to hang is read in time when it is tried alone: then the machine was busy."""
-    with tempfile.TemporaryDirectory() as scratch, place() as folder:
+def _alone(job: Job, files: Files, number: int) -> str:
+    """What becomes of a file that seemed to hang when it is tried alone: the machine may have been busy."""
+    with tempfile.TemporaryDirectory() as scratch:
         source = keep(Path(scratch), job, number, files, Verdict("hang", "", 0.0, 0))
-        return run(Job(job.form, str(folder), str(Path(scratch, "again")), given=[str(source)]))[0] == 0
+        return str(read_again([source], Path(scratch, "again"))[0]["kind"])
 
 
 def _files(folder: Path, names: list[str] | None = None) -> Files:

@@ -16,7 +16,8 @@ from collections import Counter
 from pathlib import Path
 from random import Random
 
-from tools.stress.hostile.formats import FORMATS, Files
+from tools.stress.hostile.changes import Files
+from tools.stress.hostile.formats import FORMATS
 from tools.stress.hostile.judge import LONGEST, Judge, Verdict
 
 #: Findings of one sort that are kept.
