@@ -10,7 +10,7 @@ bench.encode           run time against error of every stage and variant on ever
 bench.rasterizer       frames a second, and time against splats, pixels and overlap
 bench.pruning          what does pruning keep, against other pruners, and what may its sweeps skip?
 bench.refit            what does the re-fit of the colours bring, and what does it take?
-bench.fit              how fast are the fit's steps, and how exact its derivatives?
+bench.fit              how fast are the fit's steps?
 bench.decode           how fast does a file decode, by compiled code, NumPy or OpenCL, and in how much memory?
 bench.codec            speed, memory and size of the codec alone
 bench.virtual_cameras  what does encoding without cameras cost, and what is left of places?
@@ -33,7 +33,6 @@ stress.run          every kernel against float64 on the worst inputs: what error
 stress.platforms    the rasterizer, the metrics and the re-fit on every OpenCL runtime of this machine
 stress.simulated    does Oclgrind see a race, an access out of bounds or an uninitialised read in any kernel?
 stress.fuzz         does any changed file do more than be refused or decode to finite numbers?
-stress.guided       the same of files that are changed towards code that none has reached yet (Atheris)
 stress.bombs        what do files take that unpack to far more than they are, or claim to?
 stress.signals      what is left of a command that is told to end, at any moment?
 stress.determinism  does every command write the same bytes the second time?

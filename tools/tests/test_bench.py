@@ -98,13 +98,10 @@ def test_every_stage(folder, capsys):
 
 
 @pytest.mark.slow
-def test_steps_and_errors_of_the_fit(tables, folder):
-    found = tables("fit", folder, "--every", 4, "--steps", 4, "--batches", 2)
-    (steps,) = found["steps"]
+def test_steps_of_the_fit(tables, folder):
+    (steps,) = tables("fit", folder, "--every", 4, "--steps", 4, "--batches", 2)["steps"]
     assert steps[1] == 375
     assert min(steps[4:]) > 0
-    assert all(row[3] < 1e-5 for row in found["errors"] if row[1] * row[2] < 1)
-    assert all(row[3] > 1e-2 for row in found["errors"] if row[1] * row[2] > 20), "what exceeds the fixed point is cut"
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from potr_cl.raster.rules import GSPLAT, INRIA
 from tests.devices import FAMILIES, open_device
 from tests.reference import raster as reference
 from tests.reference.scenes import random_splats, tilted_camera
+from tools.results import Results
 from tools.stress import cases as stress_cases
 from tools.stress import measures, precise, roads, run, solvers, views
 
@@ -210,7 +211,7 @@ def test_the_report_names_what_failed(capsys):
         {"device": "A", "family": "cpu", "worst": worst, "failures": {"composite": "one splat"}},
         {"device": "B", "family": "gpu", "failed": "crashed"},
     ]
-    run.print_report(results)
+    run.report(Results(None), results)
     printed = capsys.readouterr().out
-    assert "composite on A, cpu kernels: one splat" in printed
-    assert "failed: crashed" in printed
+    assert "| composite | A | cpu | one splat |" in printed
+    assert "| B | gpu | crashed |" in printed

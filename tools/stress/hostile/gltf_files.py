@@ -15,7 +15,7 @@ from tools.stress.hostile.changes import TEXTS, Files, Rules, changed_files, dam
 _PREFIX = "KHR_gaussian_splatting:"
 _CODES = {5120: ("b", 1), 5121: ("B", 1), 5122: ("h", 2), 5123: ("H", 2), 5126: ("f", 4)}
 _KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
-_NUMBERS = (0, 1, 2, 3, 4, 12, 99, 255, 10**9, -1, -4, 2**31, 2**40, 1.0, True, None, {})
+_NUMBERS: tuple[Any, ...] = (0, 1, 2, 3, 4, 12, 99, 255, 10**9, -1, -4, 2**31, 2**40, 1.0, True, None, {})
 _MOTIONS = ([0] * 4, [0] * 3, [1, 1, -1], [1e30] * 3, [0.0] * 16, [1, 2, 9], "a")
 _RULES = Rules({
     **dict.fromkeys(("count", "byteOffset", "bufferView", "buffer", "byteLength", "byteStride", "mesh"), _NUMBERS),

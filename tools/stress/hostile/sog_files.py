@@ -18,7 +18,7 @@ from tools.stress.hostile.changes import TEXTS, Files, Rules, changed_files, dam
 _PICTURES = ("means_l.webp", "means_u.webp", "quats.webp", "scales.webp", "sh0.webp")
 _PALETTE = ("shN_centroids.webp", "shN_labels.webp")
 _COEFFICIENTS = (0, 3, 8, 15)
-_NAMES = (
+_NAMES: tuple[Any, ...] = (
     ["../meta.json"] * 2,
     ["/dev/zero", "a/../../b"],
     [],
@@ -28,7 +28,18 @@ _NAMES = (
     [0, None],
 )
 _COUNTS = (0, 1, 2, 5, 16, 17, 64, 65537, -1, 1.0, True, None, "5", 10**9, 2**31, 2**40)
-_BOUNDS = ([], [0], [1e39] * 3, [800.0] * 3, ["1", 2, 3], [[1, 2, 3]] * 3, 5, None, [float("nan")] * 3, [1, 2, 3, 4])
+_BOUNDS: tuple[Any, ...] = (
+    [],
+    [0],
+    [1e39] * 3,
+    [800.0] * 3,
+    ["1", 2, 3],
+    [[1, 2, 3]] * 3,
+    5,
+    None,
+    [float("nan")] * 3,
+    [1, 2, 3, 4],
+)
 _HINTS = {
     **dict.fromkeys(("count", "file", "offset", "lodLevels"), _COUNTS), **dict.fromkeys(("mins", "maxs"), _BOUNDS),
     **dict.fromkeys(("files", "filenames", "environment"), _NAMES), "bands": (0, 1, 2, 3, 4, 1.0, True, "1"),
