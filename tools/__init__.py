@@ -49,8 +49,7 @@ make.places           houses, streets and sites out of trained scenes, with view
 make.test_data        the excerpts in tests/data
 make.release          a wheel and an sdist that are ready for a package index
 make.readme_picture   the picture at the top of the README
-make.foreign_files    the excerpt in splat-transform's formats
-make.other_tools      some splats in the formats of six tools, and how splat-transform reads them
+make.other_tools      splats in the formats of six tools, and how splat-transform reads them
 make.golden_files     files that every later decoder must read to the same values
 make.native           the compiled part of the decoder, in the checkout
 make.docs             the pages and tables of README and docs that are made from the code (see CONTRIBUTING.md)

@@ -1,9 +1,10 @@
-"""Run time against error of all stages and whole encodes, on every OpenCL device.
+"""Run time against error of all stages, on every OpenCL device.
 
     python -m tools.bench.encode [SCENE …] [--device NAME] [--quick] [--stage NAME …] [--json FILE]
 
-For each stage the variants that exist: kernel family, compiler flags, sort, skips, iterations, steps, entropy coder,
-preset; each with its time and its error against float64 or against the full computation. A variant is on the Pareto
+For each stage the variants that exist: kernel family, compiler flags, sort, steps, entropy coder; each with its time
+and its error against float64 or against the full computation. (tools.bench.pruning has what the schedule may skip,
+tools.study.rate_distortion compares whole encodes of any options.) A variant is on the Pareto
 front if no other of its stage is at least as good in time, error and bytes and better in one by more than 5 %, the
 noise. Scenes: lego and plush by default; --quick takes the bundled excerpt at half size and the best device.
 
@@ -16,7 +17,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import tempfile
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -32,9 +32,7 @@ from potr_cl.model.camera import Camera, camera_centres, test_views, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import DeviceInfo, Family, choose_device, list_devices
-from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import GSPLAT, INRIA
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, Precision
@@ -46,7 +44,6 @@ from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.refitting.targets import RenderedTargets
 from tests.reference import raster as reference
 from tests.reference.removal import BruteForce
-from tools.bench.pruning import Bench, skips
 from tools.bench.rasterizer import stage_times
 from tools.results import Results
 from tools.workloads import SCENES, best_of, excerpt, in_process, log, read, scaled, scene_parser
@@ -108,7 +105,6 @@ class Workload:
     """
 
     info: DeviceInfo
-    folder: Path
     scene: Scene
     train: list[Camera]
     test: list[Camera]
@@ -118,7 +114,7 @@ class Workload:
     def of(info: DeviceInfo, folder: Path, quick: bool) -> Workload:
         scene, cameras = read(folder)
         cameras = [scaled(camera, 0.5) for camera in cameras] if quick else cameras
-        return Workload(info, folder, scene, train_views(cameras), test_views(cameras), quick)
+        return Workload(info, scene, train_views(cameras), test_views(cameras), quick)
 
     @property
     def some(self) -> list[Camera]:
@@ -255,15 +251,6 @@ def choose_splats(importance: F64, count: int) -> NDArray[np.int64]:
     return np.unique(by_importance[at.clip(0, len(seen) - 1)])
 
 
-def prune_rows(load: Workload) -> Iterator[Row]:
-    """What the schedule may skip, see tools.bench.pruning."""
-    most = 8 if load.quick else 48
-    with Bench(load.folder, Device(load.info), 4 if load.quick else 1) as bench:
-        for row in skips(bench, (most, most // 2)):
-            is_default = row["skipped"] == f"tolerance {SweepOptions.tolerance:g}"
-            yield Row("prune", row["skipped"], row["seconds"], 10 ** (-row["equal"] / 20), is_default)
-
-
 def ridge_errors(scene: Scene, compacted: Scene, centres: F64, weights: Any, options: CompactionOptions) -> F64:
     """(K, 3) weighted colour errors above the optimum over the coefficients left free, of the splats that are seen.
 
@@ -334,7 +321,7 @@ def refit_rows(load: Workload) -> Iterator[Row]:
                 yield Row("re-fit", f"{family}, {steps} steps", best_of(1, work), errors[-1], is_default)
 
 
-# ----------------------------------------------------------------------------------------- coding, encodes
+# ---------------------------------------------------------------------------------------------------- coding
 
 
 def code_rows(load: Workload) -> Iterator[Row]:
@@ -353,34 +340,6 @@ def code_rows(load: Workload) -> Iterator[Row]:
         yield Row("decode", name, best_of(load.repeats, lambda d=data[0]: decode(d)), size, default)  # type: ignore[misc]
 
 
-def encode_rows(load: Workload) -> Iterator[Row]:
-    """Presets, iterations, stages left out: time, bytes and PSNR over the test views."""
-    device = Device(load.info)
-    variants: dict[str, dict[str, Any]] = {
-        "paper": {},
-        "fast": {"preset": "fast"},
-        "best": {"preset": "best"},
-        "paper, 12 iterations": {"prune": {"iterations": 12}},
-        "paper, 4 iterations": {"prune": {"iterations": 4}},
-        "paper, every removal effect anew": {"prune": {"tolerance": -1}},
-        "paper, no compaction": {"compact": False},
-        "paper, no pruning": {"prune": False},
-        "paper, neither": {"prune": False, "compact": False},
-        "paper, re-fit of 8 steps": {"refit": {"steps": 8}},
-        "best, re-fit of 4 steps": {"preset": "best", "refit": {"steps": 4}},
-        "best, re-fit of 16 steps": {"preset": "best", "refit": {"steps": 16}},
-    }
-    with Evaluator(device, load.scene, EvaluationViews.of([*load.train, *load.test]), (0.0, 0.0, 0.0)) as evaluator:
-        for number, (name, changes) in enumerate(variants.items()):
-            options = EncodeOptions.for_preset(**{"preset": "paper", **changes})
-            for _ in range(2 if load.quick or number == 0 else 1):  # the first builds the kernels
-                started = time.perf_counter()
-                encoded = encode(load.scene, load.train, options, device=device)
-                seconds = time.perf_counter() - started
-            psnr = evaluator.psnr(decode(b"".join(encoded.pieces)))
-            yield Row("encode", name, seconds, 10 ** (-psnr / 20), name == "best", encoded.nbytes)
-
-
 #: By stage: what the time is of, what the error is, and what measures it.
 STAGES: dict[str, tuple[str, str, Callable[[Workload], Iterator[Row]]]] = {
     "project": ("a view's projection", "largest error of a centre, pixels", rasterizer_rows),
@@ -388,12 +347,10 @@ STAGES: dict[str, tuple[str, str, Callable[[Workload], Iterator[Row]]]] = {
     "sort": ("a view's depth sort", "intersections out of order", rasterizer_rows),
     "composite": ("a view's compositing", "largest error of a pixel", rasterizer_rows),
     "removal": ("a sweep over all tiles of a view", "median relative error of ΔMSE", removal_rows),
-    "prune": ("the schedule", "RMS error on test views at equal counts", prune_rows),
     "ridge": ("the kernel, a million splats", "colour error above the optimum, 99.99th percentile", ridge_rows),
     "re-fit": ("the solver", "RMS error on training views", refit_rows),
     "code": ("coding without looking at views", "bytes", code_rows),
     "decode": ("decoding", "bytes", code_rows),
-    "encode": ("the whole encode", "RMS error on test views", encode_rows),
 }
 
 

@@ -23,9 +23,11 @@ from numpy.typing import NDArray
 
 from potr_cl.formats import load_scene
 from potr_cl.model.camera import Camera
+from potr_cl.model.quaternions import quaternions_of
 from potr_cl.model.scene import Scene, joined
 from tests.reference.captures import looking
 from tests.reference.frames import moved
+from tools.make.city import of_size
 from tools.workloads import camera_entry
 
 F64 = NDArray[np.float64]
@@ -181,14 +183,8 @@ def _textured(points: F64, seed: int) -> F64:
 def _splats(means: F64, scales: F64, quaternions: F64, opacities: F64, colours: F64) -> Scene:
     logits = np.log(opacities / (1 - opacities))
     sh = ((colours - 0.5) / _SH0)[:, None]
-    single = np.float32
-    return Scene(
-        means.astype(single),
-        np.log(scales).astype(single),
-        quaternions.astype(single),
-        logits.astype(single),
-        sh.astype(single),
-    )
+    parameters = means, np.log(scales), quaternions, logits, sh
+    return Scene(*(each.astype(np.float32) for each in parameters))
 
 
 def _panel(rng: np.random.Generator, corner: F64, along: F64, across: F64, seed: int, spacing: float) -> Scene:
@@ -203,16 +199,12 @@ def _panel(rng: np.random.Generator, corner: F64, along: F64, across: F64, seed:
     scales = np.column_stack([sizes, np.full(count, 0.1 * spacing)])
     colours = _textured(place * lengths, seed) + rng.normal(0, 0.03, (count, 3))
     return _splats(
-        means, scales, np.tile(_quaternion(axes), (count, 1)), rng.beta(4, 1.2, count).clip(0.02, 0.99), colours
+        means,
+        scales,
+        np.tile(quaternions_of(axes.T[None]), (count, 1)),
+        rng.beta(4, 1.2, count).clip(0.02, 0.99),
+        colours,
     )
-
-
-def _quaternion(axes: F64) -> F64:
-    """Of the rotation that has these axes for columns, w first."""
-    from potr_cl.model.quaternions import quaternions_of
-
-    found: F64 = quaternions_of(axes.T[None])[0]
-    return found
 
 
 def _cloud(rng: np.random.Generator, middle: F64, radius: float, colour: F64, count: int) -> Scene:
@@ -267,7 +259,9 @@ def build(kind: str, things: Sequence[Scene], splats: int, views: int, degree: i
     coefficients = (degree + 1) ** 2
     parts = [_of_degree(part, coefficients) for part in parts]
     cameras = [
-        dataclasses.replace(_sized(looking(at, ahead, name=f"{kind}_{number:03d}", wide=0.75)), split="test")
+        dataclasses.replace(
+            of_size(looking(at, ahead, name=f"{kind}_{number:03d}", wide=0.75), 1080, 720), split="test"
+        )
         for number, (at, ahead) in enumerate(place.spots)
     ]
     return joined(parts), cameras
@@ -278,13 +272,6 @@ def _of_degree(scene: Scene, coefficients: int) -> Scene:
     shared = min(coefficients, scene.sh.shape[1])
     sh[:, :shared] = scene.sh[:, :shared]
     return dataclasses.replace(scene, sh=sh)
-
-
-def _sized(camera: Camera, width: int = 1080, height: int = 720) -> Camera:
-    factor = width / camera.width
-    return dataclasses.replace(
-        camera, width=width, height=height, fx=camera.fx * factor, fy=camera.fy * factor, cx=width / 2, cy=height / 2
-    )
 
 
 def main() -> None:

@@ -40,7 +40,6 @@ from tools.stress.cases import (
     small_scenes,
 )
 from tools.stress.measures import (
-    GPU_ONLY,
     LIMIT,
     PROMISES,
     WHAT,
@@ -86,11 +85,11 @@ def run_device(device: Device, examples: int, only: str = "") -> dict[str, Any]:
         measure: (view, small_scenes()) for measure in WHAT
     }
     searches["ridge"] = system, ridge_systems()
-    for measure in ("re-fit: optimum", "re-fit: loss", "same bits: slices"):
+    for measure in ("re-fit: optimum", "re-fit: loss"):
         searches[measure] = problem, refit_problems()
     failures = {}
     for measure, (run, strategy) in searches.items():
-        if not measure.startswith(beginnings) or (measure in GPU_ONLY and device.family != "gpu"):
+        if not measure.startswith(beginnings):
             continue
         if examples:
             search(measure, strategy, run, worst, examples)
