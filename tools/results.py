@@ -81,13 +81,11 @@ class Column:
         unit: of its numbers; stands in the head too.
         format: how a number is written, as in ".2f"; for several numbers in a cell a text with a field for each, as in
             "{:.2f} / {:.2f}".
-        default: what a cell shows if it is of the package's default (tools.make.benchmark_results).
     """
 
     name: str
     unit: str = ""
     format: str = ""
-    default: str = ""
 
     @staticmethod
     def of(text: str) -> list[Column]:

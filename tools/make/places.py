@@ -183,8 +183,9 @@ def _textured(points: F64, seed: int) -> F64:
 def _splats(means: F64, scales: F64, quaternions: F64, opacities: F64, colours: F64) -> Scene:
     logits = np.log(opacities / (1 - opacities))
     sh = ((colours - 0.5) / _SH0)[:, None]
-    parameters = means, np.log(scales), quaternions, logits, sh
-    return Scene(*(each.astype(np.float32) for each in parameters))
+    single = np.float32
+    shapes = means.astype(single), np.log(scales).astype(single), quaternions.astype(single)
+    return Scene(*shapes, logits.astype(single), sh.astype(single))
 
 
 def _panel(rng: np.random.Generator, corner: F64, along: F64, across: F64, seed: int, spacing: float) -> Scene:

@@ -1,9 +1,8 @@
 """Other roads to the same result, at their worst (:func:`check_roads`): a part of tools.stress.run.
 
-A file whose values are spread over a device's memory must give the bits that the host gives, whatever the scene is; what
-is told to be seen must be so. (The tests hold that other roads of large scenes give the same bits as the plain one.)
-And the fit's steps, with the choice
-of coefficients and the roundings after them, may leave nothing that is not finite, and no worse scene than they got.
+A file whose values are spread over a device's memory must give the bits that the host gives, and what is told to be
+seen must be so. (The tests hold that other roads of large scenes give the same bits.) And the fit's steps, with the
+choice of coefficients and the roundings after them, may leave nothing that is not finite, and no worse scene.
 """
 
 from __future__ import annotations

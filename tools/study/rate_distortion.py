@@ -240,10 +240,9 @@ def keep_tables(measured: dict[str, Any], path: Path | None) -> None:
         table = results.table(
             name,
             f"Size and quality of {name} by preset and quality, all test views",
-            Column("preset", default="{preset}"), Column("q", default="{quality:g}"),
-            "splats||,; size|MB|.3f; times smaller||.1f; bytes a splat||.2f; PSNR against uncompressed|dB|.2f; "
-            "SSIM against uncompressed||.4f; PSNR against photographs|dB|.2f; SSIM against photographs||.4f; "
-            "lost|dB|.2f",
+            "preset; q; splats||,; size|MB|.3f; times smaller||.1f; bytes a splat||.2f; "
+            "PSNR against uncompressed|dB|.2f; SSIM against uncompressed||.4f; "
+            "PSNR against photographs|dB|.2f; SSIM against photographs||.4f; lost|dB|.2f",
         )  # fmt: skip
         for series, curve in entry["series"].items():
             for p in curve["encodes"]:
@@ -262,9 +261,8 @@ def keep_tables(measured: dict[str, Any], path: Path | None) -> None:
     table = results.table(
         "stages",
         "Whole encodes at quality 0.5, stage by stage, in a process that has encoded before",
-        "scene", Column("preset", default="{preset}"),
-        "splats kept||,; bytes||,; times smaller than the PLY||.1f; PSNR against the uncompressed renders|dB|.2f; "
-        "lost on the photographs|dB|.2f",
+        "scene; preset; splats kept||,; bytes||,; times smaller than the PLY||.1f; "
+        "PSNR against the uncompressed renders|dB|.2f; lost on the photographs|dB|.2f",
         *(Column(stage, "s", ".2f") for stage in _STAGES),
         "in all|s|.2f",
     )  # fmt: skip
