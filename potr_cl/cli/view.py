@@ -20,7 +20,7 @@ def _view(args: argparse.Namespace) -> None:
         truth=args.truth, host=args.host, port=args.port, browser=args.browser and _has_screen(), device=args.device,
         rules=args.rules, background=args.background, trust=args.trust, antialiased=ANTIALIASED[args.antialiased],
     ) as viewer:  # fmt: skip
-        say_done(f"{viewer.url} shows it; Ctrl-C ends it")
+        say_done(f"viewer: {viewer.url} (Ctrl-C to stop)")
         if args.host != HOST:
             note("warning: whoever reaches this machine can open the page: it has no password", "warning")
         viewer.wait()

@@ -97,7 +97,7 @@ class LeftOut:
 
     def __str__(self) -> str:
         more = "".join(f"; {each}" for each in (self.files, self.photographs) if each is not None)
-        return f"the fit was left out: {self.why}{more}"
+        return f"no fit: {self.why}{more}"
 
 
 def _steps(text: str) -> int | Literal["auto"]:

@@ -185,7 +185,7 @@ def tell_of_lenses(path: Path, cameras: Sequence[Camera]) -> None:
     widest = 2 * math.degrees(MOST_HALF_FIELD)
     beyond = f"; of {cut} the edges are left out, beyond {widest:.0f} degrees or what the lens's formula describes"
     _log.warning(
-        "'%s': %d of %d views have lens distortion: pinhole views that cover the same field stand for them%s",
+        "'%s': %d of %d views have lens distortion: replaced by pinhole views that cover the same area%s",
         path, len(lenses), len(cameras), beyond if cut else "",
     )  # fmt: skip
 
