@@ -220,7 +220,7 @@ def upper_centres(count: int, distance: float) -> np.ndarray:
     return distance * centres / np.linalg.norm(centres, axis=1, keepdims=True)
 
 
-@pytest.mark.parametrize("degree", [pytest.param(2, marks=pytest.mark.slow), 3])
+@pytest.mark.parametrize("degree", [2, 3])
 def test_colours_tell_the_side_that_was_photographed(around_ball, degree):
     centres = camera_centres(placed(trained(BALL, BALL.means, upper_centres(60, 3), degree)))
     elevation = np.degrees(np.arcsin(centres[:, 2] / np.linalg.norm(centres, axis=1)))
@@ -254,14 +254,11 @@ UP = np.tile([0.0, 0, 1], (300, 1))
 PLANE = np.random.default_rng(6).uniform(-1, 1, (300, 3)) * [1, 1, 0]
 DEGENERATE = {
     "one splat": BALL.subset(np.arange(1)),
-    "two splats": BALL.subset(np.arange(2)),
     "all coincident": BALL.subset(np.zeros(50, int)),
     "coincident points": flat_splats(np.zeros((300, 3)), UP, 1e-30),
     "line": flat_splats(LINE, UP, 0.01),
     "plane": flat_splats(PLANE, UP, 0.05),
     "tiny units": scaled(BALL, 1e-6),
-    "small units": scaled(BALL, 0.02),
-    "minute units": scaled(BALL, 1e-4),
     "huge units": scaled(BALL, 1e9),
     "far from the origin": dataclasses.replace(BALL, means=BALL.means + np.float32(1e5)),
     "transparent": dataclasses.replace(BALL, opacity_logits=BALL.opacity_logits - 60),
