@@ -38,7 +38,7 @@ def views_of(kind, cameras, scene):
     return train_views(cameras)[: int(kind)]
 
 
-@pytest.mark.parametrize("kind", ["8", pytest.param("2", marks=pytest.mark.slow), "1", "virtual"])
+@pytest.mark.parametrize("kind", ["8", "1", "virtual"])
 def test_a_fit_that_is_left_out_says_why_and_changes_nothing(device, plush_excerpt, plush_excerpt_cameras, kind):
     """As that of an excerpt is, whose splats are few and worth much."""
     views = views_of(kind, plush_excerpt_cameras, plush_excerpt)

@@ -55,9 +55,8 @@ def to_46_db(device, plush_excerpt, cameras):
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("size", [18_000, pytest.param(24_000, marks=pytest.mark.slow)])
-def test_a_size_is_filled_and_not_passed(device, plush_excerpt, cameras, size, preset):
-    lines = []
+def test_a_size_is_filled_and_not_passed(device, plush_excerpt, cameras, preset):
+    size, lines = 18_000, []
     options = EncodeOptions.for_preset(preset, prune={"iterations": 6})
     if options.fit.asked_for:
         options = options.changed(fit={"steps": 20})
@@ -83,9 +82,7 @@ class HalfOpaque(Stage):
         return dataclasses.replace(state, scene=scene, geometry=None)
 
 
-@pytest.mark.parametrize(
-    "place", [pytest.param(0, marks=pytest.mark.slow), pytest.param(-2, marks=pytest.mark.slow), -1]
-)
+@pytest.mark.parametrize("place", [pytest.param(0, marks=pytest.mark.slow), -1])
 def test_a_stage_of_ones_own_takes_part_in_a_search_as_in_an_encode(device, plush_excerpt, cameras, place):
     stages = list(EncodeOptions.for_preset("best", prune={"iterations": 4}, refit={"steps": 3}).stages)
     stages.insert(place, HalfOpaque())
@@ -120,11 +117,9 @@ def test_a_psnr_is_reached_with_little_to_spare(device, plush_excerpt, cameras, 
 @pytest.mark.parametrize(
     ("preset", "target"),
     [
-        pytest.param("best", Target(max_bytes=17_000), marks=pytest.mark.slow),
         ("best", Target(max_bytes=22_000)),
         pytest.param("best", Target(max_bytes=28_000), marks=pytest.mark.slow),
         pytest.param("fast", Target(min_psnr=46), marks=pytest.mark.slow),
-        pytest.param("fast", Target(min_psnr=49), marks=pytest.mark.slow),
     ],
 )
 def test_what_is_found_is_what_a_plain_encode_makes(device, plush_excerpt, cameras, preset, target):
