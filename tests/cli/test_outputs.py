@@ -89,15 +89,14 @@ def test_refused_in_one_line_before_any_work(
     assert sorted(folder.rglob("*")) == before
 
 
-@pytest.mark.parametrize("suffix", [".spz", ".PLY", ".compressed.ply"])
 @pytest.mark.parametrize(
-    "command",
+    ("command", "suffix"),
     [
-        "decode a.potr -o",
-        "convert a.ply",
-        pytest.param("prune a.ply --iterations 2 --virtual-views 8 -o", marks=pytest.mark.slow),
-        "compact a.ply --virtual-views 8 -o",
-        pytest.param("refit a.ply --reference a.ply --steps 1 --virtual-views 8 -o", marks=pytest.mark.slow),
+        *(("convert a.ply", suffix) for suffix in (".spz", ".PLY", ".compressed.ply")),
+        ("decode a.potr -o", ".spz"),
+        ("prune a.ply --iterations 2 --virtual-views 8 -o", ".PLY"),
+        ("compact a.ply --virtual-views 8 -o", ".compressed.ply"),
+        ("refit a.ply --reference a.ply --steps 1 --virtual-views 8 -o", ".spz"),
     ],
 )
 def test_a_scene_is_written_as_its_name_says(folder: Path, command: str, suffix: str) -> None:

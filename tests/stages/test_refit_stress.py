@@ -184,7 +184,7 @@ def test_views_of_different_sizes(device):
 
 @pytest.mark.one_runtime
 @pytest.mark.parametrize(
-    "count", [20_000, pytest.param(1_000_000, marks=pytest.mark.slow)]
+    "count", [20_000, pytest.param(400_000, marks=[pytest.mark.slow, pytest.mark.one_family])]
 )  # fmt: skip
 def test_overlapping_splats_on_one_pixel_column(device, count):
     rng = np.random.default_rng(0)

@@ -95,9 +95,7 @@ def expected(scene, cameras, device):
     return encode(scene, cameras, OPTIONS, device=device).data
 
 
-@pytest.mark.parametrize(
-    "workers", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("workers", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_the_same_bytes(workers, scene, cameras, device, expected):
     with local_cluster(workers) as cluster:
         with ClusterPool(cluster.scheduler_address, device) as pool:
@@ -281,8 +279,7 @@ def processes_of_a_cluster(workers, without=None, env=None, more=0):
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="sends a signal")
-@pytest.mark.parametrize("lost", ["scheduler", "workers"])
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize(("lost", "how"), [("scheduler", signal.SIGSTOP), ("workers", signal.SIGKILL)])
 def test_what_is_printed_when_the_cluster_is_gone(lost, how, tmp_path, data):
     """One line that says so, and that this computer goes on; none of Dask's own."""
     output = tmp_path / "out.potr"

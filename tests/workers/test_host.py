@@ -56,7 +56,7 @@ def few(cameras, size=80):
 
 
 #: Ways of :func:`test_the_same_bytes` that are tried in the quick subset: each family once.
-QUICK = {("cpu", "nothing is kept of any view", 3), ("gpu", "a GPU decides itself", 3)}
+QUICK = {("cpu", "nothing is kept of any view"), ("gpu", "a GPU decides itself")}
 
 
 @pytest.fixture(scope="module", params=FAMILIES)
@@ -65,11 +65,10 @@ def family(request):
 
 
 @pytest.mark.parametrize(
-    ("family", "options", "count"),
+    ("family", "options"),
     [
-        pytest.param(family, options, count, marks=() if (family, name, count) in QUICK else pytest.mark.slow)
+        pytest.param(family, options, marks=() if (family, name) in QUICK else pytest.mark.slow)
         for family in FAMILIES
-        for count in (2, 3)
         for name, options in {
             "by number": OPTIONS,
             "nothing is kept of any view": OPTIONS.changed(memory=0),
@@ -77,8 +76,8 @@ def family(request):
         }.items()
     ],
 )
-def test_the_same_bytes(plush_excerpt, plush_excerpt_cameras, family, options, count):
-    cameras = few(plush_excerpt_cameras)
+def test_the_same_bytes(plush_excerpt, plush_excerpt_cameras, family, options):
+    count, cameras = 3, few(plush_excerpt_cameras)
     alone = open_device(family)
     expected = encode(plush_excerpt, cameras, options, device=alone)
     assert expected.shared is None
@@ -93,10 +92,8 @@ def test_the_same_bytes(plush_excerpt, plush_excerpt_cameras, family, options, c
     assert [device.allocated for device in devices] == [0] * count
 
 
-@pytest.mark.parametrize("count", [pytest.param(2, marks=pytest.mark.slow), 4])
-def test_steps_by_a_part_of_the_views_give_the_same_bytes(
-    plush_excerpt, plush_excerpt_cameras, family, count, monkeypatch
-):
+@pytest.mark.one_family
+def test_steps_by_a_part_of_the_views_give_the_same_bytes(plush_excerpt, plush_excerpt_cameras, family, monkeypatch):
     """Every device knows which of its views these are, and whether there are any."""
     cameras = few(plush_excerpt_cameras)
     options = OPTIONS.changed(prune={"iterations": 2}, compact=False)
@@ -104,7 +101,7 @@ def test_steps_by_a_part_of_the_views_give_the_same_bytes(
     monkeypatch.setattr("potr_cl.stages.refitting.colour_map.ENOUGH", 2)
     expected = encode(plush_excerpt, cameras, options, device=open_device(family)).data
     assert expected != every
-    devices = [open_device(family) for _ in range(count)]
+    devices = [open_device(family) for _ in range(4)]
     with HostPool(devices) as pool:
         assert encode(plush_excerpt, cameras, options, device=devices[0], pool=pool).data == expected
 

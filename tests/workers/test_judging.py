@@ -140,6 +140,7 @@ def test_views_of_the_same_name(plush_excerpt, cameras, coded, family):
     assert [device.allocated, another.allocated] == [0, 0]
 
 
+@pytest.mark.one_family
 @pytest.mark.parametrize("kind", [HostPool, ElsewherePool])
 @pytest.mark.parametrize("command", ["__init__", "take", "figures"])
 @pytest.mark.parametrize("lost", ["one", "all"])
