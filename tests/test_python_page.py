@@ -84,8 +84,9 @@ def test_a_notebook_runs_in_jupyter(notebook, clone, monkeypatch):
 
 
 def scenes_shown(document) -> list[str]:
-    """What cells show of scenes, which does not depend on the device."""
-    texts = [text for cell in document.cells for output in cell.get("outputs", []) for text in texts_of(output)]
+    """Scenes that are a cell's last expression, which are read and do not depend on the device."""
+    outputs = [output for cell in document.cells for output in cell.get("outputs", [])]
+    texts = ["".join(output.get("data", {}).get("text/plain", [])) for output in outputs]
     return [text for text in texts if text.startswith("Scene(")]
 
 

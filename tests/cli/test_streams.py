@@ -107,7 +107,7 @@ def test_one_command_feeds_another(folder: Path) -> None:
 def test_what_cannot_be(
     folder: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
+    capsys: pytest.CaptureFixture[str],
     call: str,
     source: bytes,
     code: int,
@@ -116,7 +116,7 @@ def test_what_cannot_be(
     monkeypatch.chdir(folder)
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(source)))
     assert cli.main(call.split()) == code
-    out, err = capfd.readouterr()
+    out, err = capsys.readouterr()
     assert said.replace("':", ":") in err
     assert err.startswith("potr-cl: ")
     assert err.count("\n") == 1
