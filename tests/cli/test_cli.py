@@ -99,6 +99,7 @@ def test_bad_cameras(tmp_path, scene_path, capsys):
     assert not (tmp_path / "a.potr").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="needs resource limits")
 def test_disk_full(tmp_path, scene_path, potr_path):
     """A file size limit stands for a full disk: the write fails in the middle."""
@@ -119,6 +120,7 @@ def test_disk_full(tmp_path, scene_path, potr_path):
         assert sorted(p.name for p in tmp_path.iterdir()) == ["scene.ply", "scene.potr"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="needs POSIX permissions")
 def test_no_permission(scene_path):
     with tempfile.TemporaryDirectory() as folder:  # not tmp_path, which nobody else may even enter

@@ -85,6 +85,7 @@ def test_compact(tmp_path, scene_path, capsys):
     assert np.abs(compacted.sh[:, 1:]).sum() < np.abs(scene.sh[:, 1:]).sum()
 
 
+@pytest.mark.slow
 def test_each_part_of_compaction_can_be_left_out(tmp_path, scene_path):
     cameras = cameras_json(tmp_path / "cameras.json")
     choices = ([], ["--colour-model", "rgb"], ["--weighting", "visibility"], ["--one-pass"], ["--alpha", "1"])

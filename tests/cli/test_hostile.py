@@ -188,6 +188,7 @@ def test_names_that_cannot_be(
     assert sorted(path.name for path in tmp_path.iterdir() if path.name != "new") == ["loop.ply", "scene.ply"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform in ("darwin", "win32"), reason="names are Unicode there")
 def test_a_name_that_is_not_utf_8(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

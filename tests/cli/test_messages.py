@@ -94,6 +94,7 @@ def test_every_argument_has_help_and_every_command_can_be_quiet(name):
 # How much is said
 
 
+@pytest.mark.slow
 def test_quiet_says_nothing_but_what_was_asked_for(encode, capsys):
     assert called(capsys, *encode, "--quiet") == (0, "", "")
     code, out, err = called(capsys, "info", encode[5], "--quiet")
@@ -106,6 +107,7 @@ def test_quiet_says_nothing_but_what_was_asked_for(encode, capsys):
     assert (code, out, err.count("\n")) == (2, "", 1)
 
 
+@pytest.mark.slow
 def test_verbose_says_more(encode, capsys):
     _, _, normal = called(capsys, *encode)
     _, _, verbose = called(capsys, *encode, "--verbose")
@@ -142,6 +144,7 @@ def test_a_long_stage_says_how_long_it_will_go_on(capsys, monkeypatch):
     assert capsys.readouterr().err.splitlines() == ["a …", "a: about 36 s left", "b …"]
 
 
+@pytest.mark.slow
 def test_what_takes_long_to_read_is_named(encode, capsys, monkeypatch):
     _, _, err = called(capsys, *encode)
     assert "reading" not in err
@@ -153,6 +156,7 @@ def test_what_takes_long_to_read_is_named(encode, capsys, monkeypatch):
 # Progress
 
 
+@pytest.mark.slow
 def test_a_stage_is_told_once_in_a_log(encode, capsys):
     _, _, err = called(capsys, *encode, "--max-size", "20k")
     lines = err.splitlines()
@@ -266,6 +270,7 @@ def test_help_has_no_escapes_in_any_version_of_python(monkeypatch, capsys):
     assert "x1b" not in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_terminal_gets_a_bar(encode):
     written = on_a_terminal(*encode)
     assert "elapsed" in written

@@ -89,6 +89,7 @@ def test_refused_in_one_line_before_any_work(
     assert sorted(folder.rglob("*")) == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "suffix"),
     [

@@ -157,6 +157,7 @@ def replace_somewhere(draw: st.DataObject, value: Any) -> Any:
     return copy
 
 
+@pytest.mark.slow
 @warnings_are_errors
 @pytest.mark.parametrize("content", [[view(), view(img_name="b", split="test")], nerfstudio(["a.png", "b.png"])])
 @given(draw=st.data())

@@ -48,6 +48,7 @@ def test_wrong_frames_of_the_excerpt_without_directions_are_found(plush_excerpt,
         assert judge_cameras(other, cameras).suspicious, what
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degree", [3, 0])
 def test_no_right_cameras_of_the_excerpt_are_refused(plush_excerpt, plush_excerpt_cameras, degree):
     scene = plush_excerpt if degree else without_directions(plush_excerpt)

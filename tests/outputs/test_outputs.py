@@ -115,6 +115,7 @@ def test_fixed_coefficients_are_those_of_the_file(output):
     assert not sh[:, seen.shape[1] :].any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("output", OTHERS, ids=name)
 def test_bytes_do_not_depend_on_threads(output):
     scene = random_scene(20_000, 2)
@@ -148,6 +149,7 @@ def test_constant_colours_make_up_for_coarse_coefficients(plush_excerpt, plush_e
     assert figures[1] > figures[0] + 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".spz", ".compressed.ply"])
 def test_a_size_is_met(suffix, plush_excerpt, plush_excerpt_cameras, device):
     goal = {".spz": 40_000, ".compressed.ply": 84_000}[suffix]
@@ -157,6 +159,7 @@ def test_a_size_is_met(suffix, plush_excerpt, plush_excerpt_cameras, device):
     assert 0.9 * goal < encoded.nbytes <= goal
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("suffix", "least"), [(".spz", 48), (".compressed.ply", 62)])
 def test_a_psnr_is_met(suffix, least, plush_excerpt, plush_excerpt_cameras, device):
     encoded = potr_cl.encode(
@@ -220,6 +223,7 @@ def test_degrees_that_are_left_out_are_told_once(plush_excerpt, plush_excerpt_ca
     assert "of degree 3:" in said
 
 
+@pytest.mark.slow
 def test_what_a_format_cannot_hold_is_said_once(plush_excerpt, plush_excerpt_cameras, device, caplog):
     scene = dataclasses.replace(antialiased(plush_excerpt), low_pass=MIP_SPLATTING_LOW_PASS)
     with caplog.at_level(logging.WARNING, "potr_cl"):

@@ -84,6 +84,7 @@ def test_far_splats_are_rounded_more(plush_excerpt):
     assert errors[::2].mean() > 10 * errors[1::2].mean()
 
 
+@pytest.mark.slow
 def test_a_higher_quality_is_larger_and_better(tmp_path, plush_excerpt, plush_excerpt_cameras, usual):
     sizes, psnrs = [], []
     with Evaluator(usual, plush_excerpt, EvaluationViews.of(plush_excerpt_cameras), (0, 0, 0)) as evaluator:

@@ -83,6 +83,7 @@ def test_without_room_to_compare_files_the_fit_judges_itself(judged, plush_excer
     assert made.fitted.files is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("threshold", "doubt"), [(1e-8, True), (3e-7, False)])
 def test_files_are_made_where_the_gain_is_in_doubt(judged, plush_excerpt_cameras, threshold, doubt):
     """And only there: they take time. What they have said is told."""

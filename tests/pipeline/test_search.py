@@ -54,6 +54,7 @@ def to_46_db(device, plush_excerpt, cameras):
     return found, lines
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", PRESETS)
 def test_a_size_is_filled_and_not_passed(device, plush_excerpt, cameras, preset):
     size, lines = 18_000, []
@@ -82,6 +83,7 @@ class HalfOpaque(Stage):
         return dataclasses.replace(state, scene=scene, geometry=None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", [pytest.param(0, marks=pytest.mark.slow), -1])
 def test_a_stage_of_ones_own_takes_part_in_a_search_as_in_an_encode(device, plush_excerpt, cameras, place):
     stages = list(EncodeOptions.for_preset("best", prune={"iterations": 4}, refit={"steps": 3}).stages)
@@ -114,6 +116,7 @@ def test_a_psnr_is_reached_with_little_to_spare(device, plush_excerpt, cameras, 
     assert found.value == pytest.approx(reached)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("preset", "target"),
     [
@@ -137,6 +140,7 @@ def test_what_is_found_is_what_a_plain_encode_makes(device, plush_excerpt, camer
     assert max(colours) == pytest.approx(min(colours))
 
 
+@pytest.mark.slow
 def test_a_rough_encode_comes_first_where_it_saves_time(device, plush_excerpt, cameras):
     target = Target(max_bytes=20_000)
     for options, first in (
@@ -233,6 +237,7 @@ def test_nothing_to_see(device):
     assert found.value == 200
 
 
+@pytest.mark.slow
 def test_colours_may_be_fitted_to_ground_truth(device, plush_excerpt, cameras, tmp_path):
     """Which sets a bound to the PSNR against the renders that no quality passes."""
     with Rasterizer(device, dataclasses.replace(plush_excerpt, sh=plush_excerpt.sh * np.float32(0.9))) as shown:
@@ -249,6 +254,7 @@ def test_colours_may_be_fitted_to_ground_truth(device, plush_excerpt, cameras, t
         encode_to_target(plush_excerpt, cameras, Target(min_psnr=55), options, device=device)
 
 
+@pytest.mark.slow
 def test_a_cpu_takes_over(plush_excerpt, cameras, caplog):
     """From a device whose memory does not hold the scene's views."""
     skip_without_cpu()

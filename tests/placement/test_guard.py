@@ -83,6 +83,7 @@ def kept(device: Device, unseen: str, **changes) -> State:
     return run.stages(State.of(two_rooms(), in_the_first()), names)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["best", pytest.param("paper", marks=pytest.mark.slow)])
 def test_no_stage_touches_what_no_view_resolved(device, preset):
     scene = two_rooms()
@@ -98,6 +99,7 @@ def test_no_stage_touches_what_no_view_resolved(device, preset):
     assert state.learnt[UNRESOLVED].splats == state.learnt["unseen"].splats == np.count_nonzero(found)
 
 
+@pytest.mark.slow
 def test_without_the_guard_they_are_lost(device):
     dropped = kept(device, "drop")
     assert np.count_nonzero(dropped.survivors >= _EACH) < 50
@@ -106,6 +108,7 @@ def test_without_the_guard_they_are_lost(device):
     assert np.count_nonzero(plain.survivors >= _EACH) < _EACH / 2
 
 
+@pytest.mark.slow
 def test_small_units_do_not_keep_everything(device):
     ball = sphere(8000, 2.0, 0.05)
     small = dataclasses.replace(
@@ -119,6 +122,7 @@ def test_fewer_splats_than_must_stay_are_refused(device):
         kept(device, "protect", prune_count=100)
 
 
+@pytest.mark.slow
 def test_a_file_holds_what_was_kept(device):
     encoded = encode(two_rooms(), in_the_first(), dataclasses.replace(options("protect"), q=0.5), device=device)
     assert np.count_nonzero(encoded.order >= _EACH) == _EACH

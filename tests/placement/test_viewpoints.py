@@ -138,6 +138,7 @@ def test_one_splat_can_be_looked_at():
     assert seen(dataclasses.replace(scene, opacity_logits=np.full(1, 5, np.float32)), view) == 1
 
 
+@pytest.mark.slow
 def test_the_same_scene_gives_the_same_views():
     for make in (look_around, lambda scene: turntable(scene, 4)):
         first = make(house())

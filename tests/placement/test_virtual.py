@@ -131,6 +131,7 @@ def test_large_scenes_get_more_views_and_cpus_fewer_and_smaller_ones():
         assert plan(splats, slow=True).pixels < plan(splats).pixels
 
 
+@pytest.mark.slow
 def test_judges_stand_elsewhere_and_fewer_are_the_first_of_more(around_ball):
     tests = test_views(around_ball)
     apart = np.linalg.norm(camera_centres(tests)[:, None] - camera_centres(train_views(around_ball)), axis=2)
@@ -181,6 +182,7 @@ def test_clutter_does_not_draw_the_views_away(clutter):
     assert np.mean(np.linalg.norm(camera_centres(outside), axis=1) < 12) > 0.4
 
 
+@pytest.mark.slow
 def test_no_camera_stands_in_matter():
     scene = together(BALL, floaters(4000, 2))
     centres = camera_centres(placed(scene))
@@ -220,6 +222,7 @@ def upper_centres(count: int, distance: float) -> np.ndarray:
     return distance * centres / np.linalg.norm(centres, axis=1, keepdims=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degree", [2, 3])
 def test_colours_tell_the_side_that_was_photographed(around_ball, degree):
     centres = camera_centres(placed(trained(BALL, BALL.means, upper_centres(60, 3), degree)))
@@ -294,6 +297,7 @@ def test_the_basis_is_that_of_the_rasterizer():
     assert np.allclose(ac_basis(directions), sh_basis(directions, 3)[:, 1:], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_encode_places_them_itself(monkeypatch):
     monkeypatch.setattr("potr_cl.pipeline.encode.place_cameras", lambda scene, device: place_cameras(scene, 6, 64))
     scene, options = random_scene(150, 2), EncodeOptions.for_preset("paper", prune={"iterations": 2})
@@ -302,6 +306,7 @@ def test_encode_places_them_itself(monkeypatch):
     assert given.pruned is not None
 
 
+@pytest.mark.slow
 def test_lego_is_looked_at_from_above(lego):
     scene = load_scene(lego / "point_cloud.ply")
     centres = camera_centres(placed(scene))

@@ -45,6 +45,7 @@ def building(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scene, list[Came
     return scene, views
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "motion", ["scaled by 0.7", "scaled by 2", "shifted by 3 along x", "turned by 20 degrees about y"]
 )

@@ -97,6 +97,7 @@ def test_views_that_show_nothing_tell_nothing(plush_excerpt, plush_excerpt_camer
     assert GivenViews(plush_excerpt, [away, away]).part_of_views() is None
 
 
+@pytest.mark.slow
 def test_copies_keep_about_as_many_splats_as_one(device, plush_excerpt, plush_excerpt_cameras, twelve, weighed):
     alone = len(encoded(device, plush_excerpt, train_views(plush_excerpt_cameras)).order)
     scene, cameras = twelve

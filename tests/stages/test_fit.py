@@ -73,6 +73,7 @@ def test_views_that_judge_find_the_mean_squared_error(device):
         assert found == pytest.approx(mean_error(device, targets, scene, [cameras[k] for k in held_out]), rel=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "only",
     [*(pytest.param((name,), marks=pytest.mark.one_family) for name in PARAMETERS), PARAMETERS],

@@ -181,6 +181,7 @@ def test_a_view_that_sees_nothing(device, picked):
     assert np.array_equal(errors[0][1], errors[1][1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("slices", "way"),
     [
@@ -248,6 +249,7 @@ def test_little_memory_is_enough(device, picked, part, monkeypatch):
     assert same(*results)
 
 
+@pytest.mark.slow
 def test_the_same_file(device, picked):
     """Of a whole encode, on one device and on two."""
     scene, cameras = crowded(400)

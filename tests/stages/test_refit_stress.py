@@ -144,6 +144,7 @@ def test_a_strong_pull_to_zero_is_no_better_than_what_it_costs(case):
     solve_and_check(case, RefitOptions(steps=20, gain=0, prior=1e12))
 
 
+@pytest.mark.slow
 def test_absurd_coefficients(device):
     for where in ["dc", "ac", "both"]:
         for value in [1e4, 1e10, 1e30, 3e38]:

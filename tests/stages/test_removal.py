@@ -66,6 +66,7 @@ def sweep(device, scene, cameras, tolerance=0.0, background=(0.0, 0.0, 0.0)):
         yield removal
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("background", [pytest.param((0.0, 0.0, 0.0), marks=pytest.mark.one_family), (1.0, 0.3, 0.0)])
 def test_single_removals(device, background):
     scene = visible_scene(60, 1)

@@ -184,6 +184,7 @@ def test_nobody_waits_for_a_judge_that_stands_still(scene, device, judged, caplo
     assert "continuing on" in caplog.text
 
 
+@pytest.mark.slow
 def test_scenes_are_compared_by_a_cluster(scene, cameras, device, judged, tmp_path):
     coded, _, _ = judged
     (tmp_path / "b.potr").write_bytes(coded.data)
@@ -197,6 +198,7 @@ def test_scenes_are_compared_by_a_cluster(scene, cameras, device, judged, tmp_pa
             ]
 
 
+@pytest.mark.slow
 def test_a_file_that_workers_get_is_read_once(scene, cameras, device, judged, tmp_path, monkeypatch):
     """All judge the same bytes then, whoever writes to the file meanwhile."""
     path, opened, plainly = tmp_path / "b.potr", [], Path.open
@@ -456,6 +458,7 @@ def test_a_cluster_without_workers(device, monkeypatch, caplog):
     assert "the cluster has no worker yet: waiting" in caplog.text
 
 
+@pytest.mark.slow
 def test_workers_may_come_later(scene, cameras, device, expected, monkeypatch, caplog):
     """The first one is waited for; another one gets views from the next stage on."""
     monkeypatch.setattr("potr_cl.workers.cluster._NEW", 0.1)
@@ -469,6 +472,7 @@ def test_workers_may_come_later(scene, cameras, device, expected, monkeypatch, c
             assert encode(scene, cameras, OPTIONS, device=device, pool=pool).data == expected
 
 
+@pytest.mark.slow
 def test_nobody_of_a_computer_is_asked_again_where_one_was_lost_as_it_was_met(device, monkeypatch, caplog):
     monkeypatch.setattr("potr_cl.workers.cluster._NEW", 0.05)
     asked = []
@@ -501,6 +505,7 @@ def test_devices_of_several_kinds_are_told(device, monkeypatch, caplog):
             assert not caplog.text
 
 
+@pytest.mark.slow
 @pytest.mark.skipif("Intel" not in str(choose_device()), reason="only this runtime can be told the instructions")
 def test_other_instructions_under_the_same_name_are_told(device, caplog):
     """As hosts of two generations have; they give other bytes."""

@@ -92,6 +92,7 @@ def test_the_same_bytes(plush_excerpt, plush_excerpt_cameras, family, options):
     assert [device.allocated for device in devices] == [0] * count
 
 
+@pytest.mark.slow
 @pytest.mark.one_family
 def test_steps_by_a_part_of_the_views_give_the_same_bytes(plush_excerpt, plush_excerpt_cameras, family, monkeypatch):
     """Every device knows which of its views these are, and whether there are any."""
@@ -106,6 +107,7 @@ def test_steps_by_a_part_of_the_views_give_the_same_bytes(plush_excerpt, plush_e
         assert encode(plush_excerpt, cameras, options, device=devices[0], pool=pool).data == expected
 
 
+@pytest.mark.slow
 def test_pictures_are_rendered_ahead_by_the_device_that_needs_them(plush_excerpt, plush_excerpt_cameras, monkeypatch):
     """Each its own, before the re-fit asks for any; nobody renders one again; and the bytes are those without."""
     cameras = few(plush_excerpt_cameras)
@@ -182,6 +184,7 @@ def pruned_by_threshold(plush_excerpt, plush_excerpt_cameras):
     return options, encode(plush_excerpt, few(plush_excerpt_cameras), options, device=open_device("gpu")).data
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "command", "call"),
     [
@@ -264,6 +267,7 @@ def test_the_environment_may_name_several(monkeypatch, plush_excerpt, plush_exce
     assert potr_cl.encode(plush_excerpt, few(plush_excerpt_cameras), OPTIONS).nbytes > 0
 
 
+@pytest.mark.slow
 def test_python_takes_several_devices(plush_excerpt, plush_excerpt_cameras):
     cameras = few(plush_excerpt_cameras)
     device = Device()
@@ -286,6 +290,7 @@ def test_a_search_shares_views_out_too(plush_excerpt, plush_excerpt_cameras):
     assert together.shared is not None
 
 
+@pytest.mark.slow
 def test_large_scenes_view_by_view(monkeypatch):
     """Each device looks at its views with what these may draw."""
     scene, cameras = street(5, 900)

@@ -140,6 +140,7 @@ def test_views_of_the_same_name(plush_excerpt, cameras, coded, family):
     assert [device.allocated, another.allocated] == [0, 0]
 
 
+@pytest.mark.slow
 @pytest.mark.one_family
 @pytest.mark.parametrize("kind", [HostPool, ElsewherePool])
 @pytest.mark.parametrize("command", ["__init__", "take", "figures"])
@@ -289,6 +290,7 @@ def test_with_little_memory_a_decoded_file_is_judged_by_what_views_see_too(famil
         assert np.mean(projected) < 0.4 * len(scene)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_small_groups")
 def test_an_encode_leaves_the_groups_that_it_has_found(family, monkeypatch):
     monkeypatch.setattr("potr_cl.stages.pruning.visible_parts.LEAST_SPLATS", 1)
@@ -354,6 +356,7 @@ def test_scenes_are_compared_together(plush_excerpt, cameras, coded, family, mon
     assert [device.allocated for device in devices] == [0] * 2
 
 
+@pytest.mark.slow
 def test_a_ladder_keeps_the_scene_on_the_devices(plush_excerpt, cameras, tmp_path, monkeypatch):
     options = EncodeOptions.for_preset("fast", prune={"iterations": 2}, between=False)
     expected = potr_cl.encode_ladder(plush_excerpt, tmp_path / "alone", "0.2,0.4", cameras, options)
