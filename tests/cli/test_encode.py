@@ -203,17 +203,6 @@ def test_both_entropy_stages(tmp_path, scene_path, capsys):
     capsys.readouterr()
 
 
-def test_encode_prunes(tmp_path, scene_path, capsys):
-    cameras = cameras_json(tmp_path / "cameras.json")
-    potr = tmp_path / "a.potr"
-    arguments = ["encode", scene_path, "-o", potr, "--cameras", cameras, "--iterations", "3", "--memory", "0.00001"]
-    assert cli.main([str(a) for a in [*arguments, "--count", "60"]]) == 0
-    assert "60 of 200, " in capsys.readouterr().out
-    assert cli.main(["info", str(potr), "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
-    assert (report["splats"], report["source_splats"]) == (60, 200)
-
-
 @pytest.mark.slow
 def test_without_cameras_virtual_ones_are_placed(tmp_path, scene_path, capsys):
     potr = tmp_path / "a.potr"

@@ -127,16 +127,6 @@ def test_devices_that_there_are_not(
     assert "no OpenCL device fits" in err
 
 
-def test_a_forgotten_option_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    assert outcome(capsys, ["encode", "i.ply"]) == (
-        2,
-        "",
-        "potr-cl encode: -o OUT.potr (.potr, .spz, .sog, .compressed.ply, .glb or .ply, a folder, "
-        'or "-" for standard output) is missing '
-        "(see potr-cl encode --help)\n",
-    )
-
-
 def calls(name: str, good: str) -> list[list[str]]:
     """A name in every place of every command that takes one, beside good ones."""
     cameras = str(ROOT / "tests" / "data" / "plush_excerpt_cameras.json")
