@@ -101,6 +101,7 @@ def test_refit(tmp_path, scene_path, dimmed_path, cameras_path, capsys):
     assert not load_scene(out).sh[:, 1:].any()
 
 
+@pytest.mark.slow
 def test_refit_to_ground_truth(tmp_path, scene_path, dimmed_path, cameras_path, capsys):
     photos, out = tmp_path / "photos", tmp_path / "out.ply"
     run(capsys, "render", scene_path, "--cameras", cameras_path, "-o", photos, "--background", "white")

@@ -445,6 +445,7 @@ def test_standard_output_is_full(potr_path: Path, arguments: list[str]) -> None:
     assert result.stderr == "potr-cl: cannot write to the standard output: No space left on device\n"
 
 
+@pytest.mark.slow
 @needs_posix
 @pytest.mark.parametrize("closed", ["2> /dev/full", "2>&-", "2>&- <&-"])
 def test_standard_error_is_not_needed(tmp_path: Path, scene_path: Path, closed: str) -> None:

@@ -105,6 +105,7 @@ def test_it_is_smaller_than_the_whole_scene_as_sog(tmp_path, plush_excerpt, plus
     assert 2.5 * encoded.nbytes < (tmp_path / "whole.sog").stat().st_size
 
 
+@pytest.mark.slow
 def test_the_same_bytes_every_time(tmp_path, plush_excerpt, plush_excerpt_cameras, usual):
     first, second = (
         encode(plush_excerpt, plush_excerpt_cameras, q=0.5, output=tmp_path / name, device=usual).data

@@ -97,6 +97,7 @@ def test_what_makes_up_for_splats_rounds_finer(device, plush_excerpt, plush_exce
         assert options.changed(q=q).parameters == options.changed(q=q, fit=False).parameters
 
 
+@pytest.mark.slow
 def test_what_only_fits_rounds_as_q_says(device, plush_excerpt, plush_excerpt_cameras):
     encoded = encode(plush_excerpt, plush_excerpt_cameras, HALF, device=device)
     assert encoded.fitted.spared == 0

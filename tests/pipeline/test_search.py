@@ -95,6 +95,7 @@ def test_a_stage_of_ones_own_takes_part_in_a_search_as_in_an_encode(device, plus
     assert np.median(changes) == pytest.approx(-1, abs=0.1)  # less than the quantiser's steps
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", [Target(max_bytes=24_000), Target(min_psnr=46)])
 def test_colours_may_be_refitted_in_any_preset(device, plush_excerpt, cameras, target):
     options = FEW.changed(compact=False, refit={"steps": 3, "drop": 1e-10})

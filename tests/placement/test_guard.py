@@ -83,7 +83,6 @@ def kept(device: Device, unseen: str, **changes) -> State:
     return run.stages(State.of(two_rooms(), in_the_first()), names)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["best", pytest.param("paper", marks=pytest.mark.slow)])
 def test_no_stage_touches_what_no_view_resolved(device, preset):
     scene = two_rooms()

@@ -94,6 +94,7 @@ def test_views_are_level(views, up):
         assert np.linalg.det(camera.rotation) == pytest.approx(1)
 
 
+@pytest.mark.slow
 def test_levelling_moves_no_camera():
     scene = house()
     placed = judging_views(scene, 8, 64)

@@ -159,6 +159,7 @@ def test_standpoints(around_ball):
     assert 0.1 < np.median(ratio) < 0.5
 
 
+@pytest.mark.slow
 def test_the_same_every_time(around_ball):
     again = placed(BALL)
     assert all(np.array_equal(a.rotation, b.rotation) for a, b in zip(again, around_ball, strict=True))
@@ -209,6 +210,7 @@ def test_an_object_in_a_room():
     assert seen.min() >= 1
 
 
+@pytest.mark.slow
 def test_a_scene_that_is_only_looked_at_from_inside_has_all_its_judges():
     rng = np.random.default_rng(4)
     from_inside = trained(ROOM, -WALLS, rng.uniform(-0.6, 0.6, (60, 3)) * INSIDE_ROOM)

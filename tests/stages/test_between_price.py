@@ -117,6 +117,7 @@ def test_the_thresholds_follow_the_part_of_the_views_that_show_a_splat(weighed):
     assert dataclasses.replace(taken, delta_mse_max=asked.delta_mse_max, drop=asked.drop) == asked
 
 
+@pytest.mark.slow
 def test_scenes_that_are_seen_whole_and_the_papers_preset_stay_as_they_are(
     device, plush_excerpt, plush_excerpt_cameras, twelve
 ):

@@ -101,6 +101,7 @@ def test_coefficients_are_chosen_and_the_rest_moves(device, plush_excerpt, views
     assert not np.array_equal(then.scene.means, plush_excerpt.means)
 
 
+@pytest.mark.slow
 @pytest.mark.one_family
 def test_the_refit_takes_no_coefficient_back(device, plush_excerpt, views):
     """Unless it is asked for other steps, which other coefficients may suit."""

@@ -50,6 +50,7 @@ def test_added_views_are_looked_at_as_if_they_had_been_given(device, plush_excer
     assert asked != file_of(device, plush_excerpt, given, options(0))
 
 
+@pytest.mark.slow
 def test_what_lies_between_few_views_gets_better_at_no_more_bytes(device, plush_excerpt, plush_excerpt_cameras):
     judges = test_views(plush_excerpt_cameras)
 

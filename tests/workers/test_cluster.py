@@ -493,6 +493,7 @@ def test_nobody_of_a_computer_is_asked_again_where_one_was_lost_as_it_was_met(de
     assert caplog.text.count("it does no views") == 1
 
 
+@pytest.mark.slow
 def test_devices_of_several_kinds_are_told(device, monkeypatch, caplog):
     other = SimpleNamespace(family=device.family, info="another device", digits=device.digits)
     with local_cluster(1) as cluster:
@@ -545,6 +546,7 @@ def test_several_devices_and_a_cluster(scene, cameras, device):
         potr_cl.encode(scene, cameras, device=[device, Device()], cluster="tcp://127.0.0.1:1")
 
 
+@pytest.mark.slow
 def test_another_version_is_refused(device, monkeypatch):
     with local_cluster(1) as cluster:
         monkeypatch.setattr(potr_cl, "__version__", "0.0.0")

@@ -137,6 +137,7 @@ def test_pictures_are_rendered_ahead_by_the_device_that_needs_them(plush_excerpt
     assert [device.allocated for device in devices] == [0] * 3
 
 
+@pytest.mark.slow
 @pytest.mark.one_family
 def test_more_devices_than_views(plush_excerpt, plush_excerpt_cameras, family):
     cameras = few(plush_excerpt_cameras)[:2]

@@ -109,6 +109,7 @@ def test_a_scene_that_is_kept_is_not_sent_again(plush_excerpt, cameras, coded, f
     assert [device.allocated for device in devices] == [0] * 2
 
 
+@pytest.mark.slow
 def test_a_candidate_of_the_host_is_judged_too(plush_excerpt, cameras, coded, family):
     """As files are whose readers make no scene on a device; and pictures are remembered from one to the next."""
     views, worse = EvaluationViews.of(cameras), coded.output.read(coded.data)
@@ -177,6 +178,7 @@ def test_a_large_scene_is_not_sent_to_be_judged(plush_excerpt, cameras, coded, m
         assert len(coded.data) <= pool.traffic.sent < 2 * len(coded.data) + 1000
 
 
+@pytest.mark.slow
 def test_a_search_for_a_psnr_judges_together(plush_excerpt, cameras, monkeypatch):
     options = EncodeOptions.for_preset("best", prune={"iterations": 4}, refit={"steps": 2}, between=False)
     device = open_device("cpu")
@@ -224,6 +226,7 @@ def _small_groups(monkeypatch):
     monkeypatch.setattr(culling, "_SAMPLED", 2)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_small_groups")
 def test_views_of_a_large_scene_are_judged_by_what_they_see(family, monkeypatch):
     scene, cameras = street(5, 500, across=True)
