@@ -33,23 +33,15 @@ WRONG = {
         *(("--compact-at 2", "--compact-at is 2"), ("--refit-at 2", "--refit-at is 2")),
     ],
     "prune": [
-        *(
-            ("--keep 0", "--keep"),
-            ("--keep 1.5", "--keep"),
-            ("--count 0", "at least 1"),
-            ("--iterations 0", "iterations"),
-        ),
-        *(("--delta-mse-max -1", "delta_mse_max")),
-        *(("--tolerance nan", "tolerance"), ("--memory -2", "memory")),
-        ("--background octarine", "octarine"),
+        *(("--keep 0", "--keep"), ("--keep 1.5", "--keep"), ("--count 0", "at least 1")),
+        *(("--iterations 0", "iterations"), ("--delta-mse-max -1", "delta_mse_max")),
+        *(("--tolerance nan", "tolerance"), ("--memory -2", "memory"), ("--background octarine", "octarine")),
     ],
     "compact": [
         *(("--lambda -1", "lam"), ("--alpha 0", "alpha"), ("--alpha 1.5", "alpha"), ("--sf-sh 0", "sf_sh")),
         *(("-q 2", "quality"), ("--memory -1", "memory"), ("--background octarine", "octarine")),
     ],
-    "refit": [
-        *(("--steps=-1", "steps"), ("--prior -1", "prior"), ("--lambda nan", "lam"), ("--drop inf", "drop")),
-    ],
+    "refit": [("--steps=-1", "steps"), ("--prior -1", "prior"), ("--lambda nan", "lam"), ("--drop inf", "drop")],
 }
 
 

@@ -139,7 +139,6 @@ def test_views_that_are_not_kept_wait_until_they_have_lost_enough(device):
         assert np.array_equal(waiting.measure()[0][left], eager.measure()[0][left])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("memory", [None, 0])
 def test_spared_splats_stay(device, memory):
     scene, cameras = street()
@@ -195,7 +194,6 @@ def test_the_numbers_of_several_choices_of_groups(device):
             assert np.array_equal(device.download(numbers, (len(expected),), np.uint32), expected)
 
 
-@pytest.mark.slow
 def test_a_whole_encode_has_the_same_bytes(device, monkeypatch):
     scene, cameras = street(5, 900)
     options = EncodeOptions.for_preset("best", between=False, prune={"iterations": 6}, refit={"steps": 2})
