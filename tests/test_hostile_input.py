@@ -104,13 +104,3 @@ def test_files_are_the_same_the_second_time(tmp_path):
     commands = ["encode, preset paper", "encode, preset smallest", "decode", "convert to spz"]
     rows = run("determinism", tmp_path, *each("--command", commands))
     assert {row["command"]: row["same bytes"] for row in rows} == dict.fromkeys(commands, "yes")
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(importlib.util.find_spec("atheris") is None, reason="Atheris is not installed")
-def test_files_changed_towards_new_code(tmp_path):
-    rows = run("guided", tmp_path, "--format", "potr", "--format", "png", "--seconds", "10")
-    for row in rows:
-        assert row["findings"] == 0
-        assert row["files"] > 0
-        assert row["branches at last"] >= row["branches at first"] > 0
