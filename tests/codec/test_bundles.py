@@ -92,8 +92,7 @@ def assert_same(values: dict, levels) -> None:
             assert np.array_equal(levels.coefficient(m)[c], wanted)
 
 
-@pytest.mark.parametrize("splats", SIZES)
-@pytest.mark.parametrize("adapted", [False, True], ids=["same steps", "steps"])
+@pytest.mark.parametrize(("splats", "adapted"), [(splats, number % 2 == 0) for number, splats in enumerate(SIZES)])
 def test_integers_come_back(path, splats, adapted):
     values = integers(splats, splats)
     steps = steps_of(splats) if adapted else None
@@ -220,6 +219,7 @@ def small():
     return encoder.encode(values, classes_of(values, steps)), steps
 
 
+@pytest.mark.slow
 @settings(
     max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
 )

@@ -261,6 +261,7 @@ def test_threads_that_get_no_memory_are_told_of(device, monkeypatch, compiled):
         decode_to_device(open_file(of_bundles(3 * 8192, 0)), device, threads=2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("native", ["0", ""])
 def test_bundles_beyond_all_tables_have_the_bits_of_the_host(native, device, monkeypatch):
     monkeypatch.setenv("POTR_CL_NATIVE", native)

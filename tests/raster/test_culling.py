@@ -91,6 +91,7 @@ def test_far_from_the_origin(device):
         assert np.isin(splats, groups.splats(groups.visible(camera, INRIA.near))).all()
 
 
+@pytest.mark.slow
 def test_a_real_scene(device, plush_excerpt, plush_excerpt_cameras):
     groups = SplatGroups.of(plush_excerpt, 16)
     close = [dataclasses.replace(c, fx=4 * c.fx, fy=4 * c.fy) for c in plush_excerpt_cameras]

@@ -74,6 +74,7 @@ def test_elsewhere_as_many_as_fit_with_what_each_may_draw(monkeypatch):
     assert sum(by_parts) > sum(rooms(device, memories)) + 5
 
 
+@pytest.mark.slow
 def test_what_is_added_is_kept():
     """No view is made again for each measurement, with the memory that the estimate was made for."""
     device = open_device("cpu")

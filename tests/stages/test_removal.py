@@ -271,6 +271,7 @@ def test_views_of_different_sizes_count_the_same(device):
         assert np.allclose(together[i], (separate[0][i] + separate[1][i]) / 2, rtol=1e-5, atol=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.one_family
 @pytest.mark.one_runtime
 def test_the_memory_budget_is_used_and_not_exceeded(device):

@@ -40,6 +40,7 @@ def file_of(device, scene, cameras, chosen) -> bytes:
     return b"".join(encode(scene, cameras, chosen, device=device).pieces)
 
 
+@pytest.mark.slow
 def test_added_views_are_looked_at_as_if_they_had_been_given(device, plush_excerpt, plush_excerpt_cameras):
     given = train_views(plush_excerpt_cameras)
     more = [*given, *views_between(plush_excerpt, given, 2)]
@@ -49,6 +50,7 @@ def test_added_views_are_looked_at_as_if_they_had_been_given(device, plush_excer
     assert asked != file_of(device, plush_excerpt, given, options(0))
 
 
+@pytest.mark.slow
 def test_what_lies_between_few_views_gets_better_at_no_more_bytes(device, plush_excerpt, plush_excerpt_cameras):
     judges = test_views(plush_excerpt_cameras)
 
@@ -94,6 +96,7 @@ def test_dense_views_get_none(device, plush_excerpt, plush_excerpt_cameras):
     assert state.views == tuple(dense)
 
 
+@pytest.mark.slow
 def test_only_as_many_are_added_as_fit_the_memory_beside_the_given_ones(device, plush_excerpt, plush_excerpt_cameras):
     given = train_views(plush_excerpt_cameras)
     wanted, _ = added(device, plush_excerpt, given)
@@ -112,6 +115,7 @@ def test_only_as_many_are_added_as_fit_the_memory_beside_the_given_ones(device, 
     assert device.allocated == 0
 
 
+@pytest.mark.slow
 def test_a_search_finds_them_once(device, plush_excerpt, plush_excerpt_cameras):
     began = []
     chosen = EncodeOptions.for_preset("best", prune={"iterations": 16})
@@ -145,6 +149,7 @@ def test_single_cameras_get_none(device, plush_excerpt, plush_excerpt_cameras):
     assert alone == asked
 
 
+@pytest.mark.slow
 def test_virtual_cameras_get_some_if_they_are_asked_for(device, plush_excerpt):
     """By themselves none: as many as are needed have been placed. With them, they go on to be virtual."""
     state = State.of(plush_excerpt, train_views(place_cameras(plush_excerpt, 8, 64)))

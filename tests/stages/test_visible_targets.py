@@ -91,6 +91,7 @@ def test_fewer_together_where_the_device_has_no_room(device, monkeypatch):
     assert np.array_equal(*found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("memory", [None, 3_000_000], ids=["all memory", "little"])
 def test_a_refit_takes_them_and_the_bytes_stay(device, monkeypatch, memory):
     scene, cameras = street(6, 400)

@@ -109,6 +109,7 @@ def test_a_scene_that_is_kept_is_not_sent_again(plush_excerpt, cameras, coded, f
     assert [device.allocated for device in devices] == [0] * 2
 
 
+@pytest.mark.slow
 def test_a_candidate_of_the_host_is_judged_too(plush_excerpt, cameras, coded, family):
     """As files are whose readers make no scene on a device; and pictures are remembered from one to the next."""
     views, worse = EvaluationViews.of(cameras), coded.output.read(coded.data)
@@ -140,6 +141,8 @@ def test_views_of_the_same_name(plush_excerpt, cameras, coded, family):
     assert [device.allocated, another.allocated] == [0, 0]
 
 
+@pytest.mark.slow
+@pytest.mark.one_family
 @pytest.mark.parametrize("kind", [HostPool, ElsewherePool])
 @pytest.mark.parametrize("command", ["__init__", "take", "figures"])
 @pytest.mark.parametrize("lost", ["one", "all"])
@@ -175,6 +178,7 @@ def test_a_large_scene_is_not_sent_to_be_judged(plush_excerpt, cameras, coded, m
         assert len(coded.data) <= pool.traffic.sent < 2 * len(coded.data) + 1000
 
 
+@pytest.mark.slow
 def test_a_search_for_a_psnr_judges_together(plush_excerpt, cameras, monkeypatch):
     options = EncodeOptions.for_preset("best", prune={"iterations": 4}, refit={"steps": 2}, between=False)
     device = open_device("cpu")
@@ -222,6 +226,7 @@ def _small_groups(monkeypatch):
     monkeypatch.setattr(culling, "_SAMPLED", 2)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_small_groups")
 def test_views_of_a_large_scene_are_judged_by_what_they_see(family, monkeypatch):
     scene, cameras = street(5, 500, across=True)
@@ -288,6 +293,7 @@ def test_with_little_memory_a_decoded_file_is_judged_by_what_views_see_too(famil
         assert np.mean(projected) < 0.4 * len(scene)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_small_groups")
 def test_an_encode_leaves_the_groups_that_it_has_found(family, monkeypatch):
     monkeypatch.setattr("potr_cl.stages.pruning.visible_parts.LEAST_SPLATS", 1)
@@ -353,6 +359,7 @@ def test_scenes_are_compared_together(plush_excerpt, cameras, coded, family, mon
     assert [device.allocated for device in devices] == [0] * 2
 
 
+@pytest.mark.slow
 def test_a_ladder_keeps_the_scene_on_the_devices(plush_excerpt, cameras, tmp_path, monkeypatch):
     options = EncodeOptions.for_preset("fast", prune={"iterations": 2}, between=False)
     expected = potr_cl.encode_ladder(plush_excerpt, tmp_path / "alone", "0.2,0.4", cameras, options)

@@ -67,6 +67,7 @@ def array_fields(scene):
     return [f for f in dataclasses.fields(scene) if isinstance(getattr(scene, f.name), np.ndarray)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
@@ -108,6 +109,7 @@ def test_the_same_bytes(family, options, monkeypatch):
     assert [device.allocated for device in devices] == [0] * 4
 
 
+@pytest.mark.slow
 def test_a_re_fit_sends_what_views_draw(family, monkeypatch):
     """Of a direction, each worker gets the coefficients of these splats alone; what it finds is the same."""
     scene, cameras = street(5, 500, across=True)
@@ -124,6 +126,7 @@ def test_a_re_fit_sends_what_views_draw(family, monkeypatch):
     assert 0 < sent[1] < 0.8 * sent[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lost_at", [3, 6])
 def test_who_is_told_again_is_told_the_colours_of_then(lost_at, monkeypatch, plush_excerpt, plush_excerpt_cameras):
     """Of two re-fits on the way; the worker is lost after the first or the second one."""
@@ -150,6 +153,7 @@ def test_who_is_told_again_is_told_the_colours_of_then(lost_at, monkeypatch, plu
     assert asked.count(asked[0]) == lost_at
 
 
+@pytest.mark.slow
 def test_a_re_fit_without_room_for_that_sends_all(monkeypatch):
     """The bytes are the same, and nothing stays taken."""
     scene, cameras = street(5, 500, across=True)
@@ -171,6 +175,7 @@ def test_a_re_fit_without_room_for_that_sends_all(monkeypatch):
     assert [device.allocated for device in devices] == [0] * 4
 
 
+@pytest.mark.slow
 def test_the_uncompressed_scene_travels_once(family, monkeypatch):
     """Where workers get all of it: of what is pruned, once unseen splats are set aside, they get the numbers."""
     monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1 << 40)
