@@ -156,7 +156,7 @@ class SceneBuffers(Owner):
         if (
             pending is None
             and rows.nbytes >= sending.LEAST
-            and not (device.info.kind == "cpu" or device.info.integrated)
+            and not device.info.shares_host_memory
         ):
             height = max(sending.PIECE // (4 * width), 1)
             firsts = range(0, len(rows), height)

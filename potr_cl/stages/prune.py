@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 from potr_cl.errors import UsageError
 from potr_cl.host.threads import in_background, thread_pool
 from potr_cl.model.scene import FloatArray
-from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import lying_on
 from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.raster.surely_seen import surely_seen
-from potr_cl.raster.view_shares import ViewShares
 from potr_cl.stages.guarded import UNRESOLVED
 from potr_cl.stages.pruning.measured import Measured, Removal, measurement
 from potr_cl.stages.pruning.on_device import prune_scene
@@ -31,8 +29,10 @@ from potr_cl.stages.pruning.unseen import (
     find_unseen,
     without_directions,
 )
-from potr_cl.stages.pruning.visible_parts import LARGEST_LIMIT, LIKELY, groups_of_large, seen_part, sights_worth_it
+from potr_cl.stages.pruning.visible_parts import LARGEST_LIMIT
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
+from potr_cl.views.shares import ViewShares
+from potr_cl.views.visibility import MOST_SEEN, Visibility, groups_of_large, seen_part, visibility_of_large
 from potr_cl.workers.pool import Pool
 
 #: Of the time of all iterations, what the first measurement takes, which looks at all of every view; the others look at
@@ -153,7 +153,7 @@ class Prune(Stage):
 
         And as "unseen" a :class:`potr_cl.stages.pruning.unseen.Unseen`; and as "price", where the number of splats is
         not given, the ΔMSE below which a splat has gone; and as "shares" the
-        :class:`potr_cl.raster.view_shares.ViewShares`, where workers elsewhere get what their views see.
+        :class:`potr_cl.views.shares.ViewShares`, where workers elsewhere get what their views see.
         """
         if UNRESOLVED in state.learnt:
             return self._guarded(state, bench)
@@ -161,11 +161,10 @@ class Prune(Stage):
             quick = partial(surely_seen, placed) if isinstance(placed, SceneBuffers) else None
             part = in_background(seen_part, state.scene, state.views)  # while a device finds the unseen ones
             unseen = find_unseen(state, None, pool.map, quick) if quick else None
-            likely = part.result() <= LIKELY
+            likely = part.result() <= MOST_SEEN
             groups = groups_of_large(state.scene, pool.map) if likely or not unseen else None
             hidden, area = unseen or find_unseen(state, groups, pool.map)
-            options = self._sweep_options(bench.memory)
-            sights = sights_worth_it(state.scene, state.views, options, groups, pool.map) if likely else None
+            sights = visibility_of_large(state.scene, state.views, groups, pool.map) if likely else None
             groups = None
             if sights is not None and (bench.pool is None or bench.pool.in_process):
                 sights = sights.lasting()
@@ -190,7 +189,7 @@ class Prune(Stage):
                 self.name, Pruned(splats, np.full(splats, -1, np.int32), 0, lambda: Course(everything))
             )
         if sights is not None:
-            sights = sights_worth_it(state.scene.uncoloured().subset(seen), state.views, options)
+            sights = visibility_of_large(state.scene.uncoloured().subset(seen), state.views)
         return self._pruned(told, bench, sights, seen, hidden)
 
     def _guarded(self, state: State, bench: Workbench) -> State:
@@ -207,15 +206,15 @@ class Prune(Stage):
                 "give --unseen keep instead of protect"
             )
         with thread_pool(bench.threads) as pool:
-            likely = seen_part(state.scene, state.views) <= LIKELY
+            likely = seen_part(state.scene, state.views) <= MOST_SEEN
             groups = groups_of_large(state.scene, pool.map) if likely else None
-            sights = sights_worth_it(state.scene, state.views, self._sweep_options(bench.memory), groups, pool.map)
+            sights = visibility_of_large(state.scene, state.views, groups, pool.map)
             if sights is not None and (bench.pool is None or bench.pool.in_process):
                 sights = sights.lasting()
         told = self._told(state, bench, sights).having_learnt("unseen", state.learnt[UNRESOLVED])
         return self._pruned(told, bench, sights)
 
-    def _told(self, state: State, bench: Workbench, sights: Sights | None) -> State:
+    def _told(self, state: State, bench: Workbench, sights: Visibility | None) -> State:
         """The state that knows what the views see, and what a splat may cost."""
         if state.scene is state.source:
             state = replace(state, sights=sights)
@@ -229,7 +228,7 @@ class Prune(Stage):
         self,
         state: State,
         bench: Workbench,
-        sights: Sights | None = None,
+        sights: Visibility | None = None,
         seen: NDArray[np.int64] | None = None,
         hidden: NDArray[np.bool_] | None = None,
     ) -> State:
@@ -310,7 +309,7 @@ def _views_that_stay(removal: Removal) -> float:
     return removal.cached_views if isinstance(removal, RemovalSweep) else removal.kept_views
 
 
-def _dealt(state: State, seen: NDArray[np.int64] | None, pool: Pool, sights: Sights) -> ViewShares:
+def _dealt(state: State, seen: NDArray[np.int64] | None, pool: Pool, sights: Visibility) -> ViewShares:
     """The views for a pool's workers, and which of the source's splats each gets, for this stage and others."""
     workers = pool.workers()
     source, numbers = (state.source, state.survivors) if state.is_cut else (state.scene, np.arange(len(state.scene)))

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from potr_cl.model import splat_groups
-from potr_cl.raster.culling import parts_of_views
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.rules import INRIA
 from potr_cl.raster.scene_buffers import SceneBuffers, uploaded
 from potr_cl.stages.pruning.drawn_removal import DrawnRemoval
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.views.visibility import Visibility
 from tests.cases.streets import street
 from tests.cases.sweeps import assert_same_bits
 from tests.devices import open_device
@@ -37,7 +36,7 @@ def _small_groups(monkeypatch):
 
 def removal(device, memory, tolerance=0.0):
     scene, cameras = street()
-    parts = parts_of_views(scene, cameras, INRIA.near)
+    parts = Visibility.of(scene, cameras).clusters()
     return DrawnRemoval(device, scene, scene, cameras, parts, SweepOptions(tolerance, memory=memory))
 
 
@@ -57,7 +56,7 @@ def test_views_that_draw_nothing_are_views_too(device, memory):
     scene, cameras = street()
     away = dataclasses.replace(cameras[0], translation=cameras[0].translation + np.array([0, 0, -500.0]))
     cameras = [away, *cameras, away]
-    parts, options = parts_of_views(scene, cameras, INRIA.near), SweepOptions(0.0, memory=memory)
+    parts, options = Visibility.of(scene, cameras).clusters(), SweepOptions(0.0, memory=memory)
     with (
         Rasterizer(device, scene) as rasterizer,
         RemovalSweep(rasterizer, cameras, SweepOptions(0.0)) as wanted,

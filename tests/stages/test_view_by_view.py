@@ -11,18 +11,19 @@ from potr_cl.model import splat_groups
 from potr_cl.opencl.memory import Memory
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.raster.culling import Sights
 from potr_cl.raster.picked_splats import PickedSplats, Picker, Picks
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
 from potr_cl.raster.scene_buffers import uploaded
-from potr_cl.stages.pruning import measured, visible_parts
+from potr_cl.stages.pruning import measured
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.pruning.view_by_view import ViewByView
 from potr_cl.stages.pruning.visible_parts import first_totals
+from potr_cl.views import visibility
+from potr_cl.views.visibility import Visibility
 from tests.cases.streets import street
 from tests.cases.sweeps import assert_same_bits
 from tests.devices import KERNELS, open_device
@@ -58,7 +59,7 @@ def test_the_same_bits(device, memory, tolerance):
         uploaded(device, scene) as whole,
         Rasterizer(device, scene) as rasterizer,
         RemovalSweep(rasterizer, cameras, dataclasses.replace(options, memory=None)) as wanted,
-        ViewByView(device, whole, cameras, Sights.of(scene, cameras, INRIA.near), options) as got,
+        ViewByView(device, whole, cameras, Visibility.of(scene, cameras, INRIA.near), options) as got,
     ):
         assert memory is not None or got.kept_views == len(cameras)
         assert memory != SOME or 2 < got.kept_views < len(cameras) - 2
@@ -73,7 +74,7 @@ def test_the_same_choice(device):
         uploaded(device, scene) as whole,
         Rasterizer(device, scene) as rasterizer,
         RemovalSweep(rasterizer, cameras, options) as wanted,
-        ViewByView(device, whole, cameras, Sights.of(scene, cameras, INRIA.near), options) as got,
+        ViewByView(device, whole, cameras, Visibility.of(scene, cameras, INRIA.near), options) as got,
     ):
         a, b = (prune_scene(removal, schedule) for removal in (wanted, got))
     assert np.array_equal(a.order, b.order)
@@ -90,7 +91,7 @@ def test_removal_before_anything_was_measured(device):
         sweep.measure()
         sweep.remove(gone)
         wanted = sweep.measure()
-    sights = Sights.of(scene, cameras, INRIA.near)
+    sights = Visibility.of(scene, cameras, INRIA.near)
     for memory in (None, 0):
         with uploaded(device, scene) as whole:
             given = dataclasses.replace(options, memory=memory)
@@ -105,7 +106,7 @@ def test_a_view_in_which_nothing_is_drawn(device, memory):
     """Its splats are too faint: there is not one intersection of a splat and a tile."""
     scene, cameras = street(2)
     faint = dataclasses.replace(scene, opacity_logits=np.full(len(scene), -30, np.float32))
-    sights = Sights.of(faint, cameras, INRIA.near)
+    sights = Visibility.of(faint, cameras, INRIA.near)
     with (
         uploaded(device, faint) as whole,
         ViewByView(device, whole, cameras, sights, SweepOptions(0.0, memory=memory)) as removal,
@@ -117,7 +118,7 @@ def test_a_view_in_which_nothing_is_drawn(device, memory):
 
 def test_views_that_are_not_kept_wait_until_they_have_lost_enough(device):
     scene, cameras = street()
-    sights = Sights.of(scene, cameras, INRIA.near)
+    sights = Visibility.of(scene, cameras, INRIA.near)
     with (
         uploaded(device, scene) as whole,
         ViewByView(device, whole, cameras, sights, SweepOptions(0.06, memory=0)) as waiting,
@@ -143,7 +144,7 @@ def test_views_that_are_not_kept_wait_until_they_have_lost_enough(device):
 def test_spared_splats_stay(device, memory):
     scene, cameras = street()
     spared = np.random.default_rng(2).random(len(scene)) < 0.3
-    sights, options = Sights.of(scene, cameras, INRIA.near), SweepOptions(0.0, memory=memory)
+    sights, options = Visibility.of(scene, cameras, INRIA.near), SweepOptions(0.0, memory=memory)
     with uploaded(device, scene) as whole:
         kept = []
         for some in (None, spared):
@@ -206,7 +207,7 @@ def test_a_whole_encode_has_the_same_bytes(device, monkeypatch):
             super().__init__(*given, **named)
             made.append(self.kept_views)
 
-    monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1)
+    monkeypatch.setattr(visibility, "LEAST_SPLATS", 1)
     monkeypatch.setattr(measured, "ViewByView", Noting)
     by_view = encode(scene, cameras, options, device=device)
     assert made == [len(cameras)]

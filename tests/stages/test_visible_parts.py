@@ -10,18 +10,18 @@ import pytest
 from potr_cl.model import splat_groups
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.raster.culling import parts_of_views
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.rules import INRIA
 from potr_cl.raster.scene_buffers import gathered, uploaded
 from potr_cl.stages import prune
-from potr_cl.stages.pruning import measured, visible_parts
+from potr_cl.stages.pruning import measured
 from potr_cl.stages.pruning.drawn_removal import DrawnRemoval
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.pruning.visible_parts import PartedRemoval
+from potr_cl.views import visibility
+from potr_cl.views.visibility import Visibility
 from tests.cases.streets import street
 from tests.cases.sweeps import assert_same_bits
 from tests.devices import KERNELS, open_device
@@ -42,7 +42,7 @@ def _small_groups(monkeypatch):
 @pytest.fixture(params=[PartedRemoval, DrawnRemoval])
 def parted(request):
     def made(device, scene, cameras, options, whole=None):
-        parts = parts_of_views(scene, cameras, INRIA.near)
+        parts = Visibility.of(scene, cameras).clusters()
         assert 3 <= len(parts) < len(cameras)
         return request.param(device, scene, whole or scene, cameras, parts, options)
 
@@ -110,7 +110,7 @@ def test_from_a_scene_on_the_device(device, parted):
 def test_spared_splats_stay(device):
     scene, cameras = street()
     spared = np.random.default_rng(2).random(len(scene)) < 0.3
-    parts = parts_of_views(scene, cameras, INRIA.near)
+    parts = Visibility.of(scene, cameras).clusters()
     schedule = PruningOptions(1e-2, 4)
     for memory in (None, 0):
         options = SweepOptions(0.0, memory=memory)
@@ -130,7 +130,7 @@ def test_unseen_splats_are_kept_without_a_copy_of_the_scene(device, monkeypatch)
     options = EncodeOptions.for_preset("best", between=False, prune={"iterations": 6}, refit=False)
     options = dataclasses.replace(options, cameras_anyway=True)
     aside = encode(scene, cameras, options, device=device)
-    monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1)
+    monkeypatch.setattr(visibility, "LEAST_SPLATS", 1)
     spared = encode(scene, cameras, options, device=device)
     assert aside.unseen is not None
     assert aside.unseen.splats > 300
@@ -144,13 +144,13 @@ def test_groups_are_made_only_where_they_can_be_of_use(device, monkeypatch):
     options = EncodeOptions.for_preset("best", between=False, prune={"iterations": 2}, refit=False, compact=False)
     options = dataclasses.replace(options, cameras_anyway=True)
     grouped = []
-    monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1)
+    monkeypatch.setattr(visibility, "LEAST_SPLATS", 1)
     monkeypatch.setattr(prune, "groups_of_large", lambda scene, run: grouped.append(scene))
     for part in (0.55, 0.45):
         monkeypatch.setattr(prune, "seen_part", lambda scene, views, part=part: part)
         encode(scene, cameras, options, device=device)
     assert len(grouped) == 1
-    assert 0.2 < visible_parts.seen_part(*street(5, 900)) < 0.45
+    assert 0.2 < visibility.seen_part(*street(5, 900)) < 0.45
 
 
 @pytest.mark.one_family
@@ -165,7 +165,7 @@ def test_a_whole_encode_has_the_same_bytes(device, monkeypatch):
         made.append(given[4])
         return (DrawnRemoval if device.family == "cpu" else PartedRemoval)(*given)
 
-    monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1)
+    monkeypatch.setattr(visibility, "LEAST_SPLATS", 1)
     for name in ("PartedRemoval", "DrawnRemoval"):
         monkeypatch.setattr(measured, name, noting)
     # What a GPU does is another module's matter (test_view_by_view.py).

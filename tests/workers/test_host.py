@@ -18,12 +18,13 @@ from potr_cl.opencl.discovery import choose_device, choose_devices
 from potr_cl.opencl.memory import Memory
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.stages.pruning import measured, part, shared_removal, visible_parts
+from potr_cl.stages.pruning import measured, part, shared_removal
 from potr_cl.stages.pruning.part import RemovalPart
 from potr_cl.stages.pruning.view_by_view import ViewByView
 from potr_cl.stages.refitting import pictures_ahead
 from potr_cl.stages.refitting.part import ColourPart
 from potr_cl.stages.refitting.targets import RenderedTargets
+from potr_cl.views import visibility
 from potr_cl.workers.host import HostPool
 from potr_cl.workers.opening import open_workers
 from potr_cl.workers.parts import Parts
@@ -297,7 +298,7 @@ def test_large_scenes_view_by_view(monkeypatch):
     alone = open_device("gpu")
     expected = encode(scene, cameras, options, device=alone)
     monkeypatch.setattr(splat_groups, "LARGEST", 32)
-    monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1)
+    monkeypatch.setattr(visibility, "LEAST_SPLATS", 1)
     shares = []
 
     class Noting(ViewByView):

@@ -14,13 +14,15 @@ from potr_cl.errors import DeviceMemoryError
 from potr_cl.model import splat_groups
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.raster.culling import Sights
+from potr_cl.raster.carried import Excerpt
 from potr_cl.raster.rules import INRIA
-from potr_cl.raster.view_shares import Excerpt, ViewShares
-from potr_cl.stages.pruning import part, visible_parts
+from potr_cl.stages.pruning import part
 from potr_cl.stages.refitting.drawn_rows import DrawnRows
 from potr_cl.stages.refitting.packed_row import PackedRow
 from potr_cl.stages.refitting.part import ColourPart
+from potr_cl.views import visibility
+from potr_cl.views.shares import ViewShares
+from potr_cl.views.visibility import Visibility
 from tests.cases.elsewhere import ElsewherePool
 from tests.cases.streets import street
 from tests.devices import FAMILIES, open_device
@@ -38,7 +40,7 @@ OPTIONS = dataclasses.replace(
 @pytest.fixture(autouse=True)
 def _small_groups(monkeypatch):
     monkeypatch.setattr(splat_groups, "LARGEST", 32)
-    monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1)
+    monkeypatch.setattr(visibility, "LEAST_SPLATS", 1)
 
 
 @pytest.fixture(scope="module", params=FAMILIES)
@@ -127,7 +129,7 @@ def test_a_re_fit_sends_what_views_draw(family, monkeypatch):
 @pytest.mark.parametrize("lost_at", [3, 6])
 def test_who_is_told_again_is_told_the_colours_of_then(lost_at, monkeypatch, plush_excerpt, plush_excerpt_cameras):
     """Of two re-fits on the way; the worker is lost after the first or the second one."""
-    monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1 << 40)
+    monkeypatch.setattr(visibility, "LEAST_SPLATS", 1 << 40)
     options = EncodeOptions.for_preset(
         "best", q=0.3, prune={"keep": 0.4, "iterations": 8}, refit={"at": (0.3, 0.6), "steps": 3, "drop": 1e-7},
         between=False,
@@ -173,7 +175,7 @@ def test_a_re_fit_without_room_for_that_sends_all(monkeypatch):
 
 def test_the_uncompressed_scene_travels_once(family, monkeypatch):
     """Where workers get all of it: of what is pruned, once unseen splats are set aside, they get the numbers."""
-    monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1 << 40)
+    monkeypatch.setattr(visibility, "LEAST_SPLATS", 1 << 40)
     scene, cameras = street(5, 500, across=True)
     scene = with_a_house_that_nobody_sees(scene)
     options = OPTIONS.changed(prune={"keep": None}, refit={"at": ()})
@@ -217,7 +219,7 @@ def test_workers_with_gpus_look_at_each_view_with_what_it_may_draw(keep, monkeyp
 
 def test_neighbours_go_to_the_same():
     scene, cameras = street(across=True)
-    sights = Sights.of(scene, cameras, INRIA.near)
+    sights = Visibility.of(scene, cameras, INRIA.near)
     dealt = ViewShares.of(cameras, sights, [1.0, 1.0], scene, np.arange(len(scene)))
     numbers = [share.numbers for share in dealt.shares]
     assert sorted(chain(*numbers)) == list(range(len(cameras)))
@@ -230,14 +232,14 @@ def test_neighbours_go_to_the_same():
 
 def test_twice_as_fast_gets_twice_as_much():
     scene, cameras = street(8, across=True)
-    sights = Sights.of(scene, cameras, INRIA.near)
+    sights = Visibility.of(scene, cameras, INRIA.near)
     work = [int(sights.totals[own].sum()) for own in sights.dealt([2.0, 1.0])]
     assert 1.4 < work[0] / work[1] < 2.8
 
 
 def test_a_share_names_its_splats_by_their_places():
     scene, cameras = street(across=True)
-    sights = Sights.of(scene, cameras, INRIA.near)
+    sights = Visibility.of(scene, cameras, INRIA.near)
     splats, own = sights.of_views([3, 4])
     assert np.array_equal(splats, sights.groups.splats(sights.seen[3] | sights.seen[4]))
     assert own.totals[3] == sights.totals[3]
@@ -248,11 +250,11 @@ def test_a_share_names_its_splats_by_their_places():
 def test_views_that_see_nothing_have_a_share_too():
     scene, cameras = street(across=True)
     away = dataclasses.replace(cameras[0], translation=cameras[0].translation + np.array([0, 0, -500.0]))
-    sights = Sights.of(scene, [*cameras, away, away], INRIA.near)
+    sights = Visibility.of(scene, [*cameras, away, away], INRIA.near)
     assert sights.totals[-1] == 0
     splats, _ = sights.of_views([len(cameras)])
     assert len(splats) > 0
-    assert all(len(each.splats) for each in sights.parts([len(cameras), len(cameras) + 1]))
+    assert all(len(each.splats) for each in sights.clusters([len(cameras), len(cameras) + 1]))
 
 
 def test_an_excerpt_arrives_as_a_scene():

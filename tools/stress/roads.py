@@ -25,7 +25,6 @@ from potr_cl.model.unseen import unseen_splats
 from potr_cl.ondevice.decode import decode_to_device
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory
-from potr_cl.raster.culling import Sights
 from potr_cl.raster.picked_splats import PickedSplats
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
@@ -38,6 +37,7 @@ from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.pruning.view_by_view import ViewByView
 from potr_cl.stages.refitting.targets import RenderedTargets
 from potr_cl.stages.stage import State, Workbench
+from potr_cl.views.visibility import Visibility
 from tools.stress.cases import Case
 from tools.stress.measures import Measures
 
@@ -96,7 +96,7 @@ def _by_view(device: Device, scene: Scene, view: Camera) -> float:
     with Rasterizer(device, scene) as rasterizer, RemovalSweep(rasterizer, views, SweepOptions(0.0)) as sweep:
         wanted = measured(sweep)
     number = 0.0
-    sights = Sights.of(scene, views, INRIA.near)
+    sights = Visibility.of(scene, views, INRIA.near)
     for memory in (None, 0):
         options = SweepOptions(0.0, memory=memory)
         with uploaded(device, scene) as whole, ViewByView(device, whole, views, sights, options) as removal:

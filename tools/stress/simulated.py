@@ -49,7 +49,6 @@ from potr_cl.opencl.memory import Memory
 from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.raster import launch_gpu
 from potr_cl.raster import long_lists as long_lists_module
-from potr_cl.raster.culling import Sights, parts_of_views
 from potr_cl.raster.picked_splats import Picker
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import GSPLAT, INRIA
@@ -76,6 +75,7 @@ from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.refitting.targets import RenderedTargets
 from potr_cl.stages.refitting.vector_space import Layout
+from potr_cl.views.visibility import Visibility
 from tests.reference import raster as reference
 from tests.reference.scenes import plain_splats, random_splats, straight_camera, tilted_camera
 from tools.stress.platforms import check_similarity
@@ -154,7 +154,7 @@ def view_by_view(device: Device) -> None:
         return
     scene, views = _apart()
     with patch.object(splat_groups, "LARGEST", 8), uploaded(device, scene) as whole:
-        sights = Sights.of(scene, views, INRIA.near)
+        sights = Visibility.of(scene, views, INRIA.near)
         for memory in (None, 0):
             with ViewByView(device, whole, views, sights, SweepOptions(0.0, memory=memory)) as removal:
                 removal.measure()
@@ -168,7 +168,7 @@ def part_by_part(device: Device) -> None:
     """The same scene in parts that see much of the same."""
     scene, views = _apart()
     with patch.object(splat_groups, "LARGEST", 8):
-        parts = parts_of_views(scene, views, INRIA.near)
+        parts = Visibility.of(scene, views).clusters()
         assert len(parts) > 1
         with PartedRemoval(device, scene, scene, views, parts, SweepOptions(0.0)) as removal:
             removal.measure()

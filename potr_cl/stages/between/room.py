@@ -13,15 +13,15 @@ import numpy as np
 
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
-from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import fits_whole
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.stages.pruning.prepared_views import PreparedViews
-from potr_cl.stages.pruning.sweep_options import default_memory
-from potr_cl.stages.pruning.visible_parts import LIKELY, SCENES, groups_of_large, seen_part
+from potr_cl.stages.pruning.visible_parts import SCENES
 from potr_cl.stages.stage import State, Workbench
+from potr_cl.views.budget import default_memory
+from potr_cl.views.visibility import MOST_SEEN, Visibility, groups_of_large, seen_part
 
 #: More bytes than a view takes, for each splat and each pixel: where there are so many, nothing has to be measured.
 _SPLAT, _PIXEL = 500, 200
@@ -55,7 +55,7 @@ def room_for(added: Sequence[Camera], state: State, bench: Workbench) -> int:
     if budget > _SPLAT * len(state.source) * (len(state.views) + len(added)) + _PIXEL * pixels:
         return len(added)
     sampled = _evenly(state.views, _SAMPLE), _evenly(added, _SAMPLE)
-    if seen_part(state.source, state.views) <= LIKELY:
+    if seen_part(state.source, state.views) <= MOST_SEEN:
         if _by_view(state, bench):
             own, more = (_nbytes_by_view(state, views) for views in (state.views, added))
             room = int(max((budget - own * len(state.views)) // more, _ANYWAY * len(state.views)))
@@ -91,7 +91,7 @@ def _nbytes_of_parts(state: State, bench: Workbench, views: Sequence[Camera]) ->
     """Bytes that is kept of a view where it is looked at with what it may draw and no more: the mean of some."""
     source = state.source
     with thread_pool(bench.threads) as pool:
-        sights = Sights.of(source, views, INRIA.near, groups_of_large(source, pool.map), pool.map)
+        sights = Visibility.of(source, views, INRIA.near, groups_of_large(source, pool.map), pool.map)
     held = [
         _nbytes(bench, source.subset(sights.groups.splats(seen)), [view])
         for view, seen in zip(views, sights.seen, strict=True)

@@ -25,7 +25,6 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
-from potr_cl.raster.culling import ViewPart
 from potr_cl.raster.macros import totals_limits
 from potr_cl.raster.preparing_memory import PreparingMemory
 from potr_cl.raster.rasterizer import Rasterizer
@@ -34,8 +33,10 @@ from potr_cl.stages.pruning.fixed_point import FixedPoint
 from potr_cl.stages.pruning.kept_views import target_bytes
 from potr_cl.stages.pruning.passing_parts import PassingParts
 from potr_cl.stages.pruning.removal import F64, Indices, RemovalSweep
-from potr_cl.stages.pruning.sweep_options import SweepOptions, default_memory
+from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.pruning.visible_parts import first_totals
+from potr_cl.views.budget import default_memory
+from potr_cl.views.visibility import ViewGroup
 
 #: Splats that are projected at a time to find which of them views draw.
 _PIECE = 1 << 20
@@ -66,7 +67,7 @@ class _Drawn:
     """
 
     number: int
-    part: ViewPart
+    part: ViewGroup
     bits: NDArray[np.uint8]
     count: int
     intersections: int
@@ -134,7 +135,7 @@ class DrawnRemoval(Owner):
         scene: Scene,
         whole: Drawable,
         cameras: Sequence[Camera],
-        parts: Sequence[ViewPart],
+        parts: Sequence[ViewGroup],
         options: SweepOptions,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         progress: Callable[[int, int], None] | None = None,
@@ -178,7 +179,7 @@ class DrawnRemoval(Owner):
             self._owned = owned.pop_all()
         self.kept_views = len(self._views) + len(self._idle)
 
-    def _find_drawn(self, part: ViewPart) -> list[_Drawn]:
+    def _find_drawn(self, part: ViewGroup) -> list[_Drawn]:
         """What the views of a part draw, each by itself."""
         drawn = [np.zeros(len(part.splats), bool) for _ in part.numbers]
         counts = [0] * len(drawn)

@@ -9,10 +9,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import lying_on, whole_on_device
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.view_shares import ViewShares
 from potr_cl.stages.pruning.drawn_removal import DrawnRemoval
 from potr_cl.stages.pruning.part import RemovalPart
 from potr_cl.stages.pruning.removal import RemovalSweep
@@ -21,6 +19,8 @@ from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.pruning.view_by_view import ViewByView, can_go_by_view
 from potr_cl.stages.pruning.visible_parts import PartedRemoval, first_totals
 from potr_cl.stages.stage import State, Workbench
+from potr_cl.views.shares import ViewShares
+from potr_cl.views.visibility import Visibility
 from potr_cl.workers.dealing import Shares, shares
 from potr_cl.workers.parts import Parts
 
@@ -33,7 +33,7 @@ def measurement(
     state: State,
     bench: Workbench,
     options: SweepOptions,
-    sights: Sights | None = None,
+    sights: Visibility | None = None,
     spared: NDArray[np.bool_] | None = None,
     dealt: ViewShares | None = None,
     seen: NDArray[np.int64] | None = None,
@@ -67,10 +67,10 @@ def measurement(
                     first = None if spared is None else first_totals(splats, spared)
                     yield stack.enter_context(ViewByView(device, whole, views, sights, *others_given, first))
                 elif device.family == "cpu":
-                    in_parts = (device, scene, whole, views, sights.parts(), *others_given, spared)
+                    in_parts = (device, scene, whole, views, sights.clusters(), *others_given, spared)
                     yield stack.enter_context(DrawnRemoval(*in_parts))
                 else:
-                    in_parts = (device, scene, whole, views, sights.parts(), *others_given, spared)
+                    in_parts = (device, scene, whole, views, sights.clusters(), *others_given, spared)
                     yield stack.enter_context(PartedRemoval(*in_parts))
                 return
             drawable = stack.enter_context(lying_on(device, bench.placed(state, seen)))

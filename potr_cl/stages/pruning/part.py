@@ -15,10 +15,9 @@ from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Scratch, Staging
 from potr_cl.opencl.narrow import Narrowing
 from potr_cl.opencl.relay import Lent
-from potr_cl.raster.culling import Sights
+from potr_cl.raster.carried import Excerpt
 from potr_cl.raster.kept_scene import KeptScene, PartOfKept, lying_on, whole_on_device
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.view_shares import Excerpt
 from potr_cl.stages.pruning.alive_packing import AlivePacking
 from potr_cl.stages.pruning.changed_totals import (
     ChangedTotals,
@@ -33,6 +32,7 @@ from potr_cl.stages.pruning.survivors import Bits
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.pruning.view_by_view import ViewByView, can_go_by_view
 from potr_cl.stages.pruning.visible_parts import PartedRemoval
+from potr_cl.views.visibility import Visibility
 from potr_cl.workers.pool import Part
 
 Indices = NDArray[np.int64]
@@ -45,7 +45,7 @@ class RemovalPart(Part):
         device: to compute on.
         memory: bytes of its memory that the views may take; None: the default.
         scene: the uncompressed scene, perhaps kept on devices; or of it what these views may draw
-            (:mod:`potr_cl.raster.view_shares`).
+            (:mod:`potr_cl.views.shares`).
         cameras: all views.
         options: speed/accuracy trade-offs.
         background: R, G, B behind the scene.
@@ -65,7 +65,7 @@ class RemovalPart(Part):
         options: SweepOptions,
         background: tuple[float, float, float],
         numbers: Sequence[int],
-        sights: Sights | None = None,
+        sights: Visibility | None = None,
     ) -> None:
         options = SweepOptions(**{**vars(options), "memory": memory})
         with ExitStack() as owned:
@@ -76,7 +76,7 @@ class RemovalPart(Part):
             if sights is not None and can_go_by_view(drawable, device, options):
                 self._sweep = ViewByView(device, drawable, cameras, sights, options, background, numbers=numbers)
             elif sights is not None and isinstance(drawable, Scene):
-                dealt = sights.parts(numbers)
+                dealt = sights.clusters(numbers)
                 by_parts = DrawnRemoval if device.family == "cpu" else PartedRemoval
                 self._sweep = by_parts(device, drawable, drawable, cameras, dealt, options, background)
             else:

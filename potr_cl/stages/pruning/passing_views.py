@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from potr_cl.errors import DeviceMemoryError
 from potr_cl.model.camera import Camera
 from potr_cl.opencl.memory import Memory, Owner, Reused, Scratch
-from potr_cl.raster.culling import Sights
 from potr_cl.raster.macros import totals_limits
 from potr_cl.raster.picked_splats import Picker
 from potr_cl.stages.pruning.kept_views import target_bytes
@@ -21,6 +20,7 @@ from potr_cl.stages.pruning.shrinking_scene import ShrinkingScene
 from potr_cl.stages.pruning.survivors import SplatState
 from potr_cl.stages.pruning.sweep_buffers import SweepBuffers
 from potr_cl.stages.pruning.view_batches import Batch, Ready, dealt_out
+from potr_cl.views.visibility import Visibility
 
 _SOURCE = "prune/parts.cl"
 _GROUP = 64
@@ -68,7 +68,9 @@ class PassingViews(Owner):
         """Which of all views they are."""
         return {number for batch in self._batches for number in batch.numbers}
 
-    def take(self, others: Sequence[int], sights: Sights, targets: NDArray[np.int64], passing: int, room: int) -> None:
+    def take(
+        self, others: Sequence[int], sights: Visibility, targets: NDArray[np.int64], passing: int, room: int
+    ) -> None:
         """Measure these views, too.
 
         Args:

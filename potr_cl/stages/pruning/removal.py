@@ -34,8 +34,9 @@ from potr_cl.stages.pruning.queues import Queues
 from potr_cl.stages.pruning.staleness import TileSchedule
 from potr_cl.stages.pruning.steering import Steering
 from potr_cl.stages.pruning.survivors import Survivors
-from potr_cl.stages.pruning.sweep_options import SweepOptions, default_memory
+from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.pruning.uncached_sweep import UncachedSweep
+from potr_cl.views.budget import default_memory
 
 F64 = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -9,9 +9,9 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from potr_cl.raster.culling import Sights
 from potr_cl.stages.pruning.launcher import SetKernels
 from potr_cl.stages.pruning.prepared_views import PreparedSet
+from potr_cl.views.visibility import Visibility
 
 #: Bytes that these views take while they are there: of each one's splats, and of those of all together.
 _OWN, _TOGETHER = 70, 56
@@ -53,7 +53,7 @@ class Ready:
     kernels: SetKernels
 
 
-def dealt_out(others: Sequence[int], sights: Sights, targets: NDArray[np.int64], passing: int) -> list[Batch]:
+def dealt_out(others: Sequence[int], sights: Visibility, targets: NDArray[np.int64], passing: int) -> list[Batch]:
     """Views in batches of neighbours, each of which takes no more bytes than may pass, if that can be.
 
     Args:

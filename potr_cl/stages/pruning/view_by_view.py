@@ -25,7 +25,6 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
-from potr_cl.raster.culling import Sights
 from potr_cl.raster.picked_splats import Picker, Picks
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
 from potr_cl.stages.pruning.fixed_point import FixedPoint
@@ -36,8 +35,10 @@ from potr_cl.stages.pruning.queues import Queues
 from potr_cl.stages.pruning.removal import F64, Indices
 from potr_cl.stages.pruning.shrinking_scene import ShrinkingScene
 from potr_cl.stages.pruning.survivors import Bits
-from potr_cl.stages.pruning.sweep_options import SweepOptions, default_memory
+from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.pruning.view_batches import Batch
+from potr_cl.views.budget import default_memory
+from potr_cl.views.visibility import Visibility
 
 #: Views that are swept at the same time: the longest list of one keeps a work-group busy when the others are done.
 _QUEUES = 8
@@ -79,7 +80,7 @@ class ViewByView(Owner):
         device: Device,
         whole: SceneBuffers,
         cameras: Sequence[Camera],
-        sights: Sights,
+        sights: Visibility,
         options: SweepOptions,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         progress: Callable[[int, int], None] | None = None,
@@ -125,7 +126,7 @@ class ViewByView(Owner):
 
     def _prepare_all(
         self,
-        sights: Sights,
+        sights: Visibility,
         mine: NDArray[np.bool_],
         picks: Picks,
         progress: Callable[[int, int], None] | None,

@@ -1,6 +1,6 @@
 """Removal effects of scenes of which no view sees much, on GPUs that have no room for them: :class:`PartedRemoval`.
 
-Views are dealt out to parts that see much of the same (:mod:`potr_cl.raster.culling`). Each part has a scene of the
+Views are dealt out to parts that see much of the same (:mod:`potr_cl.views.visibility`). Each part has a scene of the
 splats that its views may draw, and a :class:`~potr_cl.stages.pruning.removal.RemovalSweep` of its own, which projects
 these and no others. What the parts measure is added up by the splats' numbers. All totals are integers in units that
 follow from all views, so they are the same bits as of all views with all splats.
@@ -17,28 +17,20 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
-from potr_cl.model.splat_groups import SplatGroups
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
-from potr_cl.raster.culling import Sights, ViewPart, part_seen, work
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.rules import INRIA
 from potr_cl.raster.scene_buffers import SPLAT_GROUP, Drawable, SceneBuffers
 from potr_cl.stages.pruning.fixed_point import FixedPoint, zero_totals
 from potr_cl.stages.pruning.removal import F64, Indices, RemovalSweep
 from potr_cl.stages.pruning.steering import Steering
 from potr_cl.stages.pruning.survivors import Bits, Survivors
-from potr_cl.stages.pruning.sweep_options import SweepOptions, default_memory
+from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.views.budget import default_memory
+from potr_cl.views.visibility import ViewGroup, work
 
-#: Scenes of fewer splats are projected faster than parted.
-LEAST_SPLATS = 1 << 21
-#: Parts must save this much of the splats that views project, for their own copies and for what each part costs.
-WORTH_IT = 0.5
-#: The part that views seem to see, told from few splats, up to which it may be worth it.
-LIKELY = WORTH_IT
 #: The parts' scenes stay on the device if they take no more than this part of the memory.
 SCENES = 1 / 2
 #: Bytes that a view takes for each splat of its part while it is measured, or prepared to be kept: room for one is set
@@ -49,41 +41,6 @@ _SPARED, LARGEST_LIMIT = 1 << 58, 0.1
 
 _SOURCE = "prune/parts.cl"
 _GROUP = 64
-
-
-def seen_part(scene: Scene, cameras: Sequence[Camera]) -> float:
-    """Which part of a scene a view may draw on the average, told from few of both; 1 for a small scene."""
-    if len(scene) < LEAST_SPLATS or not cameras:
-        return 1.0
-    return part_seen(scene, cameras, INRIA.near)
-
-
-def groups_of_large(scene: Scene, run: Run = map) -> SplatGroups | None:
-    """The groups of a scene's splats, if it is so large that they are worth their time; ``run`` shares the work out."""
-    return SplatGroups.of(scene, run=run) if len(scene) >= LEAST_SPLATS else None
-
-
-def sights_worth_it(
-    scene: Scene,
-    cameras: Sequence[Camera],
-    options: SweepOptions,
-    groups: SplatGroups | None = None,
-    run: Run = map,
-) -> Sights | None:
-    """What the views see; None where they had better share one scene.
-
-    Args:
-        scene: clean.
-        cameras: the views.
-        options: of the sweep.
-        groups: of the scene, where they are known.
-        run: shares the work out.
-    """
-    # A sample of the tiles is drawn from all of them in turn.
-    if len(scene) < LEAST_SPLATS or not cameras:
-        return None
-    sights = Sights.of(scene, cameras, INRIA.near, groups, run)
-    return sights if sights.totals.sum() <= WORTH_IT * len(scene) * len(cameras) else None
 
 
 def first_totals(splats: int, spared: NDArray[np.bool_] | None) -> NDArray[np.int64]:
@@ -146,7 +103,7 @@ class PartedRemoval(Owner):
         scene: Scene,
         whole: Drawable,
         cameras: Sequence[Camera],
-        parts: Sequence[ViewPart],
+        parts: Sequence[ViewGroup],
         options: SweepOptions,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         progress: Callable[[int, int], None] | None = None,
