@@ -18,9 +18,8 @@ from potr_cl.raster.surely_seen import surely_seen
 from potr_cl.stages.guarded import UNRESOLVED
 from potr_cl.stages.pruning.measured import Measured, Removal, measurement
 from potr_cl.stages.pruning.on_device import prune_scene
-from potr_cl.stages.pruning.removal import RemovalSweep
+from potr_cl.stages.pruning.removal import LARGEST_LIMIT, RemovalSweep
 from potr_cl.stages.pruning.schedule import Course, Pruned, PruningOptions
-from potr_cl.stages.pruning.shared_removal import SharedRemoval
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.pruning.unseen import (
     CHOICES,
@@ -29,7 +28,6 @@ from potr_cl.stages.pruning.unseen import (
     find_unseen,
     without_directions,
 )
-from potr_cl.stages.pruning.visible_parts import LARGEST_LIMIT
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
 from potr_cl.views.shares import ViewShares
 from potr_cl.views.visibility import MOST_SEEN, Visibility, groups_of_large, seen_part, visibility_of_large
@@ -304,9 +302,7 @@ def part_of_time(iterations: float, stays: bool) -> float:
 
 
 def _views_that_stay(removal: Removal) -> float:
-    if isinstance(removal, SharedRemoval):
-        return math.inf  # others have them
-    return removal.cached_views if isinstance(removal, RemovalSweep) else removal.kept_views
+    return removal.resident_views if isinstance(removal, RemovalSweep) else math.inf  # others have them
 
 
 def _dealt(state: State, seen: NDArray[np.int64] | None, pool: Pool, sights: Visibility) -> ViewShares:

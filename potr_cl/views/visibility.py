@@ -20,6 +20,7 @@ from potr_cl.model.morton import morton_order
 from potr_cl.model.scene import Scene
 from potr_cl.model.splat_groups import Indices, SplatGroups
 from potr_cl.raster.rules import INRIA
+from potr_cl.views.groups import ViewGroup
 
 #: A cluster's views see so many times as many splats together as three quarters of the views each at most, or this part
 #: of the scene. The others, which see more alone, are one cluster.
@@ -31,19 +32,6 @@ LEAST_SPLATS = 1 << 21
 MOST_SEEN = 1 / 2
 #: Few of the splats, one in so many, and so many views tell about which part of a scene views see.
 _SAMPLED, _VIEWS = 64, 48
-
-
-@dataclass(frozen=True)
-class ViewGroup:
-    """Some views and what they may draw.
-
-    Attributes:
-        numbers: of the views, ascending.
-        splats: their numbers in the scene, ascending.
-    """
-
-    numbers: list[int]
-    splats: Indices
 
 
 @dataclass(frozen=True)
@@ -60,7 +48,10 @@ class Visibility:
 
     @staticmethod
     def of(
-        scene: Scene, cameras: Sequence[Camera], near: float = INRIA.near, groups: SplatGroups | None = None,
+        scene: Scene,
+        cameras: Sequence[Camera],
+        near: float = INRIA.near,
+        groups: SplatGroups | None = None,
         run: Run = map,
     ) -> Visibility:
         """What some views may draw.
@@ -155,7 +146,11 @@ class Visibility:
                 dealt.append([number])
                 together = seen[number]
         dealt.append(order[totals[order] > most].tolist())
-        return [ViewGroup(sorted(own), groups.splats(self._seen_by(own))) for own in dealt if own]
+        return [self._cluster(sorted(own)) for own in dealt if own]
+
+    def _cluster(self, numbers: Sequence[int]) -> ViewGroup:
+        splats = self.groups.splats(self._seen_by(numbers))
+        return ViewGroup(tuple(numbers), len(splats), among=splats)
 
     def _seen_by(self, numbers: Sequence[int]) -> NDArray[np.bool_]:
         """(G,) the groups that some views see together, at least one: a scene has splats."""
@@ -203,8 +198,3 @@ def visibility_of_large(
         return None
     visibility = Visibility.of(scene, cameras, INRIA.near, groups, run)
     return visibility if visibility.totals.sum() <= MOST_SEEN * len(scene) * len(cameras) else None
-
-
-def work(groups: Sequence[ViewGroup]) -> int:
-    """Splats that all views project, each those of its group."""
-    return sum(len(group.numbers) * len(group.splats) for group in groups)

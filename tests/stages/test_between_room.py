@@ -11,7 +11,7 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.stages.between.room import room_for
-from potr_cl.stages.pruning.drawn_removal import DrawnRemoval
+from potr_cl.stages.pruning.planned import planned_sweep
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.views import visibility
@@ -81,6 +81,6 @@ def test_what_is_added_is_kept():
     found = rooms(device, memories)
     some = int(np.flatnonzero((np.array(found) > 0) & (np.array(found) < len(more)))[0])
     views = [*own, *more[: found[some]]]
-    parts, options = Visibility.of(scene, views).clusters(), SweepOptions(memory=memories[some])
-    with DrawnRemoval(device, scene, scene, views, parts, options) as removal:
-        assert removal.kept_views == len(views)
+    options = SweepOptions(memory=memories[some])
+    with planned_sweep(device, scene, views, options, visibility=Visibility.of(scene, views)) as removal:
+        assert removal.resident_views == len(views)

@@ -200,19 +200,19 @@ def test_workers_with_gpus_look_at_each_view_with_what_it_may_draw(keep, monkeyp
     expected = encode(scene, cameras, options, device=open_device(family)).data
     monkeypatch.setattr("potr_cl.raster.kept_scene.fits_whole", lambda device, scene: True)
     made = []
-    for module, name in (("pruning", "ViewByView"), ("refitting", "VisibleTargets")):
-        where = f"potr_cl.stages.{module}.part.{name}"
-        kind = importlib.import_module(where.rpartition(".")[0]).__dict__[name]
+    for where, name in (("pruning.planned", "NamedSplats"), ("refitting.part", "VisibleTargets")):
+        where = f"potr_cl.stages.{where}"
+        kind = importlib.import_module(where).__dict__[name]
 
         def noted(*args, kind=kind, **named):
             made.append(kind.__name__)
             return kind(*args, **named)
 
-        monkeypatch.setattr(where, noted)
+        monkeypatch.setattr(f"{where}.{name}", noted)
     devices = [open_device(family) for _ in range(3)]
     with ElsewherePool(devices) as pool:
         assert encode(scene, cameras, options, device=devices[0], pool=pool).data == expected
-    assert made.count("ViewByView") == 2
+    assert made.count("NamedSplats") == 2
     assert made.count("VisibleTargets") == 4
     assert [device.allocated for device in devices] == [0] * 3
 

@@ -32,9 +32,9 @@ from potr_cl.raster.scene_buffers import SceneBuffers, uploaded
 from potr_cl.raster.surely_seen import Seen, surely_seen
 from potr_cl.stages.fitting.fit import FitOptions, fit_scene
 from potr_cl.stages.fitting.settling import Looking, Settling, settle
+from potr_cl.stages.pruning.planned import planned_sweep
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.sweep_options import SweepOptions
-from potr_cl.stages.pruning.view_by_view import ViewByView
 from potr_cl.stages.refitting.targets import RenderedTargets
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.views.visibility import Visibility
@@ -87,7 +87,7 @@ def _by_view(device: Device, scene: Scene, view: Camera) -> float:
     gone = np.arange(0, len(scene), 3)
     left = np.setdiff1d(np.arange(len(scene)), gone)
 
-    def measured(removal: RemovalSweep | ViewByView) -> NDArray[np.float64]:
+    def measured(removal: RemovalSweep) -> NDArray[np.float64]:
         before = np.stack(removal.measure())
         removal.remove(gone)
         after = np.stack(removal.measure())
@@ -99,7 +99,10 @@ def _by_view(device: Device, scene: Scene, view: Camera) -> float:
     sights = Visibility.of(scene, views, INRIA.near)
     for memory in (None, 0):
         options = SweepOptions(0.0, memory=memory)
-        with uploaded(device, scene) as whole, ViewByView(device, whole, views, sights, options) as removal:
+        with (
+            uploaded(device, scene) as whole,
+            planned_sweep(device, whole, views, options, visibility=sights) as removal,
+        ):
             number += differing(measured(removal), wanted)
     return number
 

@@ -10,7 +10,7 @@ from potr_cl.opencl.kernel import Kernel
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.view_set import camera_struct
 from potr_cl.stages.pruning.fixed_point import FixedPoint
-from potr_cl.stages.pruning.prepared_views import PreparedSet
+from potr_cl.stages.pruning.prepared_set import PreparedSet
 from potr_cl.stages.pruning.sweep_buffers import SweepBuffers
 
 _SOURCE = "prune/removal_cpu.cl"

@@ -6,12 +6,13 @@ from typing import Protocol
 
 import pyopencl as cl
 
+from potr_cl.opencl.device import Device
 from potr_cl.raster.macros import totals_limits
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.fixed_point import FixedPoint
 from potr_cl.stages.pruning.launch_cpu import CpuLauncher
 from potr_cl.stages.pruning.launch_gpu import GpuLauncher
-from potr_cl.stages.pruning.prepared_views import PreparedSet
+from potr_cl.stages.pruning.prepared_set import PreparedSet
 from potr_cl.stages.pruning.sweep_buffers import SweepBuffers
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 
@@ -92,5 +93,9 @@ def launcher_for(rasterizer: Rasterizer, options: SweepOptions, fixed_point: Fix
         "ALPHA_CAP": float(rules.alpha_cap),
         "TRANSMITTANCE_THRESHOLD": rules.transmittance_threshold if threshold is None else threshold,
     } | totals_limits(device)
-    launcher = GpuLauncher if device.family == "gpu" else CpuLauncher
-    return launcher(rasterizer, fixed_point, macros)
+    return launchers(device)(rasterizer, fixed_point, macros)
+
+
+def launchers(device: Device) -> type[CpuLauncher | GpuLauncher]:
+    """The kind of a device's launchers."""
+    return GpuLauncher if device.family == "gpu" else CpuLauncher

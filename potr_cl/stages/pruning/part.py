@@ -17,7 +17,6 @@ from potr_cl.opencl.narrow import Narrowing
 from potr_cl.opencl.relay import Lent
 from potr_cl.raster.carried import Excerpt
 from potr_cl.raster.kept_scene import KeptScene, PartOfKept, lying_on, whole_on_device
-from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.alive_packing import AlivePacking
 from potr_cl.stages.pruning.changed_totals import (
     ChangedTotals,
@@ -26,12 +25,9 @@ from potr_cl.stages.pruning.changed_totals import (
     changes_on_host,
     numbers_or_bits,
 )
-from potr_cl.stages.pruning.drawn_removal import DrawnRemoval
-from potr_cl.stages.pruning.removal import RemovalSweep
+from potr_cl.stages.pruning.planned import planned_sweep
 from potr_cl.stages.pruning.survivors import Bits
 from potr_cl.stages.pruning.sweep_options import SweepOptions
-from potr_cl.stages.pruning.view_by_view import ViewByView, can_go_by_view
-from potr_cl.stages.pruning.visible_parts import PartedRemoval
 from potr_cl.views.visibility import Visibility
 from potr_cl.workers.pool import Part
 
@@ -70,19 +66,10 @@ class RemovalPart(Part):
         options = SweepOptions(**{**vars(options), "memory": memory})
         with ExitStack() as owned:
             drawable = owned.enter_context(lying_on(device, scene))
-            self._sweep: RemovalSweep | ViewByView | PartedRemoval | DrawnRemoval
             if sights is not None:
                 drawable = owned.enter_context(whole_on_device(device, drawable))
-            if sights is not None and can_go_by_view(drawable, device, options):
-                self._sweep = ViewByView(device, drawable, cameras, sights, options, background, numbers=numbers)
-            elif sights is not None and isinstance(drawable, Scene):
-                dealt = sights.clusters(numbers)
-                by_parts = DrawnRemoval if device.family == "cpu" else PartedRemoval
-                self._sweep = by_parts(device, drawable, drawable, cameras, dealt, options, background)
-            else:
-                rasterizer = owned.enter_context(Rasterizer(device, drawable, background=background))
-                self._sweep = RemovalSweep(rasterizer, cameras, options, numbers=numbers)
-            owned.callback(self._sweep.close)
+            sweep = planned_sweep(device, drawable, cameras, options, background, sights, numbers)
+            self._sweep = owned.enter_context(sweep)
             steering = self._sweep.steering
             self._alive = (
                 None

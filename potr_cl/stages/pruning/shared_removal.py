@@ -22,13 +22,13 @@ from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner, Scratch
 from potr_cl.opencl.narrow import Narrowing
 from potr_cl.opencl.relay import Lent, Relay
+from potr_cl.raster.scene_buffers import stride_of
 from potr_cl.stages.pruning.alive_packing import AlivePacking
 from potr_cl.stages.pruning.changed_totals import AddedChanges, numbers_of
 from potr_cl.stages.pruning.fixed_point import FixedPoint, zero_totals
 from potr_cl.stages.pruning.removal import F64, Indices, RemovalSweep
-from potr_cl.stages.pruning.steering import Steered, Steering
+from potr_cl.stages.pruning.steering import Steered
 from potr_cl.stages.pruning.survivors import Bits, Survivors
-from potr_cl.stages.pruning.view_by_view import ViewByView
 from potr_cl.workers.parts import Each, Parts, Pending
 from potr_cl.workers.pool import Pool
 
@@ -41,7 +41,7 @@ class SharedRemoval(Owner):
 
     Args:
         device: the master's.
-        splats: N. stride: N padded.
+        splats: N.
         cameras: all views.
         own: measures the master's share of the views; None if it has none.
         others: parts, each a :class:`potr_cl.stages.pruning.part.RemovalPart`, that measure the rest.
@@ -61,9 +61,8 @@ class SharedRemoval(Owner):
         self,
         device: Device,
         splats: int,
-        stride: int,
         cameras: Sequence[Camera],
-        own: RemovalSweep | ViewByView | None,
+        own: RemovalSweep | None,
         others: Parts,
         pool: Pool,
         steers: bool,
@@ -81,7 +80,7 @@ class SharedRemoval(Owner):
         self.steering: Steered | None = None
         with ExitStack() as owned:
             if steers:
-                self.steering = owned.enter_context(_SharedSteering(self, device, stride))
+                self.steering = owned.enter_context(_SharedSteering(self, device))
             self._owned = owned.pop_all()
 
     @property
@@ -183,13 +182,12 @@ class SharedRemoval(Owner):
 class _SharedSteering(Owner):
     """A :class:`potr_cl.stages.pruning.steering.Steered` whose totals are the sums over all that measure."""
 
-    def __init__(self, shared: SharedRemoval, device: Device, stride: int) -> None:
+    def __init__(self, shared: SharedRemoval, device: Device) -> None:
         self._shared = shared
         self.device, self.splats, self.units = device, shared.splats, shared._fixed_point.units
         own = None if shared._own is None else shared._own.steering
-        assert own is None or isinstance(own, (Steering, ViewByView))
-        self._own: Steering | ViewByView | None = own
-        self._memory = Memory(device)
+        self._own = own
+        self._memory, stride = Memory(device), stride_of(shared.splats)
         self._marks: Survivors | None = None
         self._relay = Relay(device) if shared._in_process else None
         self._added: AddedChanges | None = None

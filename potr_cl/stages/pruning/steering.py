@@ -9,8 +9,6 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.opencl.device import Device
-from potr_cl.stages.pruning.cached_sweep import CachedSweep
-from potr_cl.stages.pruning.survivors import Bits, Survivors
 
 
 class Steered(Protocol):
@@ -42,61 +40,3 @@ class Steered(Protocol):
 
     def remove_marked(self) -> None:
         """Take the splats out that are marked JUST_REMOVED."""
-
-
-class Steering:
-    """A :class:`Steered` sweep of views that one device does.
-
-    The device lists the tiles that the next measurement sweeps; the host learns only how many they are.
-
-    Args:
-        device: where everything is.
-        cached: the sweep of the views, all of which are cached.
-        survivors: the splats that are left.
-        tolerance: staleness above which a tile is swept again.
-        totals: that the sweep keeps up to date.
-        units: ΔMSE and I of 1 in the totals.
-        splats: N.
-
-    Attributes:
-        device, totals, units, splats, marks: see :class:`Steered`.
-    """
-
-    def __init__(
-        self,
-        device: Device,
-        cached: CachedSweep,
-        survivors: Survivors,
-        tolerance: float,
-        totals: cl.Buffer,
-        units: tuple[float, float],
-        splats: int,
-    ) -> None:
-        self._cached, self._survivors, self._tolerance = cached, survivors, tolerance
-        self.device, self.totals, self.units, self.splats = device, totals, units, splats
-        self.marks = survivors.buffer
-
-    @property
-    def alive(self) -> NDArray[np.bool_]:
-        return self._survivors.alive
-
-    def mark(self, splats: Bits) -> None:
-        """Mark splats that a controller elsewhere has chosen, as its :meth:`just_marked` gives them.
-
-        :meth:`remove_marked` follows.
-        """
-        self._survivors.mark(splats)
-
-    def just_marked(self) -> Bits:
-        """The splats that are marked JUST_REMOVED, see :meth:`Survivors.just_marked`."""
-        return self._survivors.just_marked()
-
-    def measure_on_device(self) -> None:
-        if not self._cached.device_has_listed:  # nothing is marked, so this only lists the stale tiles
-            self._survivors.settle()
-            self.remove_marked()
-        self._cached.measure()
-
-    def remove_marked(self) -> None:
-        self._cached.have_listed(self._tolerance)
-        self._survivors.marked_by_device()
