@@ -11,7 +11,7 @@ Follow it in this order:
    does not fit?*
 
 A stage is a *use*: it says what it makes of a set of prepared views, and adds up exact integers by the splats' numbers
-in the scene, so that plans, devices and computers give the same bits. Pruning is one (potr_cl/stages/pruning/removal.py).
+in the scene, so that plans, devices and computers give the same bits. Pruning is one (stages/pruning/removal.py).
 Others come onto it like this. A fit or a re-fit gives :class:`~potr_cl.views.engine.ViewEngine` an ``attach`` that
 takes a set's own buffers, binds its kernels for ``engine.resident``, and walks ``engine.streamed`` by
 ``engine.stream(group, None)`` and ``engine.prepared(numbers, subset)``. Judging makes its pictures in the same walk

@@ -137,7 +137,7 @@ def test_who_is_told_again_is_told_the_colours_of_then(lost_at, monkeypatch, plu
     cameras = [smaller(camera, 80) for camera in plush_excerpt_cameras[:5]]
     devices = [open_device("cpu") for _ in range(3)]
     expected = encode(plush_excerpt, cameras, options, device=devices[0]).data
-    measure, asked = part.RemovalPart.measure_changes, []
+    measure, asked = part.RemovalPart.changes, []
 
     def losing(removal):
         if not asked or asked[0] is removal:
@@ -146,7 +146,7 @@ def test_who_is_told_again_is_told_the_colours_of_then(lost_at, monkeypatch, plu
                 raise DeviceMemoryError("no room")
         return measure(removal)
 
-    monkeypatch.setattr(part.RemovalPart, "measure_changes", losing)
+    monkeypatch.setattr(part.RemovalPart, "changes", losing)
     with ElsewherePool(devices) as pool:
         assert encode(plush_excerpt, cameras, options, device=devices[0], pool=pool).data == expected
     assert asked.count(asked[0]) == lost_at
