@@ -61,6 +61,7 @@ def planned_sweep(
             source = owned.enter_context(CopiedSplats(device, scene, drawable, background))
             if device.family == "cpu":
                 plan = plans.as_drawn(source, cameras, clusters, memory, progress)
+                progress = None  # that was most of it
             else:
                 plan = plans.by_cluster(clusters, memory, scene.nbytes // max(len(scene), 1))
         else:

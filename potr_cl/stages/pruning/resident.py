@@ -9,7 +9,6 @@ many they are; for CPU kernels, and where views take turns, the host chooses whe
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,7 @@ from potr_cl.stages.pruning.staleness import TileSchedule
 from potr_cl.stages.pruning.survivors import Survivors
 from potr_cl.stages.pruning.sweep_buffers import SweepBuffers
 from potr_cl.stages.pruning.sweep_options import SweepOptions
-from potr_cl.views.engine import Ready, ViewEngine
+from potr_cl.views.engine import ViewEngine
 
 
 class ResidentSweep(Owner):
@@ -119,13 +118,15 @@ class ResidentSweep(Owner):
             return
         if not self.device_lists:
             self._take_marks()
-            self._queues.enqueue([kernels.note_removal for kernels in self._kernels])
+            for kernels, queue in self._queues.dealt(self._kernels):
+                kernels.note_removal(queue)
             self._counts = None
             return
         self._sweep_listed()
         above = self._options.tolerance if tolerance is None else tolerance
         self._device.fill(self._listed, np.uint32(0))
-        self._queues.enqueue([partial(kernels.note_removal, list_above=above) for kernels in self._kernels])
+        for kernels, queue in self._queues.dealt(self._kernels):
+            kernels.note_removal(queue, list_above=above)
         self._queues.wait()
         self._counts = self._device.download(self._listed, (len(self._sets),), np.uint32).tolist()
 
@@ -150,6 +151,7 @@ class ResidentSweep(Owner):
                 source.project(ready.subset, ready.views)
                 if self._engine.plan.copies_rest:
                     source.rest(ready.subset)
+        self._engine.source.forget_scratch()
 
     # ---------------------------------------------------------------------------------------------------------------
 
@@ -193,7 +195,9 @@ class ResidentSweep(Owner):
         if work:
             # The longest first, so that nothing long begins at the end.
             work.sort(key=lambda each: -each[0])
-            self._queues.enqueue([partial(self._sweep, self._sets[place], place, count) for count, place in work])
+            for (count, place), queue in self._queues.dealt(work):
+                self._engine.project(self._sets[place])
+                self._kernels[place].sweep(self._firsts[place], count, queue)
             self.tiles_swept += sum(counts)
             self._queues.wait()
             for ready in self._sets:
@@ -203,10 +207,6 @@ class ResidentSweep(Owner):
             for kernels in self._kernels:
                 kernels.target_is_known()
             self._targets_known = True
-
-    def _sweep(self, ready: Ready[PreparedSet], place: int, count: int, queue: cl.CommandQueue) -> None:
-        self._engine.project(ready)
-        self._kernels[place].sweep(ready.work.first_tile, count, queue)
 
     def close(self) -> None:
         self._memory.close()
