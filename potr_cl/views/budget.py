@@ -67,6 +67,10 @@ class Budget(Protocol):
     def took(self, group: ViewGroup, nbytes: int) -> None:
         """Note what it has taken, on the device; 0: nothing of it stays."""
 
+    def of_pictures(self, groups: Sequence[ViewGroup]) -> int:
+        """Bytes that the pictures of streamed views may take which they are compared with."""
+        return 0
+
 
 class Shared(Budget):
     """One room for clusters of views, whose own scenes count too; each gets its part of what is left.
@@ -107,31 +111,29 @@ class Named(Budget):
         totals: bytes of what they measure together.
 
     Attributes:
-        left: bytes.
         streamed: bytes that streamed views may take while they are there.
     """
 
     def __init__(self, memory: int, groups: Sequence[ViewGroup], cameras: Sequence[Camera], totals: int) -> None:
-        self.left, self.streamed = memory, int(STREAMED_NAMED * memory)
+        self._left, self.streamed = memory, int(STREAMED_NAMED * memory)
         self._targets = {number: target_bytes(cameras[number]) for each in groups for number in each.numbers}
         # For the targets of all views that do not stay room is left, unless all will stay.
         self._reserved = 0
         if _NAMED * sum(each.count for each in groups) + sum(self._targets.values()) > memory:
-            self.left -= self.streamed + totals
+            self._left -= self.streamed + totals
             self._reserved = sum(self._targets.values())
 
     def room(self, group: ViewGroup) -> float:
         target = self._target(group)
         self._reserved = max(self._reserved - target, 0)
-        room = self.left - self._reserved
+        room = self._left - self._reserved
         return -1 if _LEAST * _NAMED * group.count + target > room else room
 
     def took(self, group: ViewGroup, nbytes: int) -> None:
-        self.left -= nbytes or self._target(group)
+        self._left -= nbytes or self._target(group)
 
     def of_pictures(self, groups: Sequence[ViewGroup]) -> int:
-        """Bytes that the pictures of these streamed views may take."""
-        return self.left + sum(map(self._target, groups))
+        return self._left + sum(map(self._target, groups))
 
     def _target(self, group: ViewGroup) -> int:
         return sum(self._targets[number] for number in group.numbers)

@@ -52,8 +52,6 @@ class ViewPlan:
         copies_rest: whether copies of splats are on the device only while they are projected.
         patience: how much streamed views may have lost before they are looked at again, in tolerances of a tile; 0:
             they are looked at each time.
-        keeps_pictures: where pictures of streamed views stay that they are compared with: "host", or "device" as long
-            as there is room. Others are made again from all splats of the group.
     """
 
     groups: Sequence[ViewGroup]
@@ -64,7 +62,6 @@ class ViewPlan:
     queues: int = 0
     copies_rest: bool = False
     patience: float = 0.0
-    keeps_pictures: str = ""
 
     @property
     def numbers(self) -> list[int]:
@@ -100,7 +97,7 @@ def by_view(
 
     idle = [number for number in order if not counts[number]]
     return ViewPlan(
-        groups, budget, idle, together, queues=8, patience=_PATIENCE, keeps_pictures="device"
+        groups, budget, idle, together, queues=8, patience=_PATIENCE
     )  # fmt: skip
 
 
@@ -172,9 +169,7 @@ def as_drawn(
 
     widest_first = sorted((each for each in found if each.count), key=lambda each: (-each.nbytes, each.numbers))
     idle = [number for each in found if not each.count for number in each.numbers]
-    return ViewPlan(
-        widest_first, budget, idle, together, queues=8, copies_rest=True, patience=_PATIENCE, keeps_pictures="host"
-    )
+    return ViewPlan(widest_first, budget, idle, together, queues=8, copies_rest=True, patience=_PATIENCE)
 
 
 def _drawn(source: CopiedSplats, cameras: Sequence[Camera], cluster: ViewGroup) -> list[ViewGroup]:

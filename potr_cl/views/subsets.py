@@ -61,14 +61,13 @@ class Subset:
 
 
 class SplatSource(Owner):
-    """Gives groups their splats, in the colours of now or in those of the beginning.
+    """Gives groups their splats, in the colours that they have by now.
 
     Attributes:
         device: where.
         splats: N, of the scene. stride: N padded.
         selects: whether a group that is opened for those that are left has no others.
         copies: whether it wants to know on the host which splats are left.
-        recoloured: whether the colours are others than in the beginning.
     """
 
     device: Device
@@ -76,7 +75,8 @@ class SplatSource(Owner):
     stride: int
     selects = True
     copies = False
-    recoloured = False
+    #: Coefficients on the device that a subset's rasterizer has not.
+    _other_sh: cl.Buffer | None = None
 
     def streams_in(self) -> Memory:
         """Memory for one streamed group after the other."""
@@ -100,20 +100,11 @@ class SplatSource(Owner):
         """Give the scene other SH coefficients, (N, M, 3) float32 of the same degree."""
 
     def project(
-        self,
-        subset: Subset,
-        views: ViewSet,
-        shapes: cl.Buffer | None = None,
-        colours: cl.Buffer | None = None,
-        former: bool = False,
+        self, subset: Subset, views: ViewSet, shapes: cl.Buffer | None = None, colours: cl.Buffer | None = None
     ) -> None:
-        """Enqueue the projection of prepared views, in the colours of now or ``former`` ones."""
+        """Enqueue the projection of prepared views, in the colours of now."""
         self.wake(subset)
-        subset.rasterizer.project(views, self._sh(subset, former), shapes, colours)
-
-    def _sh(self, subset: Subset, former: bool) -> cl.Buffer | None:
-        """The coefficients to project with; None: those that the subset's rasterizer has."""
-        return None
+        subset.rasterizer.project(views, self._other_sh, shapes, colours)
 
     @contextmanager
     def foreseen(self, groups: Sequence[ViewGroup]) -> Iterator[None]:
@@ -148,27 +139,14 @@ class WholeScene(SplatSource):
     def __init__(self, rasterizer: Rasterizer) -> None:
         self.device, self.splats, self.stride = rasterizer.device, rasterizer.splats, rasterizer.stride
         self._subset = Subset(rasterizer, rasterizer.splats)
-        self._former: cl.Buffer | None = None
-        self._memory = Memory(rasterizer.device)
 
     def open(self, stack: ExitStack, memory: Memory, group: ViewGroup, left: Left | None = None) -> Subset:
         return self._subset
 
     def replace_sh(self, sh: FloatArray) -> None:
-        rasterizer = self._subset.rasterizer
-        before, former = rasterizer.sh, rasterizer.replace_sh(sh)
-        if self._former is None:
-            self._former, self.recoloured = before, True
-            if former is not None:
-                self._memory.adopt(former)
-        elif former is not None:
+        former = self._subset.rasterizer.replace_sh(sh)
+        if former is not None:
             self.device.free(former)
-
-    def _sh(self, subset: Subset, former: bool) -> cl.Buffer | None:
-        return self._former if former else None
-
-    def close(self) -> None:
-        self._memory.close()
 
 
 class _Parted(SplatSource):
@@ -198,7 +176,6 @@ class NamedSplats(_Parted):
     ) -> None:
         super().__init__(whole.device, whole, whole.stride, background)
         self._whole, self._memory = whole, Memory(whole.device)
-        self._other: cl.Buffer | None = None
         self._picker = Picker(whole.device, group_of)
         self._foreseen: tuple[Picks, dict[ViewGroup, int]] | None = None
 
@@ -216,8 +193,8 @@ class NamedSplats(_Parted):
         if not count:
             return None
         picked = PickedSplats(self._whole, numbers, count)
-        if self._other is not None:
-            picked.sh = self._other
+        if self._other_sh is not None:
+            picked.sh = self._other_sh
         return Subset(stack.enter_context(self._rasterizer(picked)), count, numbers)
 
     @contextmanager
@@ -234,14 +211,10 @@ class NamedSplats(_Parted):
                 self._foreseen = None
 
     def replace_sh(self, sh: FloatArray) -> None:
-        former, self._other = self._other, self._whole.other_sh(self._memory, sh)
-        self.recoloured = True
+        former, self._other_sh = self._other_sh, self._whole.other_sh(self._memory, sh)
         if former is not None:
             self.device.queue.finish()
             self._memory.free(former)
-
-    def _sh(self, subset: Subset, former: bool) -> cl.Buffer | None:
-        return self._whole.sh if former else self._other
 
     def close(self) -> None:
         for owner in (self._picker, self._memory, self._preparing):
@@ -264,7 +237,6 @@ class CopiedSplats(_Parted):
         super().__init__(device, scene, stride_of(len(scene)), background)
         self._scene, self._whole = scene, whole
         self._other: FloatArray | None = None
-        self._in_former: SceneBuffers | None = None  # the copy that has the colours of the beginning for now
 
     def empty(self, count: int) -> SceneBuffers:
         """Room for so many splats."""
@@ -294,16 +266,7 @@ class CopiedSplats(_Parted):
         return Subset(rasterizer, len(splats), memory.upload(named, "the numbers of a view's splats"), named, own)
 
     def replace_sh(self, sh: FloatArray) -> None:
-        self._other, self.recoloured = sh, True
-
-    def _sh(self, subset: Subset, former: bool) -> cl.Buffer | None:
-        own = subset.scene
-        if self._other is None or own is None or not (former or self._in_former is own):
-            return None
-        assert subset.splats is not None
-        own.write_sh_of(self._scene.sh if former else self._other, subset.splats.astype(np.int64))
-        self._in_former = own if former else None
-        return None
+        self._other = sh
 
     def recolour(self, subset: Subset) -> None:
         if self._other is not None and subset.scene is not None and not subset.scene.rests:

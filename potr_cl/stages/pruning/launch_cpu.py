@@ -99,11 +99,6 @@ class _CpuKernels:
     def sweep_all(self) -> None:
         self.sweep(0, self._tiles)  # the sweep itself takes removed splats out of the lists
 
-    def store_target(self) -> None:
-        self._removal.set(first_time=1)
-        self.sweep(0, self._tiles)
-        self.target_is_known()
-
     def target_is_known(self) -> None:
         self._removal.set(first_time=0)
 

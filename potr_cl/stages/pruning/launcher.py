@@ -31,10 +31,6 @@ class SetKernels(Protocol):
         """Enqueue the sweep of every tile, without what removed splats left in the lists. The list of tiles must begin
         with all numbers of the set's tiles."""
 
-    def store_target(self) -> None:
-        """Enqueue that the target picture is stored, from now on to be compared with; no splat must have been removed.
-        The list of tiles must begin with all numbers of the set's tiles. Sums and totals mean nothing afterwards."""
-
     def target_is_known(self) -> None:
         """From now on, sweeps compare with the target picture instead of storing it."""
 

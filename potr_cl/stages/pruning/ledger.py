@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import numpy as np
 import pyopencl as cl
 
@@ -50,7 +47,6 @@ class Ledger(Owner):
                 self.marks = self._memory.upload(alive, "the splats that are left")
                 self.totals = self._memory.upload(zero_totals(stride), "the removal effects")
             self.numbers = None
-            self._stride = stride
 
     def take_marks(self) -> None:
         """Enqueue that the marks are those of the scene."""
@@ -61,17 +57,6 @@ class Ledger(Owner):
         """Enqueue that what the kernels have added is added to the scene's totals, (N, 2) int64."""
         if self.is_local:
             self._launch("add_part", totals=totals, part=self.totals)
-
-    @contextmanager
-    def none_removed(self) -> Iterator[None]:
-        """Inside the block, the kernels see all splats as alive."""
-        if not self.is_local:
-            with self._survivors.none_removed():
-                yield
-            return
-        self._device.fill(self.marks, np.uint8(SplatState.ALIVE), self._stride)
-        yield
-        self.take_marks()
 
     def _launch(self, name: str, **given: cl.Buffer) -> None:
         kernel = shared_kernel(self._device, name)

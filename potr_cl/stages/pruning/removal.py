@@ -10,7 +10,7 @@ together, with which splats, and which of them stay on the device: that is the p
 The parts: sweep_options.py (what may be traded for speed), resident.py and streamed.py (measuring views that stay on
 the device and views that do not), prepared_set.py (what is kept of them), ledger.py (who numbers splats how),
 launcher.py (the kernels of either family), staleness.py (which tiles the host has swept again), survivors.py (which
-splats are left), fixed_point.py (the totals' units) and steering.py (what a controller on the device needs).
+splats are left) and fixed_point.py (the totals' units).
 """
 
 from __future__ import annotations
@@ -66,7 +66,11 @@ class RemovalSweep(Owner):
         spared: (N,) splats whose effects are to be beyond :data:`LARGEST_LIMIT`, so that they are never removed.
 
     Attributes:
-        device, splats, totals, marks, units: see :class:`potr_cl.stages.pruning.steering.Steered`.
+        device: where the totals and the marks are. splats: N.
+        totals: (N, 2) int64 in the device's memory, and units: ΔMSE and I of 1 there.
+        marks: (N,) uint8 in the device's memory, :class:`~potr_cl.stages.pruning.survivors.SplatState`. A controller on
+            the device marks splats as JUST_REMOVED and calls :meth:`remove_marked`; when it marks the next ones, it
+            changes the earlier marks to REMOVED.
         fixed_point: the totals' units, those of all views.
         resident_views: how many views stay on the device, or draw nothing.
 

@@ -27,7 +27,6 @@ from potr_cl.stages.pruning.alive_packing import AlivePacking
 from potr_cl.stages.pruning.changed_totals import AddedChanges
 from potr_cl.stages.pruning.fixed_point import FixedPoint, zero_totals
 from potr_cl.stages.pruning.removal import F64, Indices, RemovalSweep
-from potr_cl.stages.pruning.steering import Steered
 from potr_cl.stages.pruning.survivors import Bits, Survivors
 from potr_cl.workers.parts import Each, Parts
 from potr_cl.workers.pool import Pool
@@ -51,7 +50,7 @@ class SharedRemoval(Owner):
             None: all parts have all.
 
     Attributes:
-        device, splats, totals, marks, units: see :class:`potr_cl.stages.pruning.steering.Steered`.
+        device, splats, totals, marks, units: as of a :class:`~potr_cl.stages.pruning.removal.RemovalSweep`.
         steering: itself, if it steers; else None.
 
     Raises:
@@ -98,7 +97,7 @@ class SharedRemoval(Owner):
                 self._relay = owned.enter_context(Relay(device))
                 self._alive = owned.enter_context(AlivePacking(device, splats, self.marks))
             self._owned = owned.pop_all()
-        self.steering: Steered | None = self if steers else None
+        self.steering: SharedRemoval | None = self if steers else None
 
     @property
     def _states(self) -> RemovalSweep | Survivors:

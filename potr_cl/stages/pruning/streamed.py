@@ -21,7 +21,7 @@ from potr_cl.stages.pruning.prepared_set import PreparedSet
 from potr_cl.stages.pruning.survivors import SplatState, Survivors
 from potr_cl.stages.pruning.sweep_buffers import SweepBuffers
 from potr_cl.stages.pruning.sweep_options import SweepOptions
-from potr_cl.views.budget import Named, target_bytes
+from potr_cl.views.budget import target_bytes
 from potr_cl.views.engine import Ready, ViewEngine
 from potr_cl.views.groups import ViewGroup
 from potr_cl.views.subsets import Left, Subset
@@ -33,7 +33,7 @@ _Set: TypeAlias = "tuple[int, ...]"
 
 
 class StreamedSweep(Owner):
-    """Measures the views of which nothing stays but, perhaps, the pictures that they are compared with.
+    """Measures the views of which nothing stays but the pictures that they are compared with.
 
     Args:
         engine: of the views.
@@ -68,10 +68,8 @@ class StreamedSweep(Owner):
             self._make_room_for_targets()
 
     def _make_room_for_targets(self) -> None:
-        plan = self._engine.plan
-        if plan.keeps_pictures != "device" or not isinstance(plan.budget, Named):
-            return
-        room = plan.budget.of_pictures(self._engine.streamed)
+        """Pictures stay on the device while there is room; the others go to the host."""
+        room = self._engine.plan.budget.of_pictures(self._engine.streamed)
         for group in self._engine.streamed:
             for numbers in self._engine.sets(group):
                 nbytes = sum(target_bytes(self._engine.cameras[number]) for number in numbers)
@@ -110,58 +108,39 @@ class StreamedSweep(Owner):
         self._device.fill(self.totals, np.uint32(0))
         for group in engine.streamed:
             sets = engine.sets(group)
-            # To make a picture again that nobody has kept takes all splats.
-            again = self._measured and not all(self._keeps(numbers) for numbers in sets)
-            with engine.stream(group, None if again else self._left) as subset:
+            with engine.stream(group, self._left) as subset:
                 if subset is None:
                     continue
                 with Ledger(self._survivors, self.totals, subset) as ledger:
-                    if again:
-                        ledger.take_marks()
                     for numbers in sets:
                         with engine.prepared(numbers, subset, self._on_device.get(numbers)) as ready:
-                            self._measure(ready, ledger, only_left=engine.source.selects and not again)
+                            self._measure(ready, ledger)
                             self.tiles_swept += ready.views.tiles
                     ledger.add_to(self.totals)
                     self._finish()
         engine.source.forget_scratch()
         self._known = self._measured = True
 
-    def _measure(self, ready: Ready[PreparedSet], ledger: Ledger, only_left: bool) -> None:
+    def _measure(self, ready: Ready[PreparedSet], ledger: Ledger) -> None:
         numbers, target = tuple(ready.numbers), ready.work.target
         if numbers in self._on_host:
             with self._device.errors("cannot hold the target images"):
                 cl.enqueue_copy(self._device.queue, target, self._on_host[numbers], is_blocking=True)
-        elif self._measured and numbers not in self._on_device:
-            self._make_target(ready, ledger)
         buffers = self._buffers(ready, ledger)
         kernels = self._launcher(ready).bind(ready.work, ready.geometry, buffers, first_time=not self._measured)
-        self._sweep(kernels, ready, only_left)
-        if not self._measured and self._engine.plan.keeps_pictures == "host":
+        self._sweep(kernels, ready)
+        if not self._measured and numbers not in self._on_device:
             kept = mapped.array((ready.views.pixels, 3), np.float32, "target pictures")
             with self._device.errors("failed while computing"):
                 cl.enqueue_copy(self._device.queue, kept, target, is_blocking=True)
             self._on_host[numbers] = kept
 
-    def _sweep(self, kernels: SetKernels, ready: Ready[PreparedSet], only_left: bool) -> None:
-        if only_left:
+    def _sweep(self, kernels: SetKernels, ready: Ready[PreparedSet]) -> None:
+        if self._engine.source.selects:
             kernels.sweep(0, ready.views.tiles)
         else:
             kernels.sweep_all()
         self._finish()
-
-    def _make_target(self, ready: Ready[PreparedSet], ledger: Ledger) -> None:
-        """Have the set's target show all splats in the colours of the beginning."""
-        source = self._engine.source
-        with ledger.none_removed():
-            if source.recoloured:
-                source.project(ready.subset, ready.views, former=True)
-            buffers = self._buffers(ready, ledger, wanted=False)
-            self._launcher(ready).bind(ready.work, ready.geometry, buffers, first_time=True).store_target()
-            if source.recoloured:
-                source.project(ready.subset, ready.views)
-            ready.work.zero_sums()
-            self._finish()
 
     @contextmanager
     def swept(self, number: int) -> Iterator[tuple[Subset, PreparedSet] | None]:
@@ -177,16 +156,13 @@ class StreamedSweep(Owner):
             ):
                 buffers = self._buffers(ready, ledger, wanted=False)
                 kernels = self._launcher(ready).bind(ready.work, ready.geometry, buffers, first_time=True)
-                self._sweep(kernels, ready, only_left=self._engine.source.selects)
+                self._sweep(kernels, ready)
                 yield subset, ready.work
 
     @property
     def _left(self) -> Left:
         mask = self._survivors.alive if self._engine.source.copies else None
         return Left(self._survivors.buffer, SplatState.ALIVE, mask)
-
-    def _keeps(self, numbers: _Set) -> bool:
-        return numbers in self._on_host or numbers in self._on_device
 
     def _launcher(self, ready: Ready[PreparedSet]) -> SweepLauncher:
         return launcher_for(ready.subset.rasterizer, self._options, self._fixed_point)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from enum import IntEnum
 
 import numpy as np
@@ -115,15 +114,6 @@ class Survivors(Owner):
         else:
             return
         self._write(self._states)
-
-    @contextmanager
-    def none_removed(self) -> Iterator[None]:
-        """Inside the block, the device sees all splats as alive."""
-        self._write(np.full_like(self._states, SplatState.ALIVE))
-        try:
-            yield
-        finally:
-            self._write(self._states)
 
     def _write(self, states: NDArray[np.uint8]) -> None:
         cl.enqueue_copy(self.device.queue, self.buffer, states, is_blocking=True)
