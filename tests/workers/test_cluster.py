@@ -380,12 +380,17 @@ def test_nobody_waits_for_ever_in_the_end(device, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="sends a signal")
 def test_a_scheduler_that_stands_still_is_told(device, monkeypatch, caplog):
+    """Also where nobody asks it anything: the workers answer without it."""
+    monkeypatch.setattr("potr_cl.workers.cluster._WHO", 1.0)
     with processes_of_a_cluster(1) as (address, (scheduler, _)), ClusterPool(address, device) as pool:
-        monkeypatch.setattr("potr_cl.workers.cluster._WHO", 1.0)
-        with standing_still(scheduler.pid):
-            (here,) = pool.workers()
+        (there,) = pool.workers()
+        with standing_still(scheduler.pid), Parts(pool, Idle, [()]) as parts:
+            eventually(lambda: there.lost)
+            parts.tell("close")
+        (here,) = pool.workers()
         assert str(device.info) in here.name
-        assert "scheduler does not answer any more: continuing on" in caplog.text
+    assert caplog.text.count("scheduler does not answer any more: continuing on") == 1
+    assert "gave up" not in caplog.text
 
 
 def seats(dask_worker):
@@ -511,6 +516,23 @@ def test_other_instructions_under_the_same_name_are_told(device, caplog):
     with others as (address, _), ClusterPool(address, device):
         pass
     assert f"({device.info}, {device.info} with other instructions), which round differently" in caplog.text
+
+
+@pytest.mark.skipif("Intel" not in str(choose_device()), reason="only this runtime can be told the instructions")
+def test_who_rounds_differently_does_no_views(device, caplog, monkeypatch):
+    """The file would depend on which views it gets; also where it comes later."""
+    monkeypatch.setattr("potr_cl.workers.cluster._NEW", 0.1)
+    others = processes_of_a_cluster(1, env={"CL_CONFIG_CPU_TARGET_ARCH": "corei7"}, more=1)
+    with others as (address, _), ClusterPool(address, device) as pool:
+        (same,) = pool.workers()
+        assert same.digits == device.digits()
+        assert caplog.text.count("rounds differently from the others") == 1
+        assert "several kinds" not in caplog.text
+        (refused,) = pool._refused
+        pool._refused.clear()  # as if it were another one
+        eventually(lambda: pool._refused)
+        assert pool._refused == {refused}
+        assert pool.workers() == [same]
 
 
 @pytest.mark.slow
