@@ -79,8 +79,15 @@ def sweep(devices, grouping, options, scene, cameras, elsewhere=False, spared=No
     assert [device.allocated for device in devices] == [0] * len(devices), "not all memory was given back"
 
 
-@pytest.mark.parametrize("workers", WORKERS)
-@pytest.mark.parametrize("residency", RESIDENCY)
+@pytest.mark.parametrize(
+    ("residency", "workers"),
+    [
+        # Several devices have the extremes in the quick subset.
+        pytest.param(some, who, marks=pytest.mark.slow if who != "one device" and some in ("some", "pictures") else ())
+        for some in RESIDENCY
+        for who in WORKERS
+    ],
+)
 @pytest.mark.parametrize("grouping", GROUPINGS)
 def test_the_same_bits(kernels, grouping, residency, workers):
     """While splats go and colours change. Which views are resident is another matter: so no tile may be skipped."""
