@@ -21,7 +21,7 @@ from potr_cl.stages.pruning.launcher import SetKernels, SweepLauncher, launcher_
 from potr_cl.stages.pruning.ledger import Ledger
 from potr_cl.stages.pruning.prepared_set import PreparedSet
 from potr_cl.stages.pruning.queues import Queues
-from potr_cl.stages.pruning.staleness import TileSchedule
+from potr_cl.stages.pruning.staleness import TileSchedule, by_set
 from potr_cl.stages.pruning.survivors import Survivors
 from potr_cl.stages.pruning.sweep_buffers import SweepBuffers
 from potr_cl.stages.pruning.sweep_options import SweepOptions
@@ -173,13 +173,8 @@ class ResidentSweep(Owner):
 
     def _choose(self, tiles: NDArray[np.int64]) -> None:
         """List tiles of all sets, numbered through, ascending."""
-        self._counts = np.diff(np.searchsorted(tiles, self._firsts)).tolist()
+        listed, self._counts = by_set(tiles, self._firsts)
         if len(tiles):
-            firsts = np.repeat(self._firsts[:-1], self._counts)
-            listed = np.zeros(self._firsts[-1], np.uint32)
-            ends = np.cumsum(self._counts)
-            within = np.arange(len(tiles)) - np.repeat(ends - self._counts, self._counts)
-            listed[firsts + within] = tiles - firsts
             self._write(self._tiles, listed)
             stale = self._staleness()
             self._schedule.note_swept(stale, tiles)
