@@ -239,7 +239,7 @@ class ClusterPool(Pool):
         here = self.first.digits()
         self._digits = here if any(worker.digits == here for worker in workers) else workers[0].digits
         for lost in gone:
-            _log.warning("%s; it does no views", lost)
+            _log.warning("%s; ignoring this worker", lost)
         self._take_in([worker for worker in workers if self._rounds_as_others(worker)])
 
     def _rounds_as_others(self, worker: _ClusterWorker) -> bool:
@@ -249,8 +249,8 @@ class ClusterPool(Pool):
         self._refused.add(worker.name)
         worker.leave()
         _log.warning(
-            "worker %s (%s) rounds differently from the others, and the file would depend on which views it gets: it "
-            "does no views; to choose, start workers on one kind of device (POTR_CL_DEVICE in their environment) and "
+            "worker %s (%s) rounds differently from the others, so that the file would depend on which views it gets; "
+            "ignoring it. To choose, start workers on one kind of device (POTR_CL_DEVICE in their environment) and "
             "hosts of one generation",
             worker.name, worker.device,
         )  # fmt: skip
@@ -274,10 +274,10 @@ class ClusterPool(Pool):
                             lost.add(worker.host)
                         worker.leave()
                         if not self._closing.is_set():
-                            _log.warning("%s; it does no views", error)
+                            _log.warning("%s; ignoring this worker", error)
                         continue
                     if self._rounds_as_others(worker):
-                        _log.warning("worker %s has come: it gets views from the next stage on", worker.name)
+                        _log.warning("worker %s joined; it gets views from the next stage on", worker.name)
                         self._take_in([worker])
 
     def _invited(self, addresses: set[str]) -> list[_ClusterWorker]:
