@@ -173,11 +173,7 @@ class SceneBuffers(Owner):
         turn = device.shared_kernel("raster/columns.cl", "columns")
         if start + len(rows) > self.splats:
             raise ValueError(f"{len(rows)} rows from splat {start} on do not fit {self.splats} splats")
-        if (
-            pending is None
-            and rows.nbytes >= sending.LEAST
-            and not (device.info.kind == "cpu" or device.info.integrated)
-        ):
+        if pending is None and rows.nbytes >= sending.LEAST and not device.info.shares_host_memory:
             height = max(sending.PIECE // (4 * width), 1)
             firsts = range(0, len(rows), height)
             with sending.Sending(device, what) as sender:

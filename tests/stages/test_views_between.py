@@ -22,7 +22,8 @@ from potr_cl.pipeline.target import Target
 from potr_cl.placement.virtual import place_cameras
 from potr_cl.quality.metrics import psnr
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.pruning.prepared_views import PreparedViews
+from potr_cl.stages.pruning.removal import RemovalSweep
+from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.stages.views_between import Between
 
@@ -109,8 +110,8 @@ def test_only_as_many_are_added_as_fit_the_memory_beside_the_given_ones(device, 
     _, state = added(device, plush_excerpt, given, memory=some * 250_000)
     with Rasterizer(device, plush_excerpt) as rasterizer:
         before = device.allocated
-        with PreparedViews(rasterizer, state.views, some * 250_000, 1) as prepared:
-            assert not prepared.uncached
+        with RemovalSweep(rasterizer, state.views, SweepOptions(memory=some * 250_000)) as sweep:
+            assert sweep.resident_views == len(state.views)
             assert device.allocated - before < some * 250_000 + 1_000_000
     assert device.allocated == 0
 

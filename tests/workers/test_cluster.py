@@ -26,7 +26,7 @@ from potr_cl.outputs.potr import Potr
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
-from potr_cl.stages.pruning import visible_parts
+from potr_cl.views import visibility
 from potr_cl.workers.cluster import ClusterPool
 from potr_cl.workers.parts import Parts
 from potr_cl.workers.pool import Part, WorkerLost
@@ -123,7 +123,7 @@ def test_workers_get_what_their_views_see(device, monkeypatch):
     options = dataclasses.replace(OPTIONS, cameras_anyway=True)
     with local_cluster(2) as cluster, ClusterPool(cluster.scheduler_address, device) as pool:
         every = encode(scene, cameras, options, device=device, pool=pool)
-        monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1)
+        monkeypatch.setattr(visibility, "LEAST_SPLATS", 1)
         some = encode(scene, cameras, options, device=device, pool=pool)
     assert some.data == every.data == encode(scene, cameras, options, device=device).data
     assert some.shared is not None

@@ -18,12 +18,12 @@ from potr_cl.opencl.discovery import choose_device, choose_devices
 from potr_cl.opencl.memory import Memory
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.stages.pruning import measured, part, shared_removal, visible_parts
+from potr_cl.stages.pruning import removal
 from potr_cl.stages.pruning.part import RemovalPart
-from potr_cl.stages.pruning.view_by_view import ViewByView
 from potr_cl.stages.refitting import pictures_ahead
 from potr_cl.stages.refitting.part import ColourPart
 from potr_cl.stages.refitting.targets import RenderedTargets
+from potr_cl.views import visibility
 from potr_cl.workers.host import HostPool
 from potr_cl.workers.opening import open_workers
 from potr_cl.workers.parts import Parts
@@ -300,17 +300,16 @@ def test_large_scenes_view_by_view(monkeypatch):
     alone = open_device("gpu")
     expected = encode(scene, cameras, options, device=alone)
     monkeypatch.setattr(splat_groups, "LARGEST", 32)
-    monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1)
+    monkeypatch.setattr(visibility, "LEAST_SPLATS", 1)
     shares = []
 
-    class Noting(ViewByView):
-        def __init__(self, *given, **named):
-            super().__init__(*given, **named)
-            shares.append(self.kept_views)
+    made = removal.RemovalSweep.__init__
 
-    for module in (measured, part):
-        monkeypatch.setattr(module, "ViewByView", Noting)
-    monkeypatch.setattr(shared_removal, "ViewByView", ViewByView)
+    def noting(self, *given, **named):
+        made(self, *given, **named)
+        shares.append(self.resident_views)
+
+    monkeypatch.setattr(removal.RemovalSweep, "__init__", noting)
     devices = [open_device("gpu") for _ in range(3)]
     with HostPool(devices) as pool:
         found = encode(scene, cameras, options, device=devices[0], pool=pool)
