@@ -18,9 +18,9 @@ from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.colour_refit import ColourRefit
 from potr_cl.stages.refitting.coming_scene import ComingScene
 from potr_cl.stages.refitting.launcher import launcher_for
+from potr_cl.stages.refitting.layout import Layout
 from potr_cl.stages.refitting.refit import active_coefficients, refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
-from potr_cl.stages.refitting.vector_space import Layout
 from tests.devices import KERNELS, open_device
 from tests.reference.refit import LENGTHS, selection, to_rgb, to_ycocg
 from tests.reference.refit_cases import Case, Linearised, Pictures
@@ -377,7 +377,7 @@ def test_views_that_are_not_kept_share_their_memory(case, monkeypatch):
         monkeypatch.setattr(case.device, "allocate", noted)
         again = linear.normal(direction)
     assert np.array_equal(first, again)
-    assert set(taken) <= {"the SH coefficients"}, "the vectors of this test"
+    assert set(taken) <= {"SH coefficients"}, "the vectors of this test"
 
 
 def test_nobody_waits_for_a_device_that_others_read_from(case, monkeypatch):

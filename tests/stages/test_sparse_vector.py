@@ -10,8 +10,8 @@ import pytest
 
 from potr_cl.raster.scene_buffers import stride_of
 from potr_cl.stages.refitting.coefficients import Coefficients
+from potr_cl.stages.refitting.layout import Layout
 from potr_cl.stages.refitting.sparse_vector import SparseVector, SparseVectors
-from potr_cl.stages.refitting.vector_space import Layout
 from tests.devices import KERNELS, open_device
 
 
@@ -30,8 +30,8 @@ def test_vectors_arrive_as_they_were(kernels, part):
             x, y = here.vector(), there.vector()
             for coefficients, vector in ((here, x), (there, y)):
                 coefficients.zero(vector)
-            here.write_columns(x, columns)
-            there.write_columns(y, np.full_like(columns, 7))
+            here.write(x, columns)
+            there.write(y, np.full_like(columns, 7))
             taking, giving = (stack.enter_context(SparseVectors(each)) for each in (here, there))
             sent = taking.take(x)
             if part < 1:

@@ -69,13 +69,13 @@ from potr_cl.stages.pruning.survivors import Survivors
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.pruning.view_by_view import ViewByView
 from potr_cl.stages.pruning.visible_parts import PartedRemoval
-from potr_cl.stages.refitting import coefficients, reached, sliced_coefficients
+from potr_cl.stages.refitting import coefficients, reached, sliced_arrays
 from potr_cl.stages.refitting.coefficients import Coefficients
+from potr_cl.stages.refitting.layout import Layout
 from potr_cl.stages.refitting.packing import Packing
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.refitting.targets import RenderedTargets
-from potr_cl.stages.refitting.vector_space import Layout
 from tests.reference import raster as reference
 from tests.reference.scenes import plain_splats, random_splats, straight_camera, tilted_camera
 from tools.stress.platforms import check_similarity
@@ -245,7 +245,7 @@ def packing(device: Device) -> None:
         packs.take_flags()
         packs.give_flags(packs.flags())
         x = vectors.vector()
-        vectors.write(x, scene.sh)
+        vectors.write(x, scene.sh.transpose(1, 2, 0).reshape(layout.columns, -1))
         packs.set_floats(x, packs.floats(x))
         sums = memory.upload(np.ones((layout.columns, layout.stride), np.int64), "sums")
         packs.add_sums(sums, packs.sums(sums))
@@ -394,7 +394,7 @@ def simulate(family: str, width: int, names: list[str], told: Path) -> None:
         patches.enter_context(patch.object(Device, "kernel", made))
         patches.enter_context(patch.object(Device, "launch", launched))
         patches.enter_context(patch.object(Device, "free", lambda _, buffer: freed.append(buffer)))
-        for module in (coefficients, sliced_coefficients):
+        for module in (coefficients, sliced_arrays):
             patches.enter_context(patch.object(module, "DOT_ITEMS", _DOT_ITEMS))
         print("STEP probes", file=sys.stderr, flush=True)
         device = Device(simulated, family=family, build_options=["-DNO_PREFETCH"])  # type: ignore[arg-type]

@@ -29,15 +29,14 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.view_set import TABLE_ENTRY, ViewSet
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.refitting.blocks import SplatBlocks
+from potr_cl.stages.refitting.coefficients import Coefficients, Vector
 from potr_cl.stages.refitting.fixed_point import gathered_scale
 from potr_cl.stages.refitting.gathering import Gathered, Gathering
 from potr_cl.stages.refitting.launcher import Launcher
 from potr_cl.stages.refitting.picked_views import PickedViews
 from potr_cl.stages.refitting.prepared_views import PreparedViews, SweptViews
 from potr_cl.stages.refitting.reached import Reach
-from potr_cl.stages.refitting.sliced_blocks import SlicedBlocks
 from potr_cl.stages.refitting.targets import TargetCache, Targets, nbytes
-from potr_cl.stages.refitting.vector_space import Vector, VectorSpace
 from potr_cl.stages.refitting.view_colours import Picks, ViewColours
 from potr_cl.stages.refitting.view_errors import ViewErrors
 
@@ -99,7 +98,7 @@ class ColourMap(Owner):
         self,
         launcher: Launcher,
         rasterizer: Rasterizer,
-        coefficients: VectorSpace,
+        coefficients: Coefficients,
         cameras: Sequence[Camera],
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         memory: int | None = None,
@@ -169,9 +168,9 @@ class ColourMap(Owner):
                 _Slot(*(_part(of, slot, together) for of in (self._change, self._totals))) for slot in range(together)
             ]
             self._tables = self._memory.allocate(TABLE_ENTRY * most * together, "the views")
-            coefficients.clear(self._totals)
+            coefficients.zero(self._totals)
             self.sums = self._memory.allocate(8 * layout.columns * layout.stride, "the sums over views")
-            coefficients.clear(self.sums)
+            coefficients.zero(self.sums)
             self._errors = ViewErrors(device, cameras, self._weights, self._numbers, launches)
             self._owned.append(self._errors)
             # By what each view's sums are multiplied on their way to the coefficients.
@@ -196,7 +195,7 @@ class ColourMap(Owner):
         x: Vector,
         targets: Targets,
         result: Vector,
-        blocks: SplatBlocks | SlicedBlocks | None = None,
+        blocks: SplatBlocks | None = None,
         constant: bool = False,
     ) -> float:
         """result += Aᵀ W (pictures(x) - targets), half the gradient of the squared error at x.
@@ -207,7 +206,7 @@ class ColourMap(Owner):
             x: the coefficients.
             targets: what the pictures should show.
             result: a vector.
-            blocks: the splats' own blocks of Aᵀ W A are added to them; cuts are left out of account there.
+            blocks: become the splats' own blocks of Aᵀ W A; cuts are left out of account there.
             constant: leave the result's AC coefficients alone. Not together with blocks.
 
         Returns:
@@ -228,14 +227,14 @@ class ColourMap(Owner):
             errors |= self.found_errors()
             self._coefficients.add_fixed(result, self.sums, 1 / self._one, constant)
             if blocks is not None:
-                blocks.add_fixed(ranges[0], sums, 1 / self._one)
+                blocks.set_fixed(ranges[0], sums, 1 / self._one)
                 self._device.queue.finish()  # before their memory is given back
         for splats in ranges[1:]:
             with Memory(self._device) as memory:
                 sums = self._block_sums(memory, len(splats))
                 self._sum_blocks(sums, splats.start)
                 assert blocks is not None
-                blocks.add_fixed(splats, sums, 1 / self._one)
+                blocks.set_fixed(splats, sums, 1 / self._one)
                 self._device.queue.finish()
         return math.fsum(errors[number] for number in sorted(errors))
 
@@ -285,7 +284,7 @@ class ColourMap(Owner):
 
     def _sum_blocks(self, blocks: cl.Buffer, first: int) -> None:
         """The blocks' part of :meth:`sum_gradient` alone, of the splats from one on."""
-        self._coefficients.clear(self._change)  # black, and no channel is free
+        self._coefficients.zero(self._change)  # black, and no channel is free
         for group in self._groups_of(None):
             for slot, numbers in zip(self._slots, group, strict=False):
                 with self._views.ready(numbers) as ready:
@@ -354,7 +353,7 @@ class ColourMap(Owner):
         """Integers for the blocks of so many splats, 0."""
         triangle = self._layout.sh_count * (self._layout.sh_count + 1) // 2
         sums = memory.allocate(8 * triangle * splats, "the splats' normal equations")
-        self._coefficients.clear(sums)
+        self._coefficients.zero(sums)
         return sums
 
     def _picks(self, numbers: range) -> Picks | None:

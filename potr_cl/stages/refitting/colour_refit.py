@@ -24,19 +24,20 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.raster.scene_buffers import stride_of
 from potr_cl.raster.view_shares import ViewShares
-from potr_cl.stages.refitting.coefficients import Coefficients
+from potr_cl.stages.refitting.blocks import SplatBlocks
+from potr_cl.stages.refitting.coefficients import Coefficients, Vector
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.coming_scene import AnyScene, ComingScene, arrived, colourless
 from potr_cl.stages.refitting.launcher import launcher_for
+from potr_cl.stages.refitting.layout import Layout, Ridge
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
-from potr_cl.stages.refitting.placement import blocks_of, left_for_views, placed, rounding_of, vectors_of
+from potr_cl.stages.refitting.placement import left_for_views, placed
 from potr_cl.stages.refitting.reached import reached_splats
 from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
-from potr_cl.stages.refitting.rounding import ROUNDS, Steps
+from potr_cl.stages.refitting.rounding import ROUNDS, Rounding, Steps
 from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts, colour_shares
 from potr_cl.stages.refitting.solver import ColourSolver, Descent, Selection, Solved
 from potr_cl.stages.refitting.targets import Targets
-from potr_cl.stages.refitting.vector_space import Layout, Ridge, Vector
 from potr_cl.workers.dealing import Shares
 from potr_cl.workers.pool import Pool
 
@@ -131,9 +132,9 @@ class ColourRefit(Owner):
                 if reach is not None:
                     place = placed(device, layout.splats, layout.sh_count, memory, slices, reach) or place
                 memory = place.views
-            self.coefficients = owned.enter_context(vectors_of(device, layout, place))
-            blocks = blocks_of(self.coefficients, place)
-            owned.callback(blocks.close)
+            in_slices = () if place is None else (place.slice, place.resident)
+            self.coefficients = owned.enter_context(Coefficients(device, layout, *in_slices))
+            blocks = SplatBlocks(self.coefficients, None if place is None else place.blocks)
             self._solver = ColourSolver(self.coefficients, blocks)
             self._written: FloatArray | None = None  # colours that the start of the next solution has already
             if isinstance(scene, ComingScene):
@@ -141,7 +142,6 @@ class ColourRefit(Owner):
                 self._written = scene.sh
             helpers = None
             if help_from is not None and others is not None:
-                assert isinstance(self.coefficients, Coefficients)
                 in_process = help_from.pool.in_process
                 helpers = owned.enter_context(SharedViews(self.coefficients, others, in_process))
             here = arrived(scene)
@@ -282,15 +282,15 @@ class ColourRefit(Owner):
         self.coefficients.copy(self._unrounded, solver.x)
         ridge = Ridge(options.lam, options.chroma_factor, options.prior)
         worth = _WORTH * options.drop * self.colour_map.total_weight
-        with rounding_of(self.coefficients, solver.blocks, steps_of_splats) as round_some:
+        with Rounding(self.coefficients, steps_of_splats) as rounding:
             *first, last = ROUNDS
             for each in first:
-                round_some(solver.x, each, worth)
+                rounding.round(solver.x, solver.blocks, each, worth)
                 gone_on = solver.go_on(self.colour_map, targets, Descent(each.steps, 0.0, ridge, part=0))
                 steps += gone_on.steps
                 errors.append(gone_on.start)
             after_first()
-            round_some(solver.x, last, worth)
+            rounding.round(solver.x, solver.blocks, last, worth)
             solved = solver.solve(self.colour_map, targets, Descent(last.steps, 0.0, ridge, part=1), constant=True)
         return Solved((errors[0], solved.errors[1]), steps + solved.steps, solved.start)
 

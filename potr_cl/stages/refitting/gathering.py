@@ -10,7 +10,7 @@ import pyopencl as cl
 
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.kernel import Kernel
-from potr_cl.stages.refitting.vector_space import Layout
+from potr_cl.stages.refitting.layout import Layout
 
 _SOURCE = "refit/gather.cl"
 #: Work-items of a work-group.

@@ -26,12 +26,12 @@ from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.coming_scene import AnyScene, arrived, colourless
 from potr_cl.stages.refitting.launcher import launcher_for
+from potr_cl.stages.refitting.layout import Layout
 from potr_cl.stages.refitting.packing import Packing
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.stages.refitting.reached import reached_splats
 from potr_cl.stages.refitting.sparse_vector import SentVector, SparseVectors
 from potr_cl.stages.refitting.targets import RenderedTargets, Targets
-from potr_cl.stages.refitting.vector_space import Layout
 from potr_cl.stages.refitting.visible_targets import VisibleTargets
 from potr_cl.workers.pool import Part
 

@@ -8,18 +8,10 @@ the sums. Further vectors stay on the device as far as there is room, those that
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 from potr_cl.opencl.device import Device
-from potr_cl.stages.refitting.blocks import SplatBlocks
-from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.reached import Reach
-from potr_cl.stages.refitting.rounding import Round, Rounding, SlicedRounding, Steps
-from potr_cl.stages.refitting.sliced_blocks import SlicedBlocks
-from potr_cl.stages.refitting.sliced_coefficients import SlicedCoefficients
-from potr_cl.stages.refitting.vector_space import Layout, Vector, VectorSpace
 
 #: Vectors of a solution: six of the solver and what it was before it was rounded.
 _VECTORS = 7
@@ -126,49 +118,3 @@ def _one_piece(splats: int, sh_count: int) -> int:
     """Bytes of all vectors, sums and blocks."""
     vector, triangle = 12 * sh_count, sh_count * (sh_count + 1) // 2
     return splats * (_VECTORS * vector + 2 * vector + 12 * triangle)
-
-
-def vectors_of(device: Device, layout: Layout, place: Place | None) -> VectorSpace:
-    """Where a re-fit's vectors lie.
-
-    Raises:
-        PotrError: the host has no room for them.
-        DeviceError: the device has none.
-    """
-    return (
-        Coefficients(device, layout)
-        if place is None
-        else SlicedCoefficients(device, layout, place.slice, place.resident)
-    )
-
-
-def blocks_of(vectors: VectorSpace, place: Place | None) -> SplatBlocks | SlicedBlocks:
-    """The splats' own blocks, where the vectors lie; raises what :func:`vectors_of` does."""
-    if isinstance(vectors, SlicedCoefficients):
-        return SlicedBlocks(vectors, vectors.layout.stride if place is None else place.blocks)
-    assert isinstance(vectors, Coefficients)
-    return SplatBlocks(vectors)
-
-
-@contextmanager
-def rounding_of(
-    vectors: VectorSpace, blocks: SplatBlocks | SlicedBlocks, steps: Steps
-) -> Iterator[Callable[[Vector, Round, float], None]]:
-    """The rounding of vectors where they lie, to the splats' steps, as long as the context lasts.
-
-    Yields:
-        What rounds: called with a vector, what of it is due, and the squared error that it is worth to save an AC
-        coefficient, as :meth:`potr_cl.stages.refitting.rounding.Rounding.round`.
-
-    Raises:
-        DeviceError: the device has no room, or the kernels cannot be built.
-    """
-    if isinstance(vectors, SlicedCoefficients) and isinstance(blocks, SlicedBlocks):
-        in_slices, its_blocks = SlicedRounding(vectors, steps), blocks
-        yield lambda x, this, worth: in_slices.round(x, its_blocks, this, worth)
-        return
-    assert isinstance(vectors, Coefficients)
-    assert isinstance(blocks, SplatBlocks)
-    on_device = blocks
-    with Rounding(vectors, steps) as rounding:
-        yield lambda x, this, worth: rounding.round(x, on_device, this, worth)

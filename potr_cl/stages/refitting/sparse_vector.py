@@ -90,7 +90,7 @@ class SparseVectors(Owner):
             ValueError: there are not as many values as flags, or they are not of so many splats.
         """
         if not isinstance(sent, SparseVector):
-            self._coefficients.write_columns(x, sent)
+            self._coefficients.write(x, sent)
             return
         device, layout = self._coefficients.device, self._coefficients.layout
         words = np.zeros((2, layout.stride), np.uint32)

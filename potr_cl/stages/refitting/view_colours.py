@@ -9,7 +9,7 @@ import pyopencl as cl
 
 from potr_cl.opencl.device import Device
 from potr_cl.raster.view_set import ViewSet
-from potr_cl.stages.refitting.vector_space import Layout
+from potr_cl.stages.refitting.layout import Layout
 
 #: Views that a work-item does one after the other, the coefficients in its registers.
 _TOGETHER = 8
