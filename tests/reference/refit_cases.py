@@ -88,7 +88,7 @@ class Linearised:
         self.error = colour_map.gradient(self._at, targets or case.targets, result, blocks)
         self.blocks: Array = unpacked(blocks)
         self.gradient: Array = as_rows(vectors, result)
-        self.room = colour_map.room
+        self.room = colour_map.own.room
 
     def normal(self, direction: Array, part: int | None = None) -> Array:
         """A transposed W A times a direction, by a part of the views or by all."""

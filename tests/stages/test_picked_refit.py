@@ -12,12 +12,12 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.refitting import colour_map, placement, reached
+from potr_cl.stages.refitting import own_views, placement, reached
 from potr_cl.stages.refitting.colour_refit import ColourRefit
-from potr_cl.stages.refitting.picked_views import PickedViews
 from potr_cl.stages.refitting.reached import reached_splats
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
+from potr_cl.stages.refitting.view_groups import ViewGroups
 from potr_cl.workers.host import HostPool
 from tests.cases.streets import street
 from tests.devices import KERNELS, open_device
@@ -35,20 +35,21 @@ def device(request):
 @pytest.fixture
 def picked(monkeypatch):
     """Have views pick their splats, and note which views did."""
-    made: list[PickedViews] = []
+    made: list[ViewGroups] = []
 
-    class Noting(PickedViews):
+    class Noting(ViewGroups):
         def __init__(self, *args: object) -> None:
-            made.append(self)
+            if args[2] is not None:
+                made.append(self)
             super().__init__(*args)  # type: ignore[arg-type]
 
-    def switch(on: bool) -> list[PickedViews]:
+    def switch(on: bool) -> list[ViewGroups]:
         monkeypatch.setattr(reached, "LEAST_SPLATS", 1 if on else 1 << 60)
         monkeypatch.setattr(reached, "WORTH_IT", 1.0)
         made.clear()
         return made
 
-    monkeypatch.setattr(colour_map, "PickedViews", Noting)
+    monkeypatch.setattr(own_views, "ViewGroups", Noting)
     return switch
 
 
@@ -194,7 +195,7 @@ def test_a_view_that_sees_nothing(device, picked):
 )
 def test_a_solution(device, picked, way, slices, monkeypatch):
     """Of two parts of the views."""
-    monkeypatch.setattr(colour_map, "ENOUGH", 4)
+    monkeypatch.setattr(own_views, "ENOUGH", 4)
     with case_of(device) as case:
         count = len(case.scene)
         rounding = {
@@ -224,7 +225,7 @@ def test_more_views_stay(device, picked):
         for on in (False, True):
             picked(on)
             with ColourRefit(device, case.scene, case.cameras, memory=10**8) as refit:
-                room[on] = refit.colour_map.room
+                room[on] = refit.colour_map.own.room
     assert 10**8 - room[True] < 0.6 * (10**8 - room[False])
 
 

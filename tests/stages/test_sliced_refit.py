@@ -165,7 +165,7 @@ def test_memory_is_that_of_vectors_and_views_together(device, monkeypatch):
             with ColourRefit(device, case.scene, case.cameras, memory=memory) as refit:
                 refit.solve(case.scene.sh, case.targets, RefitOptions(steps=1, gain=0))
                 assert device.allocated - free < memory
-                room.append(refit.colour_map.room)
+                room.append(refit.colour_map.own.room)
     assert room[1] - room[0] == pytest.approx(8 * one_piece, rel=0.01)
     assert room[0] < 3 * one_piece
 

@@ -198,8 +198,8 @@ def test_workers_with_gpus_look_at_each_view_with_what_it_may_draw(keep, monkeyp
     expected = encode(scene, cameras, options, device=open_device(family)).data
     monkeypatch.setattr("potr_cl.raster.kept_scene.fits_whole", lambda device, scene: True)
     made = []
-    for module, name in (("pruning", "ViewByView"), ("refitting", "VisibleTargets")):
-        where = f"potr_cl.stages.{module}.part.{name}"
+    for module, name in (("pruning.part", "ViewByView"), ("refitting.targets", "VisibleTargets")):
+        where = f"potr_cl.stages.{module}.{name}"
         kind = importlib.import_module(where.rpartition(".")[0]).__dict__[name]
 
         def noted(*args, kind=kind, **named):
@@ -211,7 +211,7 @@ def test_workers_with_gpus_look_at_each_view_with_what_it_may_draw(keep, monkeyp
     with ElsewherePool(devices) as pool:
         assert encode(scene, cameras, options, device=devices[0], pool=pool).data == expected
     assert made.count("ViewByView") == 2
-    assert made.count("VisibleTargets") == 4
+    assert made.count("VisibleTargets") == 2 * 3  # two re-fits, of two workers and of the master
     assert [device.allocated for device in devices] == [0] * 3
 
 

@@ -71,8 +71,8 @@ from potr_cl.stages.pruning.view_by_view import ViewByView
 from potr_cl.stages.pruning.visible_parts import PartedRemoval
 from potr_cl.stages.refitting import coefficients, reached, sliced_arrays
 from potr_cl.stages.refitting.coefficients import Coefficients
+from potr_cl.stages.refitting.exchange import Exchange
 from potr_cl.stages.refitting.layout import Layout
-from potr_cl.stages.refitting.packing import Packing
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.refitting.targets import RenderedTargets
@@ -240,15 +240,15 @@ def packing(device: Device) -> None:
     """What travels between devices that share a re-fit."""
     scene = random_splats(300, 2, seed=5)
     layout = Layout(300, 320, scene.sh.shape[1], 1)
-    with Memory(device) as memory, Coefficients(device, layout) as vectors, Packing(vectors) as packs:
+    with Memory(device) as memory, Coefficients(device, layout) as vectors, Exchange(vectors) as packs:
         vectors.activate(np.random.default_rng(1).random(scene.sh.shape) < 0.5)
-        packs.take_flags()
-        packs.give_flags(packs.flags())
+        packs.settle()
+        packs.take_flags(packs.flags())
         x = vectors.vector()
         vectors.write(x, scene.sh.transpose(1, 2, 0).reshape(layout.columns, -1))
-        packs.set_floats(x, packs.floats(x))
+        packs.take_floats(x, packs.send_floats(x))
         sums = memory.upload(np.ones((layout.columns, layout.stride), np.int64), "sums")
-        packs.add_sums(sums, packs.sums(sums))
+        packs.add_sums(sums, packs.send_sums(sums))
         packs.add_rows(sums, 1, packs.rows(sums, 0, 1))
 
 

@@ -28,8 +28,8 @@ from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.coefficients import Coefficients, Vector
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.coming_scene import AnyScene, ComingScene, arrived, colourless
-from potr_cl.stages.refitting.launcher import launcher_for
 from potr_cl.stages.refitting.layout import Layout, Ridge
+from potr_cl.stages.refitting.own_views import OwnViews
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.stages.refitting.placement import left_for_views, placed
 from potr_cl.stages.refitting.reached import reached_splats
@@ -37,6 +37,7 @@ from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
 from potr_cl.stages.refitting.rounding import ROUNDS, Rounding, Steps
 from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts, colour_shares
 from potr_cl.stages.refitting.solver import ColourSolver, Descent, Selection, Solved
+from potr_cl.stages.refitting.sweep import Sweep
 from potr_cl.stages.refitting.targets import Targets
 from potr_cl.workers.dealing import Shares
 from potr_cl.workers.pool import Pool
@@ -118,8 +119,8 @@ class ColourRefit(Owner):
                             help_from.pool, share, scene, rules, background, help_from.source, cameras, memory
                         )
                     )  # fmt: skip
-            launcher = launcher_for(device, rules)
-            layout = Layout(len(scene), stride_of(len(scene)), scene.sh.shape[1], launcher.lanes)
+            sweep = Sweep(device, rules)
+            layout = Layout(len(scene), stride_of(len(scene)), scene.sh.shape[1], sweep.lanes)
             # The vectors come first: prepared views can do with less memory, and only take longer then.
             place = placed(device, layout.splats, layout.sh_count, memory, slices) if others is None else None
             if place is None and others is None:
@@ -148,12 +149,10 @@ class ColourRefit(Owner):
             if place is None:
                 rasterizer = owned.enter_context(Rasterizer(device, colourless(here), rules))
                 reach = reached_splats(rasterizer, cameras, range(len(cameras)) if own is None else own, memory)
-            self.colour_map = owned.enter_context(
-                ColourMap(
-                    launcher, rasterizer, self.coefficients, cameras, background, memory, own, helpers,
-                    reach,
-                )
-            )  # fmt: skip
+            views = owned.enter_context(
+                OwnViews(sweep, rasterizer, self.coefficients, cameras, background, memory, own, reach)
+            )
+            self.colour_map = ColourMap(self.coefficients, views, helpers)
             if others is not None:
                 owned.callback(others.begin_to_close)
             self._unrounded: Vector | None = None

@@ -38,7 +38,7 @@ class Descent:
         steps: the most conjugate-gradient steps.
         gain: stop when a step takes less than this part off the objective.
         ridge: what holds the coefficients down or near their start.
-        part: of the views (:attr:`ColourMap.parts`) by which the normal equations are made, for a way that need not be
+        part: of the views (:attr:`OwnViews.parts`) by which the normal equations are made, for a way that need not be
             exact because another one follows, or leads less far; None: of all.
     """
 
