@@ -232,7 +232,7 @@ def _pictures_ahead(state: State, bench: Workbench) -> Iterator[PicturesAhead | 
 def _pictures_of_goal(state: State, bench: Workbench, ahead: PicturesAhead | None) -> Iterator[Targets]:
     """The pictures that colours are re-fitted to; where the re-fit needs its room, they are rendered before."""
     device, views = bench.opened, state.views
-    little = placed(device, len(state.scene), state.scene.sh.shape[1], bench.memory) is not None
+    little = placed(device, len(state.scene), state.scene.sh.shape[1], bench.memory).slice is not None
     little = little or (bench.memory is not None and state.source.nbytes > _LARGE * bench.memory)
     with _rendered(state, state.goal, bench) as targets:
         if ahead is not None:

@@ -31,8 +31,8 @@ from potr_cl.stages.refitting.coming_scene import AnyScene, ComingScene, arrived
 from potr_cl.stages.refitting.layout import Layout, Ridge
 from potr_cl.stages.refitting.own_views import OwnViews
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
-from potr_cl.stages.refitting.placement import left_for_views, placed
-from potr_cl.stages.refitting.reached import reached_splats
+from potr_cl.stages.refitting.placement import Place, placed
+from potr_cl.stages.refitting.reached import Reach, reached_splats
 from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
 from potr_cl.stages.refitting.rounding import ROUNDS, Rounding, Steps
 from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts, colour_shares
@@ -109,48 +109,42 @@ class ColourRefit(Owner):
         if not cameras:
             raise UsageError("a re-fit needs at least one view")
         with ExitStack() as owned:
-            own, others = None, None
-            if help_from is not None:
-                share = help_from.shares(len(cameras))
-                if share.others:
-                    own = share.own
-                    others = owned.enter_context(
-                        colour_parts(
-                            help_from.pool, share, scene, rules, background, help_from.source, cameras, memory
-                        )
-                    )  # fmt: skip
+            own: Sequence[int] = range(len(cameras))
+            others = None
+            if help_from is not None and (share := help_from.shares(len(cameras))).others:
+                own, pool = share.own, help_from.pool
+                others = owned.enter_context(
+                    colour_parts(pool, share, scene, rules, background, help_from.source, cameras, memory)
+                )
             sweep = Sweep(device, rules)
             layout = Layout(len(scene), stride_of(len(scene)), scene.sh.shape[1], sweep.lanes)
             # The vectors come first: prepared views can do with less memory, and only take longer then.
-            place = placed(device, layout.splats, layout.sh_count, memory, slices) if others is None else None
-            if place is None and others is None:
-                memory = left_for_views(layout.splats, layout.sh_count, memory)
-            reach = None
-            if place is not None:
-                scene = arrived(scene)  # the host has no room for vectors beside what rounds the geometry
-                rasterizer = owned.enter_context(Rasterizer(device, colourless(scene), rules))
-                reach = reached_splats(rasterizer, cameras, range(len(cameras)), memory)
-                if reach is not None:
-                    place = placed(device, layout.splats, layout.sh_count, memory, slices, reach) or place
-                memory = place.views
-            in_slices = () if place is None else (place.slice, place.resident)
-            self.coefficients = owned.enter_context(Coefficients(device, layout, *in_slices))
-            blocks = SplatBlocks(self.coefficients, None if place is None else place.blocks)
+            size = layout.splats, layout.sh_count
+            place = Place(memory) if others is not None else placed(device, *size, memory, slices)
+
+            def looked_at(room: int | None) -> tuple[Rasterizer, Reach | None]:
+                rasterizer = owned.enter_context(Rasterizer(device, colourless(arrived(scene)), rules))
+                return rasterizer, reached_splats(rasterizer, cameras, own, room)
+
+            looked = None
+            if place.slice is not None:  # the host has no room for vectors beside what rounds the geometry
+                looked = looked_at(memory)
+                scene = arrived(scene)
+                if looked[1] is not None:
+                    place = placed(device, *size, memory, slices, looked[1])
+            self.coefficients = owned.enter_context(Coefficients(device, layout, place.slice, place.resident))
+            blocks = SplatBlocks(self.coefficients, place.blocks)
             self._solver = ColourSolver(self.coefficients, blocks)
             self._written: FloatArray | None = None  # colours that the start of the next solution has already
             if isinstance(scene, ComingScene):
                 self.coefficients.write_sh(self._solver.x, scene.sh)
                 self._written = scene.sh
             helpers = None
-            if help_from is not None and others is not None:
-                in_process = help_from.pool.in_process
-                helpers = owned.enter_context(SharedViews(self.coefficients, others, in_process))
-            here = arrived(scene)
-            if place is None:
-                rasterizer = owned.enter_context(Rasterizer(device, colourless(here), rules))
-                reach = reached_splats(rasterizer, cameras, range(len(cameras)) if own is None else own, memory)
+            if others is not None:
+                helpers = owned.enter_context(SharedViews(self.coefficients, others, pool.in_process))
+            rasterizer, reach = looked or looked_at(place.views)
             views = owned.enter_context(
-                OwnViews(sweep, rasterizer, self.coefficients, cameras, background, memory, own, reach)
+                OwnViews(sweep, rasterizer, self.coefficients, cameras, background, place.views, own, reach)
             )
             self.colour_map = ColourMap(self.coefficients, views, helpers)
             if others is not None:

@@ -40,19 +40,19 @@ _COEFFICIENTS = 3
 
 @dataclass(frozen=True)
 class Place:
-    """How a re-fit does with little memory on the device.
+    """How a re-fit does with the device's memory.
 
     Attributes:
-        slice: splats whose coefficients go through the device together.
+        views: bytes that prepared views and targets may take; None: a part of what is free.
+        slice: splats whose coefficients go through the device together; None: all, and vectors and blocks lie there.
         blocks: splats whose blocks are added up together.
-        views: bytes that prepared views and targets may take.
-        resident: vectors that lie on the device.
+        resident: with slices, vectors that lie on the device even so.
     """
 
-    slice: int
-    blocks: int
-    views: int
-    resident: int = _FEWEST
+    views: int | None
+    slice: int | None = None
+    blocks: int | None = None
+    resident: int = 0
 
 
 def placed(
@@ -62,8 +62,8 @@ def placed(
     memory: int | None,
     slices: int | None = None,
     reach: Reach | None = None,
-) -> Place | None:
-    """How a re-fit has its vectors on the host; None: they lie on the device.
+) -> Place:
+    """Where a re-fit's vectors lie.
 
     Args:
         device: to compute on.
@@ -74,11 +74,11 @@ def placed(
         reach: of the views, if each has splats of its own.
     """
     vector, triangle = 12 * sh_count, sh_count * (sh_count + 1) // 2
-    one_piece = _one_piece(splats, sh_count)
+    one_piece = splats * (_VECTORS * vector + 2 * vector + 12 * triangle)
     free = max(device.info.memory - device.allocated, 0)
     fits = one_piece <= max(_OF_FREE * free if memory is None else min(_OF_GIVEN * memory, _OF_FREE * free), _ANYWAY)
     if slices is None and fits:
-        return None
+        return Place(memory if memory is None or one_piece <= _ANYWAY else max(memory - one_piece, 0))
     total = free if memory is None else min(memory, free)
     of_slice = 2 * vector + 4 * triangle + 8
     some = slices or min(max(int(_SLICE * total / of_slice), _LEAST_SLICE), _MOST_SLICE)
@@ -95,26 +95,10 @@ def placed(
         others = 0
         if resident <= _COEFFICIENTS:
             resident, others = max(resident - 1, _FEWEST), 1
-        return Place(some, blocks, max(int(left - (resident + others) * splats * vector), 0), resident)
+        return Place(max(int(left - (resident + others) * splats * vector), 0), some, blocks, resident)
     room = int(((_OF_HOST if of_host else _OF_VECTORS) * total / max(splats, 1) - _SWEEP) / vector) - 3
     besides = splats * (3 * vector + _SWEEP) + some * of_slice + 8 * triangle * min(blocks, splats)
     # Of few splats a slice, which has so many at least, takes more than its share.
     room = min(room, int((total - besides) / max(splats * vector, 1)))
     resident = min(max(room, _FEWEST), _MOST) if slices is None else _FEWEST
-    return Place(some, blocks, max(int(total - besides - splats * resident * vector), 0), resident)
-
-
-def left_for_views(splats: int, sh_count: int, memory: int | None) -> int | None:
-    """Bytes of the device's memory that views may take, where the vectors lie there in one piece.
-
-    Args:
-        splats, sh_count, memory: as of :func:`placed`, which found that they fit.
-    """
-    one_piece = _one_piece(splats, sh_count)
-    return memory if memory is None or one_piece <= _ANYWAY else max(memory - one_piece, 0)
-
-
-def _one_piece(splats: int, sh_count: int) -> int:
-    """Bytes of all vectors, sums and blocks."""
-    vector, triangle = 12 * sh_count, sh_count * (sh_count + 1) // 2
-    return splats * (_VECTORS * vector + 2 * vector + 12 * triangle)
+    return Place(max(int(total - besides - splats * resident * vector), 0), some, blocks, resident)
