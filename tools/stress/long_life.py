@@ -20,8 +20,8 @@ from pathlib import Path
 
 import potr_cl
 from potr_cl.opencl.device import Device
-from tools.bench.memory import resident
 from tools.results import Column, Results
+from tools.workloads import resident
 
 _SCENE = Path(__file__).parents[2] / "tests" / "data" / "plush_excerpt.ply"
 _CAMERAS = _SCENE.with_name("plush_excerpt_cameras.json")
@@ -61,9 +61,9 @@ def main() -> None:
             WORKS[work](Device(args.device) if args.each_opens_a_device else device)
         if turn == args.count or str(turn).strip("0") in ("1", "3"):
             gc.collect()
-            before = resident("VmRSS")
+            before = resident("VmRSS") / 1e9
             ctypes.CDLL(None).malloc_trim(0)
-            now = resident("VmRSS")
+            now = resident("VmRSS") / 1e9
             tenth = now if turn == _TENTH else tenth
             objects = len(gc.get_objects())
             table.add(turn, time.perf_counter() - began, 1e3 * before, 1e3 * now, device.allocated / 1e6, objects)
