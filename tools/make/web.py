@@ -23,7 +23,7 @@ _NATIVE = Path(potr_cl.codec.native.__file__).parent
 _SOURCES = ("bundles", "bundles_tokens", "bundles_values", "steps", "octree", "quantise")
 _ALWAYS = (
     "--target=wasm32-wasi", "-mexec-model=reactor", "-std=c11", "-flto", "-ffp-contract=off", "-fno-math-errno",
-    "-fvisibility=hidden", "-mbulk-memory", "-mnontrapping-fptoint", "-msign-ext", "-Wl,--no-entry", "-Wl,--gc-sections",
+    "-fvisibility=hidden", "-fno-stack-protector", "-mbulk-memory", "-mnontrapping-fptoint", "-msign-ext", "-Wl,--no-entry", "-Wl,--gc-sections",
     "-Wl,--strip-all", "-Wl,--export=__heap_base",
 )  # fmt: skip
 #: The build that takes every file, as small as it can be; and the one for speed.

@@ -183,7 +183,7 @@ export function readHeader(data, fileBytes, trust) {
     if (coder > 1 || (coder && !quantiser)) refuse(`${what} is of coder ${coder}, which is unknown: update potr_cl`);
     if (splats < 1 || splats > MOST_SPLATS || depth > MOST_LEVELS || some > MOST_SECTIONS)
       refuse(`${what} makes no sense: ${splats} splats, octree of ${depth} levels, ${some} sections`);
-    if (!box.every(isFinite) || [0, 1, 2].some((k) => box[k] > box[k + 3])) refuse(`${what} makes no sense: its box is (${box.map(float).join(', ')})`);
+    if (!box.every(isFinite) || [0, 1, 2].some((k) => box[k] > box[k + 3])) refuse(`${what} makes no sense: its box is [${box.map(float).join(', ')}]`);
     if (!origin.every(isFinite) || !(side >= 0 && side <= 2 * LARGEST)) refuse(`${what} makes no sense: its root cube is not finite`);
     if (!factors.every((x) => x >= Math.fround(1e-3) && x <= 1e9)) refuse(`${what} makes no sense: a scale factor outside 0.001 to 1e9`);
     if (!(error >= 0 && error < Infinity) || (before && (before.level < level || before.level > level + 1)))

@@ -1,0 +1,119 @@
+"""The decoder for browsers (web/) in Node: its own tests, and that it says of any file what Python says.
+
+``python -m tools.make.web`` builds it; where it is not built, or no Node is there, these tests are skipped.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import random
+import shutil
+import struct
+import subprocess
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from potr_cl.codec.decoder import decode
+from potr_cl.errors import DataError
+
+ROOT = Path(__file__).parents[1]
+WEB = ROOT / "web"
+NODE = shutil.which("node")
+GOLDEN = sorted((ROOT / "tests" / "data").glob("golden_*.potr"))
+#: Changed files of each golden one.
+CHANGES = 12
+
+pytestmark = [
+    pytest.mark.one_family,
+    pytest.mark.skipif(NODE is None, reason="there is no Node"),
+    pytest.mark.skipif(
+        not all((WEB / "dist" / name).exists() for name in ("potr.js", "potr.wasm", "potr-simd.wasm")),
+        reason="the decoder for browsers is not built: python -m tools.make.web",
+    ),
+]
+
+
+def run(*arguments: str) -> str:
+    assert NODE is not None
+    done = subprocess.run([NODE, *arguments], cwd=WEB, capture_output=True, text=True, timeout=900, check=False)
+    assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-4000:]
+    return done.stdout
+
+
+def test_its_own_tests() -> None:
+    run("--test", *(str(path.relative_to(WEB)) for path in sorted((WEB / "test").glob("*.test.mjs"))))
+
+
+def judged(data: bytes) -> str:
+    try:
+        scene = decode(data)
+    except DataError as error:
+        return str(error)
+    digest = hashlib.sha256()
+    for array in (scene.means, scene.log_scales, scene.quaternions, scene.opacity_logits, scene.sh):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def with_sums(data: bytearray) -> bytearray:
+    """With checksums that are right, so that what they would find reaches the decoder."""
+    (size,) = struct.unpack_from("<I", data, 12)
+    if not 36 <= size <= len(data):
+        return data
+    at, offset = 32, size
+
+    def entries(number: int) -> None:
+        nonlocal at, offset
+        for _ in range(number):
+            if at + 16 > size - 4:
+                return
+            (stored,) = struct.unpack_from("<I", data, at + 4)
+            struct.pack_into("<I", data, at + 12, zlib.crc32(data[offset : offset + stored]))
+            at, offset = at + 16, offset + stored
+
+    entries(data[29])
+    for _ in range(min(struct.unpack_from("<I", data, 24)[0], 1000)):
+        if at + 76 > size - 4:
+            break
+        at += 76
+        entries(data[at - 73])
+    struct.pack_into("<I", data, size - 4, zlib.crc32(data[: size - 4]))
+    return data
+
+
+def changed(data: bytes, chance: random.Random) -> bytes:
+    out = bytearray(data)
+    place = chance.randrange(min(len(out), 400) if chance.random() < 0.4 else len(out))
+    for _ in range(chance.randint(1, 3)):
+        out[(place + chance.randrange(16)) % len(out)] = chance.choice([0, 1, 127, 128, 255, chance.randrange(256)])
+    return bytes(with_sums(out) if chance.random() < 0.8 else out)
+
+
+def alike(ours: str, theirs: str) -> bool:
+    """Whether both mean the same. Libraries differ in which changed Zstandard frames they refuse, and in what words."""
+    frames = ("decompress", "describes its contexts at an impossible length", "describes impossible contexts")
+    return ours == theirs or any(words in ours for words in frames)
+
+
+@pytest.mark.parametrize("build", ["simd", "general"])
+def test_says_what_python_says(build: str, tmp_path: Path) -> None:
+    chance = random.Random(5)
+    files = [path.read_bytes() for path in GOLDEN]
+    files += [changed(data, chance) for data in files for _ in range(CHANGES)]
+    names = []
+    for number, data in enumerate(files):
+        names.append(tmp_path / f"{number}.potr")
+        names[-1].write_bytes(data)
+    found = json.loads(run("test/judge.mjs", build, *map(str, names)))
+    wrong = [
+        (path.name, ours, theirs)
+        for path, data, ours in zip(names, files, found, strict=True)
+        if not alike(ours, theirs := judged(data))
+    ]
+    assert found[: len(GOLDEN)] == [judged(data) for data in files[: len(GOLDEN)]]
+    assert not wrong, json.dumps(wrong, indent=1)
+    assert sum(" " in words for words in found) > len(files) / 4, "hardly a change was noticed"
