@@ -6,8 +6,8 @@ import { gzipSync } from 'node:zlib';
 import { build } from 'esbuild';
 import { minify } from 'terser';
 
-/** Where pages that encode makes have their viewer from. */
-const PAGES = '../potr_cl/outputs/page';
+/** What pages that encode makes are made of. */
+const PAGE = '../potr_cl/outputs/page.html';
 
 /** @param {string} name @param {object} options of esbuild @returns {Promise<string>} */
 async function bundled(name, options = {}) {
@@ -22,5 +22,5 @@ for (const name of readdirSync('loaders')) copyFileSync(`loaders/${name}`, `dist
 
 const viewer = await bundled('src/page/viewer.js', { format: 'iife', alias: { potr: './src/potr.js' }, loader: { '.wasm': 'binary' }, define: { 'import.meta.url': '"about:blank"' } });
 const page = readFileSync('src/page/page.html', 'utf-8').replace('@viewer@', () => gzipSync(viewer, { level: 9 }).toString('base64'));
-mkdirSync(PAGES, { recursive: true });
-writeFileSync(`${PAGES}/page.html`, page);
+
+writeFileSync(PAGE, page);

@@ -1,7 +1,7 @@
 // The viewer in a page that encode makes: three.js, the decoder and a scene in one file. Drag to turn, pinch or wheel to go
 // nearer, right drag or two fingers to move; W A S D Q E and the arrow keys fly.
 
-import { Color, PerspectiveCamera, Scene, Vector3, WebGPURenderer } from 'three/webgpu';
+import { Color, LinearSRGBColorSpace, PerspectiveCamera, Scene, Vector3, WebGPURenderer } from 'three/webgpu';
 import { OrbitControls } from 'three/addons/controls/OrbitControls.js';
 import { GaussianSplat } from 'three/addons/objects/GaussianSplat.js';
 import { decode } from 'potr';
@@ -26,6 +26,8 @@ async function show(about) {
   const splats = await decode(content('scene'), { wasm: { general, simd }, workers: 0 });
   const { centre, reach } = middle(splats), view = about.view;
   const renderer = new WebGPURenderer({ antialias: false });
+  // Colours of splats are those of the screen already: nothing is to be made of them.
+  renderer.outputColorSpace = LinearSRGBColorSpace;
   renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
   document.body.append(renderer.domElement);
   await renderer.init();
