@@ -17,8 +17,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import potr_cl
 from potr_cl.codec.decoder import decode
 from potr_cl.errors import DataError
+from potr_cl.pipeline.options import EncodeOptions
+from tests.reference.scenes import random_scene
 
 ROOT = Path(__file__).parents[1]
 WEB = ROOT / "web"
@@ -57,6 +60,16 @@ def judged(data: bytes) -> str:
     for array in (scene.means, scene.log_scales, scene.quaternions, scene.opacity_logits, scene.sh):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
+
+
+@pytest.mark.parametrize("preset", ["best", "paper"])
+@pytest.mark.parametrize("build", ["simd", "general"])
+def test_large_sections(build: str, preset: str, tmp_path: Path) -> None:
+    """Zstandard frames of many blocks, and many bundles, the last one of which is not whole."""
+    options = EncodeOptions.for_preset(preset).changed(prune=False, refit=False, compact=False)
+    encoded = potr_cl.encode(random_scene(50_001, degree=2, seed=3), None, options)
+    encoded.save(tmp_path / "large.potr")
+    assert json.loads(run("test/judge.mjs", build, str(tmp_path / "large.potr"))) == [judged(encoded.data)]
 
 
 def with_sums(data: bytearray) -> bytearray:
