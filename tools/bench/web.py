@@ -69,13 +69,15 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="keep the figures")
     args = parser.parse_args()
     results = [measured(file, args.rounds) for file in args.files]
-    print("| file | splats | native, M splats/s | SIMD | of native | without SIMD | of native | arrays, MB | Node's peak, MB |")
+    print(
+        "| file | splats | native, M splats/s | SIMD | of native | without SIMD | of native | arrays, MB | Node's peak, MB |"
+    )
     print("|---|---|---|---|---|---|---|---|---|")
     for each in results:
         native, simd, general = (each["splats"] / each["seconds"][name] / 1e6 for name in ("native", "simd", "general"))
         print(
-            f"| {each['file']} | {each['splats']:,} | {native:.2f} | {simd:.2f} | {simd / native:.2f} | {general:.2f} | "
-            f"{general / native:.2f} | {each['arrays'] / 1e6:.0f} | {each['peak']['simd'] / 1e6:.0f} |"
+            f"| {each['file']} | {each['splats']:,} | {native:.2f} | {simd:.2f} | {simd / native:.2f} | "
+            f"{general:.2f} | {general / native:.2f} | {each['arrays'] / 1e6:.0f} | {each['peak']['simd'] / 1e6:.0f} |"
         )
     if args.json is not None:
         args.json.write_text(json.dumps(results, indent=1) + "\n")

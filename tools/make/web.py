@@ -1,9 +1,9 @@
-"""Build the npm package of the decoder for browsers (web/), and the viewer that goes into pages (potr_cl/viewer/offline).
+"""Build the npm package of the decoder for browsers (web/), and what pages are made of (potr_cl/outputs/page.html).
 
     python -m tools.make.web [--only-wasm]
 
-The C is compiled to WebAssembly by Zig's C compiler, which PyPI has (pip install ziglang), or by clang, wasi-libc and lld
-of Debian, whichever is there. All else is npm's: web/package-lock.json says what is installed.
+The C is compiled to WebAssembly by Zig's C compiler, which PyPI has (pip install ziglang), or by clang, wasi-libc and
+lld of Debian, whichever is there. All else is npm's: web/package-lock.json says what is installed.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ _NATIVE = Path(potr_cl.codec.native.__file__).parent
 _SOURCES = ("bundles", "bundles_tokens", "bundles_values", "steps", "octree", "quantise")
 _ALWAYS = (
     "--target=wasm32-wasi", "-mexec-model=reactor", "-std=c11", "-flto", "-ffp-contract=off", "-fno-math-errno",
-    "-fvisibility=hidden", "-fno-stack-protector", "-mbulk-memory", "-mnontrapping-fptoint", "-msign-ext", "-Wl,--no-entry", "-Wl,--gc-sections",
-    "-Wl,--strip-all", "-Wl,--export=__heap_base",
+    "-fvisibility=hidden", "-fno-stack-protector", "-mbulk-memory", "-mnontrapping-fptoint", "-msign-ext",
+    "-Wl,--no-entry", "-Wl,--gc-sections", "-Wl,--strip-all", "-Wl,--export=__heap_base",
 )  # fmt: skip
 #: The build that takes every file, as small as it can be; and the one for speed.
 BUILDS = {

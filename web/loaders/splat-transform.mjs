@@ -1,4 +1,4 @@
-// Lets splat-transform (3.0 and newer) read .potr files, and so turn them into all that it writes:
+// Lets splat-transform (2.7 and newer) read .potr files, and so turn them into all that it writes:
 //
 //     splat-transform potr/dist/loaders/splat-transform.mjs -p file=scene.potr scene.sog
 //
