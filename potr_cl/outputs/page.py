@@ -9,7 +9,8 @@ from __future__ import annotations
 import base64
 import json
 import math
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -63,11 +64,11 @@ class Page(Potr):
         """The scene in a page. Raises DataError if there is none, or it is damaged."""
         return super().read(scene_in(data), trust)
 
-    def seen(
-        self, data: bytes, device: Device, trust: bool = False, memory: int | None = None
-    ) -> AbstractContextManager[Drawable]:
+    @contextmanager
+    def seen(self, data: bytes, device: Device, trust: bool = False, memory: int | None = None) -> Iterator[Drawable]:
         """See :meth:`potr_cl.outputs.potr.Potr.seen`."""
-        return super().seen(scene_in(data), device, trust, memory)
+        with super().seen(scene_in(data), device, trust, memory) as scene:
+            yield scene
 
     def properties(self, data: bytes) -> dict[str, int]:
         """Bytes by attribute; those of the page are "other"."""

@@ -69,9 +69,8 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="keep the figures")
     args = parser.parse_args()
     results = [measured(file, args.rounds) for file in args.files]
-    print(
-        "| file | splats | native, M splats/s | SIMD | of native | without SIMD | of native | arrays, MB | Node's peak, MB |"
-    )
+    heads = ("SIMD", "of native", "without SIMD", "of native", "arrays, MB", "Node's peak, MB")
+    print(f"| file | splats | native, M splats/s | {' | '.join(heads)} |")
     print("|---|---|---|---|---|---|---|---|---|")
     for each in results:
         native, simd, general = (each["splats"] / each["seconds"][name] / 1e6 for name in ("native", "simd", "general"))
