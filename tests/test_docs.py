@@ -104,10 +104,14 @@ def resolves(name: str) -> bool:
 
 
 def commands(page: Path) -> Iterator[list[str]]:
-    """The calls of the command line in a page's indented blocks, without comments."""
-    for line in re.findall(r"^ {4}(.+)$", page.read_text("utf-8"), re.MULTILINE):
+    """The calls of the command line in a page's indented blocks, without comments, and in its tables."""
+    text = page.read_text("utf-8")
+    for line in re.findall(r"^ {4}(.+)$", text, re.MULTILINE):
         for call in re.findall(r"(?:python -m potr_cl|^\$? *potr-cl) ([^&|]+)", line):
             yield shlex.split(call, comments=True)
+    for row in re.findall(r"^\|.+$", text, re.MULTILINE):
+        for call in re.findall(r"`potr-cl (\w[^`]+)`", row):
+            yield shlex.split(call)
 
 
 @pytest.mark.parametrize("page", PRESENT, ids=ids(PRESENT))

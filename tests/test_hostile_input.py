@@ -124,13 +124,3 @@ def test_files_are_the_same_the_second_time(tmp_path):
 @pytest.mark.slow
 def test_every_file_is_the_same_the_second_time(tmp_path):
     twice(tmp_path)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(importlib.util.find_spec("atheris") is None, reason="Atheris is not installed")
-def test_files_changed_towards_new_code(tmp_path):
-    rows = run("guided", tmp_path, "--format", "potr", "--format", "png", "--seconds", "10")
-    for row in rows:
-        assert row["findings"] == 0
-        assert row["files"] > 0
-        assert row["branches at last"] >= row["branches at first"] > 0

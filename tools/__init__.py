@@ -10,12 +10,11 @@ bench.encode           run time against error of every stage and variant on ever
 bench.rasterizer       frames a second, and time against splats, pixels and overlap
 bench.pruning          what does pruning keep, against other pruners, and what may its sweeps skip?
 bench.refit            what does the re-fit of the colours bring, and what does it take?
-bench.fit              how fast are the fit's steps, and how exact its derivatives?
+bench.fit              how fast are the fit's steps?
 bench.decode           how fast does a file decode, by compiled code, NumPy or OpenCL, and in how much memory?
 bench.codec            speed, memory and size of the codec alone
 bench.virtual_cameras  what does encoding without cameras cost, and what is left of places?
 bench.paired           are whole encodes faster or slower than those of another checkout?
-bench.memory           host memory of one encode, stage by stage
 bench.scaling          time and memory against splats, views and workers: with which exponents?
 bench.web              how fast is the browser's decoder against native C, and in how much memory?
 =====================  =================================================================================================
@@ -25,9 +24,7 @@ What a choice costs or brings, against the alternatives (``study``):
 =========================  =============================================================================================
 study.rate_distortion      size against quality: the curves that other studies compare with
 study.ablation             what does each part of the codec contribute?
-study.compare_formats      what would people use instead?
-study.output_formats       how small are encodes to the formats that viewers open, and what do others read of them?
-study.frames               which cameras in another frame are found, and what do unseen splats cost?
+study.formats              how small are encodes to the formats that viewers open, and what do others make of scenes?
 =========================  =============================================================================================
 
 What happens at the limits (``stress``):
@@ -37,11 +34,11 @@ stress.run          every kernel against float64 on the worst inputs: what error
 stress.platforms    the rasterizer, the metrics and the re-fit on every OpenCL runtime of this machine
 stress.simulated    does Oclgrind see a race, an access out of bounds or an uninitialised read in any kernel?
 stress.fuzz         does any changed file do more than be refused or decode to finite numbers?
-stress.guided       the same of files that are changed towards code that none has reached yet (Atheris)
 stress.bombs        what do files take that unpack to far more than they are, or claim to?
 stress.signals      what is left of a command that is told to end, at any moment?
 stress.determinism  does every command write the same bytes the second time?
 stress.page         is the viewer's server upset by any message, or by many?
+stress.long_life    does a process that encodes, renders and compares all day grow?
 stress.native       does the compiled decoder touch memory not its own, or differ from NumPy's, on changed files?
 ==================  ====================================================================================================
 
@@ -54,8 +51,7 @@ make.places           houses, streets and sites out of trained scenes, with view
 make.test_data        the excerpts in tests/data
 make.release          a wheel and an sdist that are ready for a package index
 make.readme_picture   the picture at the top of the README
-make.foreign_files    the excerpt in splat-transform's formats
-make.other_tools      some splats in the formats of six tools, and how splat-transform reads them
+make.other_tools      splats in the formats of six tools, and how splat-transform reads them
 make.golden_files     files that every later decoder must read to the same values
 make.native           the compiled part of the decoder, in the checkout
 make.web              the decoder for browsers, and the viewer of pages
@@ -63,10 +59,8 @@ make.docs             the pages and tables of README and docs that are made from
 make.benchmarks       the tables and plots of docs/benchmarks, from the results beside them
 ====================  ==================================================================================================
 
-Shared: :mod:`tools.results` (tables that say what they are of), :mod:`tools.workloads` (scenes, views, repeated work),
-:mod:`tools.study.evaluation` (what a candidate loses to its scene), :mod:`tools.study.curves` (points of several runs
-as one curve), :mod:`tools.study.pruning_baselines` (the orders of other pruners), :mod:`tools.stress.cases` (inputs at
-their worst), :mod:`tools.stress.precise` (what they give in float64). Tools import the package and the float64
+Shared: :mod:`tools.results` (tables that say what they are of), :mod:`tools.workloads` (command lines, scenes, time and
+memory), :mod:`tools.study.evaluation` (what a candidate loses to its scene). Tools import the package and the float64
 definitions (:mod:`tests.reference`), no other tests; kernels of their own are given to a
 :class:`potr_cl.opencl.device.Device` as variants. Their own tests are in tools/tests.
 """

@@ -51,13 +51,17 @@ class Results:
         self._tables: dict[str, Table] = {}
         print("{machine}, {date}, commit {commit}".format(**self._circumstances))
 
-    def table(self, name: str, title: str, *columns: Column) -> Table:
+    def table(self, name: str, title: str, *given: Column | str) -> Table:
         """Begin a table, with its head on standard output.
 
         Args:
             name: of the result in the JSON file.
             title: what the table shows, without a full stop.
+            given: columns; a text is several, "name; name|unit; name|unit|format".
         """
+        columns = tuple(
+            column for each in given for column in ([each] if isinstance(each, Column) else Column.of(each))
+        )
         heads = " | ".join(column.head for column in columns)
         print(f"\n{title}:\n\n| {heads} |\n{'|---' * len(columns)}|", flush=True)
         self._tables[name] = Table(title, columns, self._keep)
@@ -77,13 +81,16 @@ class Column:
         unit: of its numbers; stands in the head too.
         format: how a number is written, as in ".2f"; for several numbers in a cell a text with a field for each, as in
             "{:.2f} / {:.2f}".
-        default: what a cell shows if it is of the package's default (tools.make.benchmark_results).
     """
 
     name: str
     unit: str = ""
     format: str = ""
-    default: str = ""
+
+    @staticmethod
+    def of(text: str) -> list[Column]:
+        """Columns from "name; name|unit; name|unit|format"."""
+        return [Column(*each.split("|")) for each in text.split("; ")]
 
     @property
     def head(self) -> str:

@@ -52,7 +52,7 @@ class SceneInfo:
             return "\n".join([format_report(facts), "", *format_histograms(facts), "", *format_suspicious(facts)])
         head = [f"format          {facts['format']}"] if facts["format"] else []
         if facts["bytes"] is not None:
-            head.append(f"size            {facts['bytes']:,} bytes, {facts['bytes'] / facts['splats']:.2f} a splat")
+            head.append(f"size            {facts['bytes']:,} bytes, {facts['bytes'] / facts['splats']:.2f} per splat")
         return "\n".join([*head, format_scene(facts)])
 
 

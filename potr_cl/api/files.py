@@ -136,7 +136,7 @@ def decode(
         write = scene_writer(output)
     data = encoded_bytes(file)
     if data is None and not isinstance(file, (str, os.PathLike)):
-        raise UsageError(f"a .potr file is wanted, its bytes or an encode to one, not {type(file).__name__}")
+        raise UsageError(f"expected the path of a .potr file, its bytes or an Encoded, not {type(file).__name__}")
     within = None if box is None else Box.of(box)
     scene = decode_file(file if data is None else data, trust, sh_degree, within)  # type: ignore[arg-type]
     if write is not None:

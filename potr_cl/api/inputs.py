@@ -60,7 +60,7 @@ def scene_of(source: SceneSource, trust: bool = False, antialiased: bool | None 
         from potr_cl.formats import load_scene
 
         return load_scene(source, **_trusting(trust)).rendered(antialiased)
-    raise UsageError(f"a scene is wanted, or the path of its file, not {type(source).__name__}")
+    raise UsageError(f"expected a scene or the path of one, not {type(source).__name__}")
 
 
 def _usable(scene: Scene) -> Scene:
@@ -198,7 +198,7 @@ def on_device(
     if data is not None:
         return decoded(open_file(data, trust))
     if not isinstance(source, (str, os.PathLike)):
-        raise UsageError(f"a .potr file is wanted, its bytes or an encode to one, not {type(source).__name__}")
+        raise UsageError(f"expected the path of a .potr file, its bytes or an Encoded, not {type(source).__name__}")
     path = os.fspath(source)
     try:
         return decoded(open_file(path if read is None else read, trust))

@@ -100,7 +100,7 @@ def command_parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:
         "--print-completion",
         action=PrintCompletion,
         choices=SHELLS,
-        help="print the script by which a shell completes this command line (needs the extra completion)",
+        help="print a script for completion in this shell (needs the extra completion)",
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     # To decode takes less time than to import what other commands need.
@@ -114,8 +114,8 @@ def _add_loudness(command: argparse.ArgumentParser) -> None:
     """What every command understands of how much it shall say."""
     how = command.add_argument_group("messages").add_mutually_exclusive_group()
     for name, text in (
-        ("quiet", "print errors, warnings, and what was asked for as the result; no progress, no summary of a file"),
-        ("verbose", "print more: the device, its driver, what is passed over"),
+        ("quiet", "print errors, warnings and results only"),
+        ("verbose", "print more: the device, its driver, devices that are skipped"),
     ):
         how.add_argument(f"--{name}", dest="loudness", action="store_const", const=name, default="normal", help=text)
 

@@ -48,7 +48,7 @@ def add_to_option(p: argparse._ActionsContainer) -> None:
 def add_batch_options(p: argparse._ActionsContainer) -> None:
     """What every command understands that takes several scenes."""
     add_to_option(p)
-    p.add_argument("--skip-existing", action="store_true", help="leave out scenes whose output file exists")
+    p.add_argument("--skip-existing", action="store_true", help="skip scenes whose output file exists")
 
 
 def jobs(args: argparse.Namespace, kind: type[WrittenFile], suffix: str | None) -> list[argparse.Namespace]:

@@ -24,14 +24,12 @@ def _devices(args: argparse.Namespace) -> None:
 
 
 def add_devices(commands: Commands) -> None:
-    p = commands.add_parser(
-        "devices", help="the OpenCL devices; * marks the one that is taken by default, ! what does not work"
-    )
+    p = commands.add_parser("devices", help="list the OpenCL devices; * marks the default, ! what does not work")
     p.add_argument(
         "--check",
         action="store_true",
         help="run every kernel of encodes on each device, in a process of its own; takes seconds or, the first time, "
         "minutes. Devices that fail are passed over from now on. Fails if none is left",
     )
-    p.add_argument("--json", action="store_true", help="for programs")
+    p.add_argument("--json", action="store_true", help="print JSON")
     p.set_defaults(run=_devices)

@@ -101,7 +101,7 @@ def add_prune(commands: Commands) -> None:
         "--order",
         type=WrittenNumbers,
         metavar="FILE.npy",
-        help="also write the order of removal: the scene's splat numbers, first removed first, kept ones last",
+        help="also write the order of removal: indices into the scene, first removed first, kept ones last",
     )
     add_stage_flags(p, [Prune], without=["on"])
     add_usual_options(p)
@@ -130,7 +130,7 @@ def add_compact(commands: Commands) -> None:
     add_output_options(p)
     p.add_argument("-q", "--quality", type=float, default=0.5, metavar="Q", help="0 (sparsest) to 1; default 0.5")
     add_stage_flags(p, [Compact], without=["on", "at"])
-    p.add_argument("--sf-sh", type=float, metavar="SF", help="steps a unit of the quantiser to expect")
+    p.add_argument("--sf-sh", type=float, metavar="SF", help="levels per unit of the expected quantiser")
     add_usual_options(p)
     p.set_defaults(run=_compact)
 
@@ -208,14 +208,14 @@ def add_refit(commands: Commands) -> None:
         type=whole_number,
         default=RefitOptions.steps,
         metavar="N",
-        help=f"at the most; default {RefitOptions.steps}",
+        help=f"at most so many steps; default {RefitOptions.steps}",
     )
     p.add_argument(
         "--prior",
         type=float,
         default=RefitOptions.prior,
         metavar="X",
-        help=f"how strongly coefficients are held where they were; default {RefitOptions.prior:g}",
+        help=f"how strongly coefficients are held at their old values; default {RefitOptions.prior:g}",
     )
     p.add_argument(
         "--lambda",
@@ -230,7 +230,7 @@ def add_refit(commands: Commands) -> None:
         type=float,
         default=RefitOptions.drop,
         metavar="X",
-        help="give up an AC coefficient where the mean squared error grows by less; default: none",
+        help="zero an AC coefficient if that raises the mean squared error by less than this; default: none",
     )
     add_usual_options(p)
     p.set_defaults(run=_refit)

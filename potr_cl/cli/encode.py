@@ -304,7 +304,7 @@ def add_encode(commands: Commands) -> None:
         type=read_file,
         nargs="+",
         metavar="SCENE.ply",
-        help=f'{suffixes_read()}, or "-" for standard input; of several, all are seen from the same cameras',
+        help=f'{suffixes_read()}, or "-" for standard input; several scenes share the cameras',
     )
     p.add_argument(
         "-o",
@@ -312,8 +312,7 @@ def add_encode(commands: Commands) -> None:
         type=place,
         required=True,
         metavar="OUT.potr",
-        help=f'{suffixes_encoded()}, a folder, or "-" for standard output; all are made by the same stages; .potr is '
-        "the smallest",
+        help=f'{suffixes_encoded()}, a folder, or "-" for standard output; .potr is the smallest',
     )
     add_batch_options(p)
     add_spz_version_option(p)
@@ -322,20 +321,19 @@ def add_encode(commands: Commands) -> None:
         "-q", "--quality", type=float, default=0.5, metavar="Q", help="0 (smallest) to 1 (best); default 0.5"
     )
     goal.add_argument(
-        "--max-size", metavar="SIZE", help="find the quality that fills this size: 8MB, 8 MiB, 800k, or bytes"
+        "--max-size", metavar="SIZE", help="find the quality that fills this size: 8MB, 8MiB, 800k, or bytes"
     )
     goal.add_argument(
         "--min-psnr",
         type=float,
         metavar="DB",
-        help="find the quality that just reaches this mean PSNR against the uncompressed scene, on the views that the "
-        "result is judged by",
+        help="find the quality that just reaches this mean PSNR against the uncompressed scene, on the judging views",
     )
     goal.add_argument(
         "--ladder",
         metavar="Q,Q,…",
-        help="a file for each of these qualities, 0.1,0.3,0.5, and a ladder.json with their sizes and PSNR, into the "
-        "folder -o: the command view has a slider to choose among them by eye",
+        help="one file per quality, such as 0.1,0.3,0.5, and a ladder.json with sizes and PSNR, into the folder -o; "
+        "view then has a slider to choose among them",
     )
     p.add_argument(
         "--preset",
@@ -344,21 +342,23 @@ def add_encode(commands: Commands) -> None:
         help="; ".join(f"{name}: {purpose}" for name, purpose in PURPOSE.items()) + f"; default: {DEFAULT}",
     )
     add_cameras_options(p)
-    p.add_argument("--no-quality", action="store_true", help="do not judge the result; saves time")
-    p.add_argument("--json", action="store_true", help="the summary for programs; of several scenes a line each")
+    p.add_argument("--no-quality", action="store_true", help="skip judging the result; saves time")
+    p.add_argument("--json", action="store_true", help="print the summary as JSON; one line per scene")
     p.add_argument(
         "--report",
         type=WrittenPage,
         metavar="OUT.html",
-        help="a page of its own with sizes, quality by view, pictures before and after, and the course of pruning",
+        help="write a page with sizes, quality by view, pictures before and after, and the course of pruning",
     )
-    p.add_argument("--report-view", metavar="NAME", help="a judging view to show besides the worst and the median one")
+    p.add_argument("--report-view", metavar="NAME", help="an additional judging view to show in the report")
     add_stage_flags(p)
-    p.add_argument("--threads", type=whole_number, default=0, metavar="T", help="default: one a processor")
+    p.add_argument(
+        "--threads", type=whole_number, default=0, metavar="T", help="host threads (default: one per processor)"
+    )
     add_from_option(p)
     add_trust_option(p)
     add_antialiased_option(p)
-    add_memory_option(p, ", and for the re-fit; the host's arrays of a scene too large for it lie in temporary files")
+    add_memory_option(p, " and the re-fit; larger scenes use temporary files")
     add_device_options(p, SEVERAL)
     add_cluster_option(p)
     p.set_defaults(run=_encode, checked_suffix=encoded_suffix)

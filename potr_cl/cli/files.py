@@ -60,11 +60,11 @@ def add_decode(commands: Commands) -> None:
     add_batch_options(p)
     p.add_argument(
         "--sh-degree", type=int, choices=range(len(SH_COEFFICIENTS)), metavar="N",
-        help="leave out SH coefficients of degrees above N, 0 to 3, without decoding them; default: none",
+        help="skip SH degrees above N, 0 to 3, without decoding them; default: none",
     )  # fmt: skip
     p.add_argument(
         "--box", type=float, nargs=6, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
-        help="leave out splats whose centres lie outside of this box, in world units; of a file of blocks only those "
+        help="skip splats whose centres lie outside this box, in world units; of a file of blocks only those "
         "that meet the box are read; default: none",
     )  # fmt: skip
     add_trust_option(p)
@@ -90,10 +90,8 @@ def add_info(commands: Commands) -> None:
         description=f"Reads every kind of scene: {suffixes_read()}. Says how many splats it has, how large it is, how "
         "its opacities and scales are spread, and what looks suspicious.",
     )
-    p.add_argument(
-        "file", type=read_file, metavar="SCENE", help='a scene of any kind that is read, or "-" for standard input'
-    )
-    p.add_argument("--json", action="store_true", help="for programs")
+    p.add_argument("file", type=read_file, metavar="SCENE", help='a scene in any format, or "-" for standard input')
+    p.add_argument("--json", action="store_true", help="print JSON")
     add_from_option(p)
     add_trust_option(p)
     p.set_defaults(run=_info)

@@ -61,14 +61,14 @@ def add_fit(commands: Commands) -> None:
         type=whole_number,
         default=FitOptions.steps,
         metavar="N",
-        help=f"at the most; default {FitOptions.steps}",
+        help=f"at most so many steps; default {FitOptions.steps}",
     )
     p.add_argument(
         "--views-between",
         type=whole_number,
         default=0,
         metavar="N",
-        help="views to look at besides, for each training view, between it and its neighbours; default 0",
+        help="extra views per training view, between it and its neighbours; default 0",
     )
     add_usual_options(p)
     p.set_defaults(run=_fit)

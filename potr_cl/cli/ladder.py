@@ -50,7 +50,7 @@ def encode_ladder(args: argparse.Namespace, options: EncodeOptions) -> None:
             cameras = virtual_cameras(args, scene, progress, device)
         if device is not None and cameras is not None:
             tell_what_is_ahead(device, scene, cameras, options)
-            note(f"{len(steps)} qualities: so many times as long", "detail")
+            note(f"encoding {len(steps)} qualities: about {len(steps)} times as long", "detail")
         ladder = make_ladder(
             scene, name, cameras, options, steps, folder, device, progress, progress.tell, args.trust,
             judged=not args.no_quality, pool=pool,

@@ -22,19 +22,19 @@ def add_memory_option(p: argparse._ActionsContainer, besides: str = "") -> None:
         "--memory",
         type=float,
         metavar="GB",
-        help=f"GiB of device memory to keep views in{besides}; default: half of it, 0.3 of a CPU's",
+        help=f"memory limit in GiB for views{besides} (default: half of a GPU's memory, 0.3 of the RAM on a CPU)",
     )
 
 
 #: What the help of ``--device`` says besides, where a command takes several.
-SEVERAL = "; of several the views are shared out: all (of the best one's kind), or indices with commas, 0,1"
+SEVERAL = "; several devices share the views: all (of the best kind), or indices such as 0,1"
 
 
 def add_cluster_option(p: argparse._ActionsContainer) -> None:
     p.add_argument(
         "--cluster",
         metavar="ADDRESS",
-        help="a Dask cluster whose workers do the views: its scheduler's address, tcp://HOST:8786",
+        help="address of the scheduler of a Dask cluster, tcp://HOST:8786: its workers share the views",
     )
 
 
@@ -52,7 +52,7 @@ def add_device_options(p: argparse._ActionsContainer, several: str = "") -> None
     p.add_argument(
         "--device",
         metavar="DEVICE",
-        help="index, part of a name, cpu or gpu, as the command devices lists them; "
+        help="index (see the command devices), part of a name, cpu or gpu; "
         f"default: ${DEVICE_VARIABLE}, else the one that should be fastest{several}",
     )
 
@@ -64,7 +64,7 @@ def add_rendering_options(p: argparse.ArgumentParser, several: str = "") -> None
         "--rules",
         choices=tuple(RULES),
         default="inria",
-        help="whose rasterizer to follow; default inria, the original",
+        help="rasterizer to imitate; default inria, the original",
     )
 
 

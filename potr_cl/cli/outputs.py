@@ -124,7 +124,7 @@ def _check_standard_output(args: argparse.Namespace) -> None:
         raise UsageError("standard output is closed: redirect it, or give a name")
     with contextlib.suppress(OSError, ValueError, AttributeError):
         if sys.stdout.isatty():
-            raise UsageError("the result is no text for a terminal: redirect standard output, or give a name")
+            raise UsageError("refusing to write binary data to a terminal: redirect standard output, or give a name")
 
 
 def suffix_of(args: argparse.Namespace) -> str:

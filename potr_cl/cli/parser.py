@@ -122,7 +122,7 @@ def whole_number(text: str) -> int:
             return int(text)
     except ValueError:
         pass
-    raise argparse.ArgumentTypeError(f"{plain(text, 40)!r} is no whole number of at most {_MOST_DIGITS} digits")
+    raise argparse.ArgumentTypeError(f"{plain(text, 40)!r} is not a whole number of at most {_MOST_DIGITS} digits")
 
 
 def _options(words: Iterable[str]) -> Iterable[str]:

@@ -56,10 +56,10 @@ def _add_viewpoints(p: argparse.ArgumentParser) -> None:
         "--virtual-views",
         type=whole_number,
         metavar="N",
-        help=f"to place where the scene seems to have been looked at from; default {VIEWS}",
+        help=f"number of virtual views without --cameras; default {VIEWS}",
     )
     which.add_argument(
-        "--turntable", type=whole_number, metavar="N", help="views from a circle around the scene instead"
+        "--turntable", type=whole_number, metavar="N", help="place N views on a circle around the scene instead"
     )
     where.add_argument(
         "--up",
@@ -67,7 +67,7 @@ def _add_viewpoints(p: argparse.ArgumentParser) -> None:
         help=f"which way is up in these views: {', '.join(AXES)} (write --up=-y), X,Y,Z or auto; default auto, a guess",
     )
     where.add_argument(
-        "--size", type=whole_number, metavar="PIXELS", help=f"along a side of their square pictures; default {SIZE}"
+        "--size", type=whole_number, metavar="PIXELS", help=f"side of their square pictures; default {SIZE}"
     )
 
 
@@ -110,10 +110,10 @@ def _render(args: argparse.Namespace) -> None:
 
 def add_render(commands: Commands) -> None:
     p = commands.add_parser("render", help="pictures (.png) of a scene from its cameras, or from all around")
-    p.add_argument("scene", type=ReadFile, metavar="SCENE", help="the scene to look at")
-    p.add_argument("--cameras", type=ReadCameras, metavar="PATH", help=f"{CAMERAS_HELP}; without, views are placed")
+    p.add_argument("scene", type=ReadFile, metavar="SCENE", help="the scene to draw")
+    p.add_argument("--cameras", type=ReadCameras, metavar="PATH", help=f"{CAMERAS_HELP}; without it, views are placed")
     p.add_argument(
-        "-o", "--output", type=WrittenFolder, required=True, metavar="DIR", help="one file a view, named after it"
+        "-o", "--output", type=WrittenFolder, required=True, metavar="DIR", help="one file per view, named after it"
     )
     add_view_options(p, "all")
     _add_viewpoints(p)
@@ -194,17 +194,17 @@ def _tell(args: argparse.Namespace, report: dict[str, object], text: str) -> Non
 def add_compare(commands: Commands) -> None:
     p = commands.add_parser(
         "compare",
-        help="what compression cost: PSNR and SSIM of one scene's pictures against another's, and sizes",
+        help="what compression costs: PSNR and SSIM of one scene's pictures against another's, and sizes",
         description="Render two scenes from the same views and compare. A PSNR is in decibels, a mean is over views. "
         "In JSON a PSNR of null means identical pictures.",
     )
     p.add_argument("a", type=ReadFile, metavar="A", help=f"the uncompressed scene: {suffixes_read()}")
-    p.add_argument("b", type=ReadFile, metavar="B", help="the one to judge")
-    p.add_argument("--cameras", type=ReadCameras, metavar="PATH", help=f"{CAMERAS_HELP}; without, views are placed")
+    p.add_argument("b", type=ReadFile, metavar="B", help="the scene to judge")
+    p.add_argument("--cameras", type=ReadCameras, metavar="PATH", help=f"{CAMERAS_HELP}; without it, views are placed")
     p.add_argument(
         "--truth", type=ReadPhotographs, metavar="DIR", help="photographs, named after the views: judge A and B by them"
     )
-    p.add_argument("--lpips", action="store_true", help="tell LPIPS too; needs the extra lpips and its weights")
+    p.add_argument("--lpips", action="store_true", help="also compute LPIPS; needs the extra lpips and its weights")
     add_view_options(p, "test views if there are any, else all")
     p.add_argument(
         "-o",
@@ -214,7 +214,7 @@ def add_compare(commands: Commands) -> None:
         help="the worst view: A, B, and their difference, labelled",
     )
     _add_viewpoints(p)
-    p.add_argument("--json", action="store_true", help="for programs")
+    p.add_argument("--json", action="store_true", help="print JSON")
     add_trust_option(p)
     add_antialiased_option(p)
     add_rendering_options(p, SEVERAL)

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 #: Files of so many bytes are read for seconds.
 _LONG_TO_READ = 1 << 28
 
-FROM_HELP = 'the format that "-", standard input, brings: .ply, .spz …; default: what its content says'
-TO_HELP = "the format to write where no name says it, .ply, .spz …"
+FROM_HELP = 'format of "-", standard input: .ply, .spz …; default: detected'
+TO_HELP = "output format if the file name does not give it: .ply, .spz …"
 ANTIALIASED = {"yes": True, "no": False, "auto": None}
 
 
@@ -41,7 +41,7 @@ def add_trust_option(p: argparse._ActionsContainer) -> None:
     p.add_argument(
         "--trust",
         action="store_true",
-        help="read scene files that take far more memory than their size lets expect: only from who means well",
+        help="read files that expand to far more memory than their size suggests; only for files you trust",
     )
 
 
@@ -56,8 +56,8 @@ def add_antialiased_option(p: argparse._ActionsContainer) -> None:
         "--antialiased",
         choices=tuple(ANTIALIASED),
         default="auto",
-        help="whether the scene was trained with antialiasing (gsplat's antialiased mode, Mip-Splatting) and is to be "
-        "rendered so; default auto: as its file says, which PLY files of gsplat and nerfstudio do not: give yes",
+        help="whether the scene was trained with antialiasing (gsplat's antialiased, Mip-Splatting); default auto: "
+        "what the file says. PLY files of gsplat and nerfstudio do not say: pass yes",
     )
 
 

@@ -20,7 +20,7 @@ def _view(args: argparse.Namespace) -> None:
         truth=args.truth, host=args.host, port=args.port, browser=args.browser and _has_screen(), device=args.device,
         rules=args.rules, background=args.background, trust=args.trust, antialiased=ANTIALIASED[args.antialiased],
     ) as viewer:  # fmt: skip
-        say_done(f"{viewer.url} shows it; Ctrl-C ends it")
+        say_done(f"viewer: {viewer.url} (Ctrl-C to stop)")
         if args.host != HOST:
             note("warning: whoever reaches this machine can open the page: it has no password", "warning")
         viewer.wait()
@@ -46,21 +46,22 @@ def add_view(commands: Commands) -> None:
         metavar="A",
         help="the scene, or the uncompressed one of two; or a ladder's folder or ladder.json (encode --ladder)",
     )
-    p.add_argument("b", type=ReadFile, nargs="?", metavar="B", help="to compare with A: a scene or a ladder")
-    p.add_argument("--cameras", type=ReadCameras, metavar="PATH", help=f"{CAMERAS_HELP}; without, views are placed")
+    p.add_argument("b", type=ReadFile, nargs="?", metavar="B", help="the scene or ladder to compare with A")
+    p.add_argument("--cameras", type=ReadCameras, metavar="PATH", help=f"{CAMERAS_HELP}; without it, views are placed")
     p.add_argument(
-        "--truth", type=ReadPhotographs, metavar="DIR", help="photographs, named after the views: shown over pictures"
+        "--truth",
+        type=ReadPhotographs,
+        metavar="DIR",
+        help="photographs, named after the views, to show over the pictures",
     )
-    p.add_argument(
-        "--port", type=whole_number, default=PORT, metavar="PORT", help=f"default {PORT}; 0: any that is free"
-    )
+    p.add_argument("--port", type=whole_number, default=PORT, metavar="PORT", help=f"default {PORT}; 0: any free one")
     p.add_argument(
         "--host",
         default=HOST,
         metavar="ADDRESS",
-        help="to listen on; default: only this machine can connect. 0.0.0.0 lets everybody in who reaches the machine",
+        help="address to listen on; default: this machine only; 0.0.0.0 admits everybody who can reach the machine",
     )
-    p.add_argument("--no-browser", dest="browser", action="store_false", help="open no browser, only say the address")
+    p.add_argument("--no-browser", dest="browser", action="store_false", help="print the address, open no browser")
     add_trust_option(p)
     add_antialiased_option(p)
     add_rendering_options(p)

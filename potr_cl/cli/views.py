@@ -32,19 +32,19 @@ def add_cameras_options(p: argparse.ArgumentParser) -> None:
         "--cameras",
         type=cameras_to_read,
         metavar="PATH",
-        help=f'{CAMERAS_HELP}; "beside": those in the folder of each scene, or of its training; without, virtual '
-        "cameras are placed",
+        help=f'{CAMERAS_HELP}; "beside": those in the folder of each scene, or of its training. Without '
+        "--cameras, virtual ones are placed",
     )
     p.add_argument(
         "--virtual-views",
         type=whole_number,
         metavar="N",
-        help="how many to place without --cameras (default: 200 to 1600, more for larger scenes)",
+        help="number of virtual views without --cameras (default: 200 to 1600, more for larger scenes)",
     )
     p.add_argument(
         "--cameras-anyway",
         action="store_true",
-        help="take the cameras even if they do not seem to be in the scene's frame",
+        help="use the cameras even if they do not seem to be in the scene's frame",
     )
 
 

@@ -53,7 +53,7 @@ def parse_colour(text: str) -> Colour:
     with contextlib.suppress(ValueError):
         red, green, blue = ImageColor.getrgb(text.strip())[:3]
         return red / 255, green / 255, blue / 255
-    raise UsageError(f"'{text}' is no colour: give R,G,B from 0 to 1, a name such as white, or #rrggbb")
+    raise UsageError(f"unknown colour '{text}': give R,G,B from 0 to 1, a name such as white, or #rrggbb")
 
 
 def opened_image(source: Any, formats: tuple[str, ...]) -> Image.Image:

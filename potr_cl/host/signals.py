@@ -26,7 +26,7 @@ _SAID = {
 PATIENCE = 5.0
 
 #: What the first Ctrl-C is answered by work that can end early.
-_ENDS_EARLY = b"potr-cl: interrupted: what is done so far is kept, and the work goes on with it; once more to end\n"
+_ENDS_EARLY = b"potr-cl: interrupted: finishing with the result so far; press Ctrl-C again to abort\n"
 
 _received: int | None = None
 _unwinds = False

@@ -23,9 +23,8 @@ _VIEWS, _VIEWS_ON_CPU, MOST = 240, 200, 1600
 _SIZE, _SIZE_ON_CPU, _SPLATS = 600, 480, 300_000
 #: An eighth as many judge, but no more than so many.
 _MOST_TESTS = 32
-#: Degrees from side to side. A wide view shows a splat together with more of the others, so that fewer views show each
-#: splat from as many directions.
-FIELD = 65.0
+#: Degrees from side to side, as photographs have.
+FIELD = 50.0
 #: What may be asked for: no more views than places are tried, no wider ones than are rendered.
 MOST_ASKED, WIDEST_ASKED = 4000, 16384
 #: What the names of virtual cameras begin with.

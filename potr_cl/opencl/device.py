@@ -6,6 +6,7 @@ import hashlib
 import logging
 import os
 import threading
+import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
@@ -19,7 +20,7 @@ from potr_cl.errors import DeviceError, DeviceMemoryError
 from potr_cl.host.silence import whatever_warns
 from potr_cl.host.threads import in_background, thread_pool
 from potr_cl.opencl import compiler, program_cache, quirks
-from potr_cl.opencl.ahead import context_of
+from potr_cl.opencl.ahead import context_of, leave
 from potr_cl.opencl.building import building
 from potr_cl.opencl.discovery import DeviceInfo, Family, choose_device, compiler_fault, not_to_be_taken
 from potr_cl.opencl.foresight import Foresight, Wanted
@@ -99,8 +100,11 @@ class Device:
         self._frees_wait = quirks.WAITING_FREES.concerns(self.info.platform, self.info.version)
         self._foresight: Foresight | None = None
         self._of_this_thread = threading.local()
+        self._leaving: weakref.finalize[..., Device] | None = None
         with self.errors("cannot be opened"):
-            self.context = context_of(self.info)
+            self.context, self._built_before = context_of(self.info)
+            self._leaving = weakref.finalize(self, leave, self.info.handle, self.context, self._built_before)
+            self._leaving.atexit = False
             flags = cl.command_queue_properties.PROFILING_ENABLE if profiling else 0
             self.queue = cl.CommandQueue(self.context, self.info.handle, properties=flags)
         if self.info.max_work_group < 256 and self.family == "gpu":
@@ -129,6 +133,8 @@ class Device:
                 raise DeviceMemoryError(
                     f"device {self.info} ran out of memory ({said}): {self._memory_advice()}"
                 ) from None
+            if self._leaving is not None:
+                self._leaving.detach()  # it may work no more
             raise DeviceError(f"device {self.info} {what} ({said}): choose another with --device") from None
 
     def _memory_advice(self) -> str:
@@ -177,12 +183,13 @@ class Device:
             with building(wanted, alone=self.info.kind == "cpu"):
                 if wanted not in self._programs:
                     options = ["-cl-std=CL1.2", *self._build_options, *(f"-D{name}={value}" for name, value in macros)]
-
                     text = kernel_source(source, self._variants)
-                    with self.errors(f"failed to build {source}"):
-                        self._programs[wanted] = whatever_warns(
-                            lambda: program_cache.built(self.context, text, options)
-                        )
+                    program = self._built_before.get((text, tuple(options)))
+                    if program is None:
+                        with self.errors(f"failed to build {source}"):
+                            program = whatever_warns(lambda: program_cache.built(self.context, text, options))
+                        self._built_before[text, tuple(options)] = program
+                    self._programs[wanted] = program
         return self._programs[wanted]
 
     def kernel(self, source: str, name: str, **defines: str | int | float) -> Kernel:

@@ -52,10 +52,10 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
 
 #: What each preset is for, in a line.
 PURPOSE: dict[Preset, str] = {
-    "best": "colours re-fitted together, steps of equal worth, bundles: a small file in little time",
-    "smallest": "as best, in more iterations, with re-fits while pruning and a fit of all parameters: takes far longer",
-    "fast": "as best, in fewer iterations and steps: encodes faster",
-    "paper": "what the paper does: colours compacted splat by splat, its steps, zstd",
+    "best": "small files, quickly",
+    "smallest": "smaller still: more iterations, and a fit of all parameters; takes several times as long",
+    "fast": "fewer iterations and steps: faster, a little larger",
+    "paper": "the method of the paper: colours compacted splat by splat, zstd",
 }
 
 

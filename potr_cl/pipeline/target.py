@@ -15,7 +15,7 @@ KINDS = {
     "encode": "quality {}:",
     "refit": "re-fitted for quality {}:",
     "steps": "steps of quality {}:",
-    "colours": "quality {}, other steps of colours:",
+    "colours": "quality {} with other precision of colours:",
 }
 
 

@@ -33,12 +33,14 @@ _OF_PICTURE = 0.0076
 #: The distances that are tried, in those at which splats are resolved; rays; and how well, as a part of the best, a
 #: distance is remembered at which photographs were taken.
 _DISTANCES, _TRIED, _AS_WELL = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0), 600, 0.95
+#: The part of the targets that is spread over area.
+_OVER_AREA = 0.25
 #: Directions from which seeing a point counts as new.
 BINS = 32
 #: Views at each place.
 AIMS = 5
 #: How far a place is from its point, in distances at which that is resolved; of one place in so many, up to this.
-_NEAREST, _FARTHEST, _FAR_PLACES, _OVERVIEW = 0.5, 1.5, 4, 6.0
+_NEAREST, _FARTHEST, _FAR_PLACES, _OVERVIEW = 0.7, 2.0, 4, 6.0
 #: The part of the free way from its point that a place is away at most, and the cells that it is away from matter.
 _OF_WAY, _CLEAR = 0.7, 2
 #: The longest lens, as a part of the usual field of view.
@@ -56,7 +58,7 @@ _BIN_DIRECTIONS = on_sphere(low_discrepancy(BINS, 2)).astype(np.float32)
 
 @dataclass(frozen=True)
 class Targets:
-    """Points on surfaces, which views are judged by: half of them are spread over splats, half over area.
+    """Points on surfaces, which views are judged by: most of them are spread over splats, some over area.
 
     Attributes:
         targets: (K, 3) world units.
@@ -76,8 +78,9 @@ class Targets:
     @staticmethod
     def of(scene: Scene, space: Space, count: int) -> Targets:
         """About so many of a scene."""
-        by_area = np.linspace(0, len(space.rows) - 1, count // 2).astype(np.int64)
-        by_splat = space.firsts[np.linspace(0, len(space.firsts) - 1, count - count // 2).astype(np.int64)]
+        over_area = round(_OVER_AREA * count)
+        by_area = np.linspace(0, len(space.rows) - 1, over_area).astype(np.int64)
+        by_splat = space.firsts[np.linspace(0, len(space.firsts) - 1, count - over_area).astype(np.int64)]
         chosen = np.union1d(by_area, by_splat)
         points = space.points[chosen]
         return Targets(points, space.sizes_near(points), space.rows[chosen])

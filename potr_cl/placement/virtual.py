@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from potr_cl.model.camera import Camera
+from potr_cl.model.camera import Camera, resized
 from potr_cl.model.placement.matter import frame_of
 from potr_cl.model.placement.sampling import F64
 from potr_cl.model.scene import Scene
@@ -66,11 +66,13 @@ def judging_views(
     could stand, drawn without regard to what the training views show. Fewer are the first of more.
 
     Args:
-        scene, size, device: as :func:`place_cameras` takes them.
+        scene, device: as :func:`place_cameras` takes them.
         count: of the views; None: as many as :func:`place_cameras` places.
+        size: of their square images, in pixels; where they stand does not depend on it. None: the usual one.
     """
-    ground = _Ground.of(scene, None, size, FIELD, device)
-    return _named(ground.judges(ground.planned.test if count is None else count))
+    ground = _Ground.of(scene, None, None, FIELD, device)
+    judges = _named(ground.judges(ground.planned.test if count is None else count))
+    return judges if size is None else [resized(camera, size, size) for camera in judges]
 
 
 @dataclass(frozen=True)

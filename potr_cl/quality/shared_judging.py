@@ -239,7 +239,7 @@ class SharedJudging(Owner):
 
     def _lose_parts(self, error: DeviceError) -> None:
         # What else the line says is how to mend it, which nobody has to.
-        _log.warning("nobody else can judge (%s): %s does", str(error).split(": ")[0], self._device.info)
+        _log.warning("no worker can judge (%s); using %s instead", str(error).split(": ")[0], self._device.info)
         self._parts, self._pool, self._part_of = None, None, {}
         abandoned = _Abandoned()
         self._left.__exit__(type(abandoned), abandoned, None)

@@ -179,7 +179,7 @@ def format_report(report: dict[str, Any]) -> str:
         f"octree levels   {report['octree_levels']}",
         "steps a unit    " + ", ".join(f"{name} {factor:g}" for name, factor in report["scale_factors"].items()),
         f"colour steps    {_said_of_steps(report['colour_steps'], report['sections'])}",
-        f"size            {report['bytes']:,} bytes, {report['bytes_a_splat']:.2f} a splat",
+        f"size            {report['bytes']:,} bytes, {report['bytes_a_splat']:.2f} per splat",
         f"as PLY          {report['ply_bytes']:,} bytes, {report['ratio_to_ply']:.1f} times as much",
     ]
     if report["blocks"] is not None:
@@ -189,7 +189,7 @@ def format_report(report: dict[str, Any]) -> str:
         lines.append(f"source file     {report['source_bytes']:,} bytes, {report['ratio_to_source']:.1f} times as much")
     lines += [
         "",
-        _ROW.format("section", "coder", "streams", "integers", "serialised", "bytes", "bits a splat", "share"),
+        _ROW.format("section", "coder", "streams", "integers", "serialised", "bytes", "bits/splat", "share"),
     ]
     for name, entry in report["sections"].items():
         serialised = entry["serialised_bytes"]
@@ -206,7 +206,7 @@ def format_report(report: dict[str, Any]) -> str:
             )
         )
     if report["blocks"] is not None:
-        lines += ["", _BLOCK_ROW.format("block", "splats", "bytes", "bits a splat", "bounding box")]
+        lines += ["", _BLOCK_ROW.format("block", "splats", "bytes", "bits/splat", "bounding box")]
         for number, block in enumerate(report["blocks"][:_MOST_BLOCKS]):
             bits = f"{8 * block['bytes'] / block['splats']:.2f}"
             lines.append(

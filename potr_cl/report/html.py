@@ -54,7 +54,7 @@ def views_to_show(quality: dict[str, Any], chosen: str | None) -> list[tuple[str
     """The worst, the median and a chosen view of a report's quality, with titles; the first view if none is chosen."""
     views = quality["views"]
     by_psnr = sorted(views, key=lambda view: math.inf if view["psnr"] is None else view["psnr"])
-    wanted = {"worst view": by_psnr[0], "median view": by_psnr[(len(views) - 1) // 2]}
+    wanted = {"worst view": by_psnr[0], "typical view": by_psnr[(len(views) - 1) // 2]}
     named = [view for view in views if view["name"] == chosen]
     wanted["chosen view" if named else "first view"] = (named or views)[0]
     shown: dict[str, tuple[str, dict[str, Any]]] = {}
@@ -132,7 +132,7 @@ def _sizes(report: dict[str, Any]) -> str:
         left += width
     rows.append(["all", f"{total:,}", f"{total / splats:.2f}", "100 %"])
     svg = f'<svg class="bar" viewBox="0 0 100 6" preserveAspectRatio="none" role="img">{"".join(bar)}</svg>'
-    return svg + _table(["property", "bytes", "bytes a splat", "share"], rows)
+    return svg + _table(["property", "bytes", "bytes per splat", "share"], rows)
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -287,7 +287,7 @@ def _search(search: dict[str, Any]) -> str:
         "encode": "full encode",
         "refit": "its splats, re-fitted",
         "steps": "other quantiser steps",
-        "colours": "other steps of colours",
+        "colours": "other precision of colours",
     }
     rows = [[kinds[step["kind"]], f"{step['q']:g}", _text(step["said"])] for step in search["tries"]]
     said = f"<p>Asked for: {_text(search['target'])}. Reached: {_text(search['reached'])}.</p>"

@@ -204,7 +204,7 @@ def format_scene(report: dict[str, Any]) -> str:
     coefficients = 3 * SH_COEFFICIENTS[report["sh_degree"]]
     lines = [
         f"splats          {report['splats']:,}",
-        f"SH degree       {report['sh_degree']}, {coefficients} coefficients a splat",
+        f"SH degree       {report['sh_degree']}, {coefficients} coefficients per splat",
         f"antialiased     {antialiasing(report)}",
         f"bounding box    {_box(report['bounding_box'])}",
         f"robust bounds   {_box(report['robust_bounding_box'])}",

@@ -245,7 +245,7 @@ def format_encode_report(report: dict[str, Any]) -> str:
         encodes = sum(step["kind"] == "encode" for step in search["tries"])
         full = f"{encodes} full encode{'s' if encodes > 1 else ''}"
         q = report["options"]["q"]
-        lines.append(f"asked for  {search['target']}; reached {search['reached']} by quality {q:g} after {full}")
+        lines.append(f"target     {search['target']}: {search['reached']} at quality {q:g} ({full})")
     times = dict(report["seconds"])
     total = times.pop("total")
     lines.append(f"time       {total:.1f} s: " + ", ".join(f"{stage} {time:.1f}" for stage, time in times.items()))

@@ -40,34 +40,40 @@ class Code(Stage):
         EntropyCoder.level, Flag("--zstd-level", "1 (fast) to 22 (small)", "L", int, default="the preset's")
     )
     gamma: float | None = option(
-        None, Flag("--gamma", "least distance a centre may move, world units", "UNITS", float), parameter=True
+        None, Flag("--gamma", "position precision, in world units", "UNITS", float), parameter=True
     )
     beta: float | None = option(
         None,
         Flag(
             "--beta",
-            "the same as a part of the nearest camera's distance; best, fast: of a typical splat's size there",
+            "position precision relative to the distance of the nearest camera (best, smallest, fast: to the size of a "
+            "typical splat)",
             "PART",
             float,
         ),
         parameter=True,
     )
     sf_dc: float | None = option(
-        None, Flag("--sf-dc", "steps a unit for constant SH coefficients", "SF", float), parameter=True
+        None, Flag("--sf-dc", "quantisation levels per unit for the DC SH coefficients", "SF", float), parameter=True
     )
     sf_sh: float | None = option(
-        None, Flag("--sf-sh", "steps a unit for the other SH coefficients", "SF", float), parameter=True
+        None, Flag("--sf-sh", "quantisation levels per unit for the other SH coefficients", "SF", float), parameter=True
     )
     sf_opacity: float | None = option(
         None,
-        Flag("--sf-opacity", "steps a unit for opacities; best, fast: for their logits", "SF", float),
+        Flag(
+            "--sf-opacity",
+            "quantisation levels per unit for opacities (best, smallest, fast: for their logits)",
+            "SF",
+            float,
+        ),
         parameter=True,
     )
     sf_rotation: float | None = option(
         None,
         Flag(
             "--sf-rotation",
-            "steps a unit for quaternions; best, fast: times the root of the largest scale in steps",
+            "quantisation levels per unit for quaternions (best, smallest, fast: times the root of the largest scale)",
             "SF",
             float,
         ),
@@ -77,7 +83,8 @@ class Code(Stage):
         None,
         Flag(
             "--sf-scale",
-            "steps a unit for standard deviations; best, fast: in a typical splat's size, twice as many if antialiased",
+            "quantisation levels per unit for scales (best, smallest, fast: per typical splat size, twice as many if "
+            "antialiased)",
             "SF",
             float,
         ),
@@ -88,7 +95,7 @@ class Code(Stage):
         None,
         Flag(
             "--block-splats",
-            "most splats of a block of a .potr file; 65536 for readers that show blocks as they arrive",
+            "maximum splats per block of a .potr file; 65536 for viewers that show blocks as they arrive",
             "N",
             int,
             default="1048576, in scenes of more than 2097152",

@@ -38,22 +38,25 @@ class Compact(Stage):
 
     on: bool = option(
         True,
-        Flag("--compact", "make the colours' coefficients sparse splat by splat", default="where there is no re-fit"),
+        Flag("--compact", "make the SH coefficients sparse, splat by splat", default="where there is no re-fit"),
     )
     at: float = option(
-        0.75, Flag("--compact-at", "of the pruning iterations after which colours are compacted", "PART", float)
+        0.75,
+        Flag("--compact-at", "fraction of the pruning iterations after which colours are compacted", "PART", float),
     )
     lam: float | None = option(
         None, Flag("--lambda", "how strongly AC coefficients are pulled to 0", "X", float), parameter=True
     )
     alpha: float | None = option(
-        None, Flag("--alpha", "cosine above which two coefficients count as one; 1: never", "X", float), parameter=True
+        None,
+        Flag("--alpha", "cosine above which two coefficients are treated as one; 1: never", "X", float),
+        parameter=True,
     )
     colour_model: ColourModel = option(
         CompactionOptions.colour_model,
         Flag(
             "--colour-model",
-            "channels to make sparse, each on its own; ycocg pulls Co and Cg three times as hard",
+            "colour space of the sparse coefficients; ycocg penalises Co and Cg three times as much",
             choices=get_args(ColourModel),
         ),
     )
@@ -61,13 +64,13 @@ class Compact(Stage):
         CompactionOptions.weighting,
         Flag(
             "--weighting",
-            "a view counts as much as it shows of the splat (importance), or as any other that sees it (visibility)",
+            "weight views by how much of the splat they show (importance), or equally (visibility)",
             choices=get_args(Weighting),
         ),
     )
     two_pass: bool = option(
         CompactionOptions.two_pass,
-        Flag("--one-pass", "do not solve again without the coefficients that would be quantised to 0"),
+        Flag("--one-pass", "do not solve again after leaving out coefficients that would be quantised to 0"),
     )
 
     def __post_init__(self) -> None:

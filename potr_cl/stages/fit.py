@@ -97,7 +97,7 @@ class LeftOut:
 
     def __str__(self) -> str:
         more = "".join(f"; {each}" for each in (self.files, self.photographs) if each is not None)
-        return f"the fit was left out: {self.why}{more}"
+        return f"no fit: {self.why}{more}"
 
 
 def _steps(text: str) -> int | Literal["auto"]:
@@ -144,8 +144,8 @@ class Fit(Stage):
         0,
         Flag(
             "--fit",
-            "steps in which positions, shapes, opacities and colours of the splats that are left are fitted to the "
-            "uncompressed scene's pictures, so that fewer of them do: fewer bytes at about the same PSNR, and slower; "
+            "steps of optimising positions, shapes, opacities and colours of the remaining splats, so that fewer are "
+            "needed: smaller files at about the same PSNR, slower; "
             f"auto: {STEPS['gpu']} on a GPU, {STEPS['cpu']} on a CPU; off: none",
             "STEPS",
             _steps,

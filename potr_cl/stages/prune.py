@@ -66,39 +66,43 @@ class Prune(Stage):
 
     on: bool = option(True, Flag("--no-prune", "keep every splat"))
     keep: float | None = option(
-        None, Flag("--keep", "of the splats, exactly, instead of -q's", "FRACTION", float, group="how many")
+        None,
+        Flag("--keep", "keep exactly this fraction of the splats (overrides -q)", "FRACTION", float, group="how many"),
     )
     count: int | None = option(
-        None, Flag("--count", "splats to keep, exactly, instead of -q's", "N", int, group="how many")
+        None, Flag("--count", "keep exactly N splats (overrides -q)", "N", int, group="how many")
     )
     delta_mse_max: float | None = option(
         None,
         Flag(
             "--delta-mse-max",
-            "remove a splat if the mean squared error grows by less (by less still where each view shows a part of the "
-            "scene)",
+            "remove splats that raise the mean squared error by less than X (less if each view shows only a part of "
+            "the scene)",
             "X",
             float,
             group="how many",
         ),
         parameter=True,
     )
-    iterations: int = option(48, Flag("--iterations", "rounds in which effects are measured anew", "N", int))
+    iterations: int = option(48, Flag("--iterations", "rounds of measuring and removing", "N", int))
     tolerance: float = option(
         SweepOptions.tolerance,
         Flag(
-            "--tolerance", "part of a tile that must have been removed before it is looked at again; 0: any", "X", float
+            "--tolerance",
+            "measure a tile again once this part of it has been removed; 0: after any removal",
+            "X",
+            float,
         ),
     )
     turns: int = option(
-        SweepOptions.turns, Flag("--turns", "look at a view again in every N-th iteration only", "N", int)
+        SweepOptions.turns, Flag("--turns", "measure each view again only every N iterations", "N", int)
     )
     decay: float = option(
         PruningOptions.decay,
         Flag(
             "--damping",
-            "decay of the exponential moving average by which splats are ranked: what a splat's effect in one "
-            "iteration counts against the next iteration's; 0: only the newest counts, as in the paper",
+            "decay of the exponential moving average that ranks the splats; 0: only the newest measurement counts, "
+            "as in the paper",
             "X",
             float,
         ),
@@ -107,7 +111,7 @@ class Prune(Stage):
         PruningOptions.a,
         Flag(
             "--mapping-a",
-            "the smaller, the later go splats whose removal improves the match; the paper has 10",
+            "lower values keep splats whose removal would improve the match for longer (paper: 10)",
             "X",
             float,
         ),
@@ -116,8 +120,8 @@ class Prune(Stage):
         "keep",
         Flag(
             "--unseen",
-            "what no training view shows: keep it, coarsely coded, or drop it (with --keep or --count it always goes "
-            "first); protect: keep all that no view shows from near enough, as it is. Without cameras, keep protects",
+            "splats that no training view shows: keep them, coded coarsely, or drop them (--keep and --count always "
+            "drop them first); protect: keep unchanged what no view shows from near enough; so does keep without any",
             choices=CHOICES,
         ),
     )

@@ -72,8 +72,7 @@ class Refit(Stage):
         8,
         Flag(
             "--refit",
-            "steps in which the colours are re-fitted to the uncompressed scene's pictures, all splats together; off: "
-            "none",
+            "steps of fitting the colours of all splats together to the uncompressed scene's pictures; off: none",
             "N",
             _steps,
             default="auto, the preset's",
@@ -81,14 +80,19 @@ class Refit(Stage):
     )
     drop: float | None = option(
         None,
-        Flag("--drop", "give up a coefficient if the mean squared error grows by less; re-fit only", "X", float),
+        Flag(
+            "--drop",
+            "zero an SH coefficient if that raises the mean squared error by less than X (re-fit only)",
+            "X",
+            float,
+        ),
         parameter=True,
     )
     at: tuple[float, ...] = option(
         (),
         Flag(
             "--refit-at",
-            "of the pruning iterations after which they are re-fitted too: a few percent smaller, and slower",
+            "fractions of the pruning iterations after which to re-fit too: a few percent smaller, slower",
             "PART",
             float,
             many=True,
@@ -100,8 +104,8 @@ class Refit(Stage):
         None,
         Flag(
             "--photos",
-            "photographs, named after the views: re-fit (and with --fit, fit) to them instead, for truth rather than "
-            "fidelity, if some that are held out are matched better so",
+            "photographs, named after the views: match them instead of the uncompressed scene, if that improves "
+            "held-out photographs",
             "DIR",
             Path,
             default="the uncompressed scene's pictures",

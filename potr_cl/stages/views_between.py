@@ -77,8 +77,8 @@ class Between(Stage):
         "auto",
         Flag(
             "--views-between",
-            "views to look at besides, for each training view, between it and its neighbours; 0.5: for every second; "
-            "auto: as many as the scene needs; off: none",
+            "extra views per training view, between it and its neighbours; 0.5: one for every second; auto: as many "
+            "as the scene needs; off: none",
             "N",
             _number,
             default="the preset's: auto, but off in paper",

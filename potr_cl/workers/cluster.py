@@ -38,8 +38,9 @@ _POLL_GROWS, _MOST_POLL = 1.5, 1.0
 _NEW = 2.0
 #: Seconds in which the handle of a part arrives once it is made.
 _FETCH = 30.0
-#: Seconds in which the scheduler says who is alive: at once, unless it stands still, or the client is closed meanwhile.
-_WHO = 15.0
+#: Seconds in which the scheduler says who is alive, and how often it is asked before it counts as gone: it answers at
+#: once, unless it stands still, or the client is closed meanwhile; but this process may have stood still itself.
+_WHO, _ASKED = 6.0, 2
 #: Threads that wait for workers.
 _MOST_WAITING = 256
 
@@ -67,6 +68,7 @@ class ClusterPool(Pool):
         self._waiting = ThreadPoolExecutor(_MOST_WAITING, thread_name_prefix="potr_cl cluster")
         self._workers: list[_ClusterWorker] = []
         self._here: DeviceThread | None = None
+        self._is_gone = False  # the scheduler
         self._refused: set[str] = set()
         self._meeting = threading.Lock()
         self._owned = ExitStack()
@@ -128,12 +130,26 @@ class ClusterPool(Pool):
     # ------------------------------------------------------------------------------------------------ for the workers
 
     def _alive(self) -> set[str]:
-        """Addresses of the workers that the scheduler knows."""
-        # With the connection Dask gives up all that it has on workers, also if it can be made again.
-        if self.client.status == "running":
-            with suppress(Exception):
-                return set(self.client.sync(self.client.scheduler.ncores, callback_timeout=_WHO))
-        raise WorkerLost("the cluster's scheduler does not answer any more")
+        """Addresses of the workers that the scheduler knows.
+
+        Raises:
+            WorkerLost: it is gone. Once there have been workers, the user has been told then, and they have been left.
+        """
+        for _ in range(_ASKED):
+            # With the connection Dask gives up all that it has on workers, also if it can be made again.
+            if self.client.status == "running" and not self._is_gone:
+                with suppress(Exception):
+                    return set(self.client.sync(self.client.scheduler.ncores, callback_timeout=_WHO))
+        why = "the cluster's scheduler does not answer any more"
+        if not self._workers:
+            raise WorkerLost(why)
+        # Workers may answer for a while, and then no more.
+        self._is_gone = True
+        for worker in self._workers:
+            worker.lost = worker.told = True
+        if not self._closing.is_set():
+            self._goes_on_here(why)
+        raise WorkerLost(why)
 
     def wait_for(self, answer: Any, address: str, most: float = math.inf) -> Any:
         """What a worker answers.
@@ -154,7 +170,7 @@ class ClusterPool(Pool):
                 raise WorkerLost(f"{address} does not answer")
             if self._closing.is_set():
                 raise WorkerLost(f"{address} is not waited for any more")
-            if self.client.status != "running" or time.monotonic() - looked > _ALIVE:
+            if self._is_gone or self.client.status != "running" or time.monotonic() - looked > _ALIVE:
                 looked = time.monotonic()
                 if address not in self._alive():
                     raise WorkerLost(f"{address} is gone")
@@ -220,18 +236,35 @@ class ClusterPool(Pool):
                 gone.append(error)
         if not workers:
             raise UsageError(f"{gone[0]}, and no other worker is there")
+        here = self.first.digits()
+        self._digits = here if any(worker.digits == here for worker in workers) else workers[0].digits
         for lost in gone:
-            _log.warning("%s; it does no views", lost)
-        self._take_in(workers)
+            _log.warning("%s; ignoring this worker", lost)
+        self._take_in([worker for worker in workers if self._rounds_as_others(worker)])
+
+    def _rounds_as_others(self, worker: _ClusterWorker) -> bool:
+        """Whether a worker that has been met computes to the same digits; if not it is left, and the user told."""
+        if worker.digits == self._digits:
+            return True
+        self._refused.add(worker.name)
+        worker.leave()
+        _log.warning(
+            "worker %s (%s) rounds differently from the others, so that the file would depend on which views it gets; "
+            "ignoring it. To choose, start workers on one kind of device (POTR_CL_DEVICE in their environment) and "
+            "hosts of one generation",
+            worker.name, worker.device,
+        )  # fmt: skip
+        return False
 
     def _meet_others(self) -> None:
-        """Meet those that come, until the cluster is left."""
+        """Meet those that come, until the cluster is left or its scheduler is gone."""
         # One that dies as it is asked would be started again and again by Dask.
         lost: set[str] = set()
         while not self._closing.wait(_NEW):
-            with suppress(WorkerLost):  # whoever waits for an answer says so
-                known = {worker.name for worker in self._workers}
-                come = self._alive() - known - self._refused
+            if self._is_gone:
+                return
+            with suppress(WorkerLost):
+                come = self._alive() - {worker.name for worker in self._workers} - self._refused
                 for worker in self._invited({address for address in come if _host(address) not in lost}):
                     try:
                         worker.meet()
@@ -241,9 +274,10 @@ class ClusterPool(Pool):
                             lost.add(worker.host)
                         worker.leave()
                         if not self._closing.is_set():
-                            _log.warning("%s; it does no views", error)
-                    else:
-                        _log.warning("worker %s has come: it gets views from the next stage on", worker.name)
+                            _log.warning("%s; ignoring this worker", error)
+                        continue
+                    if self._rounds_as_others(worker):
+                        _log.warning("worker %s joined; it gets views from the next stage on", worker.name)
                         self._take_in([worker])
 
     def _invited(self, addresses: set[str]) -> list[_ClusterWorker]:
@@ -280,10 +314,10 @@ class _ClusterWorker(Worker):
 
     Attributes:
         host: the computer.
-        device: the name of its device, once it has been met.
+        device, digits: the name of its device and how it rounds, once it has been met.
     """
 
-    device = ""
+    device = digits = ""
 
     def __init__(self, pool: ClusterPool, name: str, place: int) -> None:
         self.name, self.host, self.place = name, _host(name), place
@@ -305,7 +339,7 @@ class _ClusterWorker(Worker):
         """
         try:
             self._seat = self._pool.wait_for(self._future, self.name, _HELLO)
-            version, name, family, digits = self.ask("hello")
+            version, name, family, self.digits = self.ask("hello")
         except WorkerLost:
             # As those do that have no potr_cl.
             raise WorkerLost(
@@ -325,7 +359,7 @@ class _ClusterWorker(Worker):
             ) from None
         _check(self.name, version, name, family, self._pool.first)
         # Hosts of two generations can call other processors by the same name.
-        others = name == str(self._pool.first.info) and digits != self._pool.first.digits()
+        others = name == str(self._pool.first.info) and self.digits != self._pool.first.digits()
         self.device = f"{name} with other instructions" if others else name
 
     def ask(self, method: str, *args: Any) -> Any:

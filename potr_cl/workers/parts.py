@@ -234,7 +234,9 @@ class Parts(Owner):
                 raise last
             loads = [sum(by is each for by in self._by) for each in left]
             other = left[loads.index(min(loads))]
-            _log.warning("worker %s gave up (%s): its views go to %s", worker.name, last, other.name)
+            if not worker.told:
+                _log.warning("worker %s failed (%s); reassigning its views to %s", worker.name, last, other.name)
+                worker.told = worker.lost
             with suppress(PotrError):
                 left_behind = self._held[place]
                 if left_behind is not None:

@@ -76,10 +76,12 @@ class Worker(ABC):
     Attributes:
         name: for messages.
         lost: whether it has been given up: it may stand still, and to wait for it again would take as long again.
+        told: whether the user knows that.
     """
 
     name: str
     lost: bool = False
+    told: bool = False
 
     @abstractmethod
     def make(self, kind: type[Part], memory: int | None, given: Sequence[Any]) -> Future[Held]:

@@ -110,7 +110,7 @@ def test_bytes_of_any_kind_are_decoded(plush_excerpt):
     wanted = potr_cl.decode(data)
     for kind in (bytearray, memoryview):
         assert (potr_cl.decode(kind(data)).sh == wanted.sh).all()
-    with pytest.raises(UsageError, match=r"a .potr file is wanted, its bytes or an encode to one, not Scene"):
+    with pytest.raises(UsageError, match=r"expected the path of a .potr file, its bytes or an Encoded, not Scene"):
         potr_cl.decode(plush_excerpt)
 
 

@@ -81,7 +81,7 @@ def test_encode_to_a_size(tmp_path, excerpt, capsys):
     assert report["search"]["max_bytes"] == 20_000
     assert report["search"]["tries"][-1]["value"] == report["bytes"]
     assert report["search"]["reached"] == f"{report['bytes']:,} bytes"
-    assert "asked for  at most 20,480 bytes; reached" in run(capsys, *fast, "-o", potr, "--max-size", "20KiB")
+    assert "target     at most 20,480 bytes: " in run(capsys, *fast, "-o", potr, "--max-size", "20KiB")
 
 
 def test_encode_to_a_psnr(tmp_path, excerpt, capsys):

@@ -130,7 +130,7 @@ def interrupted(words, times):
             rounds += "held-out views" in line
             if rounds == 2 and "held-out views" in line:
                 process.send_signal(signal.SIGINT)
-            if "interrupted: what is done so far is kept" in line and times == 2:
+            if "interrupted: finishing with" in line and times == 2:
                 process.send_signal(signal.SIGINT)
         output, _ = process.communicate(timeout=300)
     return process.returncode, output, rounds

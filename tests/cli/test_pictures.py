@@ -80,7 +80,7 @@ def test_render_bad_calls(tmp_path, scene_path, cameras_path, capsys):
     fails(capsys, [*render[:3], tmp_path / "none.json", *render[4:]], 2, "none.json")
     fails(capsys, [*render, "--views", "view_9"], 2, "'view_9'", "0 ('view_0') to 7 ('view_7')")
     fails(capsys, [*render, "--views", "8"], 2, "'8'")
-    fails(capsys, [*render, "--background", "beige-ish"], 2, "'beige-ish' is no colour")
+    fails(capsys, [*render, "--background", "beige-ish"], 2, "unknown colour 'beige-ish'")
     fails(capsys, [*render, "--device", "no such thing"], 1, "'no such thing'", list_devices()[0].name)
     (tmp_path / "file").write_bytes(b"")
     fails(capsys, [*render[:5], tmp_path / "file"], 2, "cannot make the folder")

@@ -173,7 +173,7 @@ def test_colours(text, colour):
 
 @pytest.mark.parametrize("text", ["", "1,1", "2,0,0", "nan,0,0", "-1,0,0", "blurple", "#12", "1,1,1,1"])
 def test_no_colours(text):
-    with pytest.raises(UsageError, match="is no colour"):
+    with pytest.raises(UsageError, match="unknown colour"):
         parse_colour(text)
 
 

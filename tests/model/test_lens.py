@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from potr_cl import Camera, DataError
 from potr_cl.model.camera import within_photographs
-from potr_cl.model.lens import Lens, Pinhole
+from potr_cl.model.lens import Lens, Pinhole, coverings
 
 WIDTH, HEIGHT = 640, 480
 #: COLMAP's name of a model, its parameters, and the same lens.
@@ -135,7 +136,17 @@ def test_a_field_of_more_than_half_the_world_is_cut_off() -> None:
 )
 def test_what_is_no_lens(changes: dict[str, Any], said: str) -> None:
     with pytest.raises(DataError, match=said):
-        Lens(**({"width": 640, "height": 480, "fx": 500, "fy": 500, "cx": 320, "cy": 240} | changes))
+        Lens(**({"width": 640, "height": 480, "fx": 500, "fy": 500, "cx": 320, "cy": 240} | changes)).covering()
+
+
+def test_many_lenses_are_looked_at_together() -> None:
+    """Each is found as it is alone, to the last digit, whatever is beside it."""
+    lenses = [lens for lens in (each.values[0] for each in LENSES) if isinstance(lens, Lens)]
+    lenses += [replace(lens, fx=lens.fx + shift) for lens in lenses for shift in (0.5, 31)]
+    folded = replace(lenses[1], radial=(-20.0, 1.0))
+    found = coverings([*lenses, folded])
+    assert found[:-1] == [lens.covering() for lens in lenses]
+    assert isinstance(found[-1], DataError)
 
 
 def test_only_views_with_a_lens_are_changed() -> None:

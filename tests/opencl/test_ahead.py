@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections import defaultdict, deque
+from contextlib import suppress
+
+import pyopencl as cl
 import pytest
 
 from potr_cl.errors import DeviceError
@@ -21,7 +25,22 @@ def contexts(monkeypatch):
         return real(handle)
 
     monkeypatch.setattr(ahead, "new_context", counted)
+    monkeypatch.setattr(ahead, "_left", defaultdict(lambda: deque(maxlen=0)))  # nothing of other tests
     return made
+
+
+def test_who_opens_a_device_again_and_again_has_one_context(contexts, monkeypatch):
+    """Drivers never give back all that they take for one."""
+    monkeypatch.setattr(ahead, "_left", defaultdict(lambda: deque(maxlen=1)))
+    for _ in range(3):
+        device = Device()
+        device.shared_kernel("opencl/fill.cl", "fill")
+        del device
+    assert len(contexts) == 1
+    with suppress(DeviceError), Device().errors("has failed"):
+        raise cl.RuntimeError("of the device")
+    Device()
+    assert len(contexts) == 2  # that of a device that has failed is left to nobody
 
 
 def test_what_was_begun_is_taken_once(contexts):

@@ -70,7 +70,7 @@ def trained(scene: Scene, normals: np.ndarray, centres: np.ndarray, degree: int 
     return dataclasses.replace(scene, sh=sh.astype(np.float32))
 
 
-def placed(scene: Scene, count: int = 128, size: int = 600):
+def placed(scene: Scene, count: int = 128, size: int | None = None):
     return place_cameras(scene, count, size)
 
 
@@ -91,7 +91,7 @@ def test_an_object_is_seen_from_all_sides(around_ball):
 def test_names_and_splits(around_ball):
     assert (len(train_views(around_ball)), len(test_views(around_ball))) == (128, 16)
     assert len({c.name for c in around_ball}) == 144
-    assert {(c.width, c.height) for c in around_ball} == {(600, 600)}
+    assert {(c.width, c.height) for c in around_ball} == {(480, 480)}, "on a CPU"
     assert is_virtual(around_ball)
     assert not is_virtual([])
     assert not is_virtual([dataclasses.replace(around_ball[0], name="photo")])
@@ -115,7 +115,7 @@ def test_the_median_splat_is_resolved(around_ball):
 
 
 def test_a_plan_says_beforehand_what_is_placed(around_ball):
-    planned = plan(len(BALL), 128, 600)
+    planned = plan(len(BALL), 128, slow=True)
     assert (planned.training, planned.test) == (len(train_views(around_ball)), len(test_views(around_ball)))
     assert planned.pixels == sum(c.width * c.height for c in train_views(around_ball))
     assert str(planned) == f"{planned.training} views of {planned.size} x {planned.size} pixels"
@@ -135,9 +135,9 @@ def test_judges_stand_elsewhere_and_fewer_are_the_first_of_more(around_ball):
     tests = test_views(around_ball)
     apart = np.linalg.norm(camera_centres(tests)[:, None] - camera_centres(train_views(around_ball)), axis=2)
     assert apart.min() > 0
-    alone = judging_views(BALL, 16, 600)
+    alone = judging_views(BALL, 16)
     assert np.array_equal(camera_centres(alone), camera_centres(tests))
-    assert np.array_equal(camera_centres(judging_views(BALL, 5, 600)), camera_centres(tests)[:5])
+    assert np.array_equal(camera_centres(judging_views(BALL, 5, 64)), camera_centres(tests)[:5]), "whatever their size"
     # Near and far.
     distance = np.linalg.norm(camera_centres(judging_views(BALL, 40, 600)), axis=1)
     assert distance.min() < 0.6 * distance.max()

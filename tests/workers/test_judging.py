@@ -157,8 +157,8 @@ def test_a_worker_that_is_lost(plush_excerpt, cameras, coded, family, kind, comm
     monkeypatch.setattr(JudgingPart, command, failing)
     with kind(devices) as pool:
         assert judged(devices[0], plush_excerpt, coded, views, pool) == expected
-    assert ("nobody else can judge" in caplog.text) == (lost == "all")
-    assert "its views go to" in caplog.text
+    assert ("no worker can judge" in caplog.text) == (lost == "all")
+    assert "reassigning its views to" in caplog.text
     assert [device.allocated for device in devices] == [0] * 3
 
 

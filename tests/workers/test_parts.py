@@ -114,7 +114,7 @@ def test_parts_do_what_they_are_told():
 @pytest.mark.parametrize("error", [None, DeviceMemoryError("too little memory")])
 def test_lost_parts_are_made_again(lost_at, error, caplog):
     assert course(FakePool(FakeWorker("a", lost_at, error), FakeWorker("b"))) == EXPECTED
-    assert "worker a gave up" in caplog.text
+    assert "worker a failed" in caplog.text
 
 
 def test_several_are_lost_one_after_the_other():

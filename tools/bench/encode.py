@@ -1,115 +1,398 @@
-"""Run time against error of all stages and whole encodes, on every OpenCL device.
+"""Run time against error of all stages, on every OpenCL device.
 
-    python -m tools.bench.encode                           every device, the scenes lego and plush
-    python -m tools.bench.encode --quick                   the best device, the bundled excerpt; under two minutes
-    python -m tools.bench.encode --scenes FOLDER …         folders with point_cloud.ply and cameras.json
-    python -m tools.bench.encode --stages sort ridge       some stages only
-    python -m tools.bench.encode --from benchmark.json     tables again
+    python -m tools.bench.encode [SCENE …] [--device NAME] [--quick] [--stage NAME …] [--json FILE]
 
-For each stage the variants that exist: kernel family, compiler flags, sort, skips, iterations,
-steps, entropy coder, preset; each with its time and its error against float64 or against the full computation. A
-variant is on the Pareto front if no other of its stage is at least as good in time, error and bytes and better in one
-by more than the noise of 5 %.
+For each stage the variants that exist: kernel family, compiler flags, sort, steps, entropy coder; each with its time
+and its error against float64 or against the full computation. (tools.bench.pruning has what the schedule may skip,
+tools.study.rate_distortion compares whole encodes of any options.) A variant is on the Pareto
+front if no other of its stage is at least as good in time, error and bytes and better in one by more than 5 %, the
+noise. Scenes: lego and plush by default; --quick takes the bundled excerpt at half size and the best device.
 
 Every device runs in a process of its own. Times of the rasterizer's kernels and of the ridge are the device's own, the
-others the clock's. Each is the best of some. Prints Markdown; --json keeps the figures.
+others the clock's. Each is the best of some.
 """
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import importlib.metadata
-import json
-import os
-import platform
-import subprocess
-import sys
+import math
 import tempfile
-import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
-from potr_cl.opencl.discovery import DeviceInfo, choose_device, list_devices
-from tools.bench.stage_variants import Workload, measure
-from tools.bench.tradeoffs import STAGES, print_report
-from tools.results import circumstances, processor
-from tools.workloads import SCENES, excerpt
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.codec.container import EntropyCoder
+from potr_cl.codec.decoder import decode
+from potr_cl.codec.encoder import code_scene
+from potr_cl.model.camera import Camera, camera_centres, test_views, train_views
+from potr_cl.model.scene import Scene
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import DeviceInfo, Family, choose_device, list_devices
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import GSPLAT, INRIA
+from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, Precision
+from potr_cl.stages.compaction.view_weights import ViewWeights
+from potr_cl.stages.pruning.removal import RemovalSweep
+from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.stages.refitting.refit import refit_colours
+from potr_cl.stages.refitting.refit_options import RefitOptions
+from potr_cl.stages.refitting.targets import RenderedTargets
+from tests.reference import raster as reference
+from tests.reference.removal import BruteForce
+from tools.bench.rasterizer import stage_times
+from tools.results import Results
+from tools.workloads import SCENES, best_of, excerpt, in_process, log, read, scaled, scene_parser
+
+F64 = NDArray[np.float64]
+
+#: Part by which a time or an error must be lower to be lower.
+NOISE = 0.05
+#: Compiler flags that trade accuracy for speed.
+FLAGS: Mapping[str, tuple[str, ...]] = {
+    "no flags": (),
+    "mad": ("-cl-mad-enable",),
+    "no signed zeros": ("-cl-no-signed-zeros",),
+    "flush denormals": ("-cl-denorms-are-zero",),
+    "unsafe": ("-cl-unsafe-math-optimizations",),
+    "fast relaxed": ("-cl-fast-relaxed-math",),
+}
+#: Keys that a GPU's work-group sorts in local memory at a time; 2048 is the default.
+CAPACITIES = (1024, 4096)
+#: Pixels of a view, and splats, that are computed in float64.
+PIXELS, SPLATS = 300, 150
+#: As in the tests: pixels that come no nearer, relatively, to a threshold cannot flip, nor splats in another order.
+CLEAR, TIE = 1e-4, 1e-6
 
 
-def header(info: DeviceInfo) -> dict[str, str]:
-    """The machine and the versions."""
-    packages = ("potr-cl", "pyopencl", "numpy", "zstandard")
-    versions = []
-    for package in packages:
-        try:
-            versions.append(f"{package} {importlib.metadata.version(package)}")
-        except importlib.metadata.PackageNotFoundError:
-            versions.append(f"{package} not installed")
-    return {
-        "device": f"{info.name}, {info.platform}, {info.version}, driver {info.handle.driver_version}",
-        "machine": f"{processor()}, {os.cpu_count()} processors, {platform.system()} {platform.release()}",
-        "versions": f"Python {platform.python_version()}, " + ", ".join(versions),
-        "date": time.strftime("%Y-%m-%d"),
-    }
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One variant of one stage: its time and its error (STAGES), and the bytes of the result where it decides these.
+
+    Attributes:
+        default: whether this is what the package does on this device.
+    """
+
+    stage: str
+    variant: str
+    seconds: float
+    error: float
+    default: bool = False
+    nbytes: int | None = None
 
 
-def run(info: DeviceInfo, folder: Path, name: str, quick: bool, stages: Sequence[str]) -> dict[str, Any]:
-    """One device on one scene."""
-    load = Workload.of(folder, quick)
-    rows = [dataclasses.asdict(row) for row in measure(info, load, quick, stages)]
-    return {**header(info), "scene": name, "splats": len(load.scene), "rows": rows}
+def on_front(row: Row, rows: Sequence[Row]) -> bool:
+    """Whether no other variant is at least as good in all and, beyond what is noise, better in one."""
+
+    def marks(r: Row) -> tuple[float, float, float]:
+        return r.seconds, r.error, r.nbytes or 0
+
+    pairs = [list(zip(marks(other), marks(row), strict=True)) for other in rows]
+    return not any(all(a <= b for a, b in p) and any(a < b / (1 + NOISE) for a, b in p) for p in pairs)
 
 
-def in_process(info: DeviceInfo, folder: Path, name: str, quick: bool, stages: Sequence[str]) -> dict[str, Any]:
-    """The same in a process of its own, which a runtime that crashes takes down alone."""
-    with tempfile.TemporaryDirectory() as scratch:
-        path = Path(scratch) / "result.json"
-        command = [sys.executable, "-m", "tools.bench.encode", "--one", str(info.index), name, str(folder)]
-        command += ["--json", str(path), "--stages", *stages, *(["--quick"] if quick else [])]
-        done = subprocess.run(command, stdout=subprocess.DEVNULL, check=False)
-        if done.returncode:
-            return {**header(info), "scene": name, "rows": [], "failed": done.returncode}
-        result: dict[str, Any] = json.loads(path.read_text())
-        return result
+@dataclasses.dataclass
+class Workload:
+    """A scene on a device, and how much of it is enough.
+
+    Attributes:
+        train, test: views. some: of those, the ones that kernels are measured on.
+        repeats: of every measurement; the best counts.
+    """
+
+    info: DeviceInfo
+    scene: Scene
+    train: list[Camera]
+    test: list[Camera]
+    quick: bool
+
+    @staticmethod
+    def of(info: DeviceInfo, folder: Path, quick: bool) -> Workload:
+        scene, cameras = read(folder)
+        cameras = [scaled(camera, 0.5) for camera in cameras] if quick else cameras
+        return Workload(info, scene, train_views(cameras), test_views(cameras), quick)
+
+    @property
+    def some(self) -> list[Camera]:
+        count = 2 if self.quick else 5
+        return self.train[:: max(len(self.train) // count, 1)][:count]
+
+    @property
+    def repeats(self) -> int:
+        return 3 if self.quick else 7
+
+    @property
+    def families(self) -> tuple[Family, ...]:
+        """The device's own kernel family first."""
+        return ("cpu", "gpu") if self.info.family == "cpu" else ("gpu",)
+
+    def profiled(self, family: Family, flags: Sequence[str] = (), **macros: int) -> Device:
+        """A device whose kernels are timed, with compiler flags and other values of the kernels' macros."""
+        return Device(self.info, profiling=True, family=family, build_options=flags, macros=macros)
+
+    def flagged(self, family: Family) -> Iterator[tuple[str, bool, Device]]:
+        """Compiler flags: name, whether they are the default, device."""
+        for name, flags in FLAGS.items():
+            if not self.quick or name in ("no flags", "mad", "fast relaxed"):
+                yield f"{family}, {name}", family == self.info.family and not flags, self.profiled(family, flags)
+
+
+# ------------------------------------------------------------------------------------------------ rasterizer
+
+
+#: The kernels of each stage.
+KERNELS = {
+    "project": ("project",),
+    "tile lists": ("count_tiles", "scan_tiles", "fill_tiles"),
+    "sort": ("sort_tiles",),
+    "composite": ("composite", "composite_frame"),
+}
+
+
+def rasterizer_rows(load: Workload) -> Iterator[Row]:
+    """All kernels of the rasterizer: family and flags; on GPU kernels also the sort's capacity and the exponential."""
+    truth, first = RasterizerTruth(load), None
+
+    def variants() -> Iterator[tuple[str, bool, Device, Iterable[str]]]:
+        for family in load.families:
+            for flagged in load.flagged(family):
+                yield *flagged, KERNELS
+        for capacity in CAPACITIES:
+            if 8 * capacity <= load.info.local_memory:
+                device = load.profiled("gpu", SORT_CAPACITY=capacity)
+                yield f"gpu, sorts {capacity} at a time", False, device, ("sort",)
+        native = load.profiled("gpu").native_exp2
+        name = "polynomial" if native else "native exponential"
+        yield f"gpu, {name}", False, load.profiled("gpu", NATIVE_EXP2=int(not native)), ("composite",)
+
+    for name, default, device, stages in variants():
+        runs = [stage_times(device, load.scene, load.some) for _ in range(load.repeats)]
+        times = {kernel: min(run[kernel] for run in runs) for kernel in runs[0]}
+        centre, wrong, pixel, pairs = truth.errors(device, load.scene)
+        first = pairs if first is None else first
+        errors = {"project": centre, "tile lists": len(first ^ pairs), "sort": wrong, "composite": pixel}
+        for stage in stages:
+            yield Row(stage, name, sum(times.get(kernel, 0) for kernel in KERNELS[stage]), errors[stage], default)
+
+
+class RasterizerTruth:
+    """One view in float64: splats on screen, and some pixels."""
+
+    def __init__(self, load: Workload) -> None:
+        self.camera = load.some[0]
+        self.projected = reference.project(load.scene, self.camera, GSPLAT)
+        rng = np.random.default_rng(0)
+        self.pixels: list[tuple[int, int, F64]] = []
+        for _ in range(4 * PIXELS):
+            column, row = int(rng.integers(self.camera.width)), int(rng.integers(self.camera.height))
+            pixel = reference.composite_pixel(self.projected, column, row, GSPLAT)
+            if pixel.margin > CLEAR and pixel.gap > TIE and len(self.pixels) < PIXELS:
+                self.pixels.append((column, row, np.append(pixel.colour, pixel.transmittance)))
+
+    def errors(self, device: Device, scene: Scene) -> tuple[float, float, float, set[bytes]]:
+        """Of centres, of order, of pixels; and the tile lists as a set."""
+        with Rasterizer(device, scene, GSPLAT) as rasterizer, rasterizer.prepare(self.camera) as view:
+            shapes = device.download(view.shapes, (rasterizer.stride, 8), np.float32)
+            offsets = device.download(view.offsets, (view.tiles + 1,), np.uint32).astype(np.int64)
+            intersections = device.download(view.intersections, (view.intersection_count,), np.uint32)
+            image, transmittance = rasterizer.composite(view)
+        listed = np.isin(self.projected.index, intersections)
+        centres = np.abs(shapes[self.projected.index[listed], :2] - self.projected.centre[listed])
+        inside = (self.projected.centre[listed] >= 0).all(axis=1)
+        inside &= (self.projected.centre[listed] < (self.camera.width, self.camera.height)).all(axis=1)
+        tiles = np.repeat(np.arange(view.tiles), np.diff(offsets))
+        order = np.lexsort((intersections, shapes[intersections, 6], tiles))
+        wrong = int(np.count_nonzero(intersections[order] != intersections))
+        ours = np.concatenate([image, transmittance[..., None]], axis=2).astype(np.float64)
+        pixel = max((float(np.abs(ours[row, column] - true).max()) for column, row, true in self.pixels), default=0.0)
+        pairs = {pair.tobytes() for pair in np.stack([tiles, intersections], axis=1)}
+        return float(centres[inside].max(initial=0)), wrong, pixel, pairs
+
+
+# -------------------------------------------------------------------------------------------- pruning, colours
+
+
+def removal_rows(load: Workload) -> Iterator[Row]:
+    """Family, flags, and where pixels end; what each sweep is compared with ends its pixels in the same place."""
+    camera, default, usual = load.some[0], SweepOptions(), INRIA.transmittance_threshold
+    variants = [(*flagged, default) for family in load.families for flagged in load.flagged(family)]
+    if default.transmittance_threshold not in (None, usual):
+        ends = dataclasses.replace(default, transmittance_threshold=usual)
+        variants += [(f"{f}, pixels end at {usual:.0e}", False, load.profiled(f), ends) for f in load.families]
+    with Rasterizer(variants[0][2], load.scene) as rasterizer, RemovalSweep(rasterizer, [camera]) as removal:
+        chosen = choose_splats(removal.measure()[1], SPLATS // 3 if load.quick else SPLATS)
+    thresholds = sorted({usual, default.transmittance_threshold or usual}, reverse=True)
+    brute = BruteForce(reference.project(load.scene, camera, INRIA), camera, INRIA)
+    truths = dict(zip(thresholds, brute.effects(chosen, thresholds)[0], strict=True))
+    for label, is_default, device, options in variants:
+        with Rasterizer(device, load.scene) as rasterizer, RemovalSweep(rasterizer, [camera], options) as removal:
+            effect = removal.measure()[0][chosen]
+
+            def sweep(removal: RemovalSweep = removal) -> None:
+                removal.sweep_everything()
+                removal.measure()
+
+            best = best_of(load.repeats, sweep)
+        true = truths[options.transmittance_threshold or usual] / (3 * camera.width * camera.height)
+        seen = true > 0
+        yield Row("removal", label, best, float(np.median(np.abs(effect[seen] / true[seen] - 1))), is_default)
+
+
+def choose_splats(importance: F64, count: int) -> NDArray[np.int64]:
+    """About ``count`` splats that the views see, evenly over the logarithm of importance."""
+    seen = np.flatnonzero(importance > 0)
+    by_importance = seen[np.argsort(importance[seen], kind="stable")]
+    low, high = np.log(importance[by_importance[[len(seen) // 100, -1]]])
+    at = np.searchsorted(np.log(importance[by_importance]), np.linspace(low, high, count))
+    return np.unique(by_importance[at.clip(0, len(seen) - 1)])
+
+
+def ridge_errors(scene: Scene, compacted: Scene, centres: F64, weights: Any, options: CompactionOptions) -> F64:
+    """(K, 3) weighted colour errors above the optimum over the coefficients left free, of the splats that are seen.
+
+    Relative to the largest coefficient or 1.
+    """
+    from tests.reference.ridge import YCOCG, Ridges, triangles  # needs scipy
+
+    before, after = scene.sh @ YCOCG.T, compacted.sh @ YCOCG.T
+    largest = np.maximum(np.abs(before).max(axis=1), 1)
+    squares = np.add.reduceat(np.append(weights.weights.astype(np.float64) ** 2, 0), weights.offsets[:-1])
+    errors = []
+    for splats, triangle in triangles(scene.means.astype(np.float64), centres, weights, scene.sh_degree):
+        found = np.zeros((len(splats), 3))
+        for c in range(3):
+            used = np.abs(after[splats, :, c]) > 1e-6 * np.abs(compacted.sh[splats]).max(axis=(1, 2))[:, None]
+            used[:, 0] = True
+            lam = options.lam * (options.chroma_factor if c else 1)
+            excess = Ridges(triangle, before[splats, :, c], used, lam).excess(after[splats, :, c])[0]
+            kept = np.isclose(after[splats, 1:, c], before[splats, 1:, c], rtol=1e-5, atol=1e-7).all(axis=1)
+            found[:, c] = np.where(kept, 0, np.sqrt(excess / squares[splats]) / largest[splats, c])
+        errors.append(found)
+    return np.concatenate(errors)
+
+
+def ridge_rows(load: Workload) -> Iterator[Row]:
+    """Precision of the least squares, and family."""
+    views = load.train if load.quick else load.train[::2]
+    chosen = np.random.default_rng(0).permutation(len(load.scene))[: 500 if load.quick else 20_000]
+    scene, centres = load.scene.subset(np.sort(chosen)), camera_centres(views)
+    with Rasterizer(Device(load.info), scene) as rasterizer, RemovalSweep(rasterizer, views) as sweep:
+        sweep.measure()
+        weights = ViewWeights.from_importances(len(scene), sweep.view_importances())
+    for family in load.families:
+        device = load.profiled(family)
+        for precision in get_args(Precision):
+            # λ 0.01 and no column dropped: as hard as it gets.
+            options = CompactionOptions(lam=0.01, alpha=1, precision=precision)
+            compactor, best = Compactor(device), math.inf
+            for _ in range(load.repeats + 1):
+                device.stage_times()
+                compacted = compactor.compact(scene, centres, weights, options)
+                best = min(best, device.stage_times()["compact"])
+            errors = ridge_errors(scene, compacted, centres, weights, options)
+            default = precision == CompactionOptions.precision and family == load.info.family
+            error = float(np.quantile(errors, 0.9999))
+            yield Row("ridge", f"{family}, {precision}", best * 1e6 / len(scene), error, default)
+
+
+def refit_rows(load: Workload) -> Iterator[Row]:
+    """Steps of conjugate gradients, and family, on the more important half of the splats."""
+    views = load.train if load.quick else load.train[:: max(len(load.train) // 16, 1)]
+    with Rasterizer(Device(load.info), load.scene) as rasterizer, RemovalSweep(rasterizer, views) as removal:
+        importance = removal.measure()[1]
+    kept = load.scene.subset(np.sort(np.argsort(importance)[len(importance) // 2 :]))
+    default = EncodeOptions.for_preset("best").refit.steps
+    for family in load.families[: 1 if load.quick else 2]:
+        device = Device(load.info, family=family)
+        with Rasterizer(device, load.scene) as rasterizer:
+            targets = RenderedTargets(rasterizer, views)
+            for steps in (0, 1, 2, 4, 8, 16) if load.quick else (0, 1, 2, 4, 8, 16, 32, 64):
+                errors: list[float] = []
+
+                def work(device: Device = device, targets: RenderedTargets = targets, steps: int = steps) -> None:
+                    refitted = refit_colours(device, kept, views, targets, RefitOptions(steps=steps, gain=0))
+                    errors.append(math.sqrt(refitted.errors[1]))  # noqa: B023 (called before the loop goes on)
+
+                is_default = family == load.info.family and steps == default
+                yield Row("re-fit", f"{family}, {steps} steps", best_of(1, work), errors[-1], is_default)
+
+
+# ---------------------------------------------------------------------------------------------------- coding
+
+
+def code_rows(load: Workload) -> Iterator[Row]:
+    """Entropy coders and levels, and decoding what they made."""
+    for coder in [*(EntropyCoder("zstd", level) for level in (1, 9, 19, 22)), EntropyCoder()]:
+        parameters = EncodeOptions.for_preset("best" if coder.name == "bundles" else "paper").parameters
+        data: list[bytes] = []
+
+        def code(coder: EntropyCoder = coder, parameters: Any = parameters, data: list[bytes] = data) -> None:
+            data.append(b"".join(code_scene(load.scene, parameters, load.train, entropy=coder).pieces))
+
+        seconds = best_of(1, code)
+        name = f"{coder.name} {coder.level}" if coder.name == "zstd" else coder.name
+        default, size = coder == EncodeOptions.for_preset("best").code.coder, len(data[0])
+        yield Row("code", name, seconds, size, default)
+        yield Row("decode", name, best_of(load.repeats, lambda d=data[0]: decode(d)), size, default)  # type: ignore[misc]
+
+
+#: By stage: what the time is of, what the error is, and what measures it.
+STAGES: dict[str, tuple[str, str, Callable[[Workload], Iterator[Row]]]] = {
+    "project": ("a view's projection", "largest error of a centre, pixels", rasterizer_rows),
+    "tile lists": ("a view's tile lists", "intersections that another variant has not", rasterizer_rows),
+    "sort": ("a view's depth sort", "intersections out of order", rasterizer_rows),
+    "composite": ("a view's compositing", "largest error of a pixel", rasterizer_rows),
+    "removal": ("a sweep over all tiles of a view", "median relative error of ΔMSE", removal_rows),
+    "ridge": ("the kernel, a million splats", "colour error above the optimum, 99.99th percentile", ridge_rows),
+    "re-fit": ("the solver", "RMS error on training views", refit_rows),
+    "code": ("coding without looking at views", "bytes", code_rows),
+    "decode": ("decoding", "bytes", code_rows),
+}
+
+
+def run(index: int, folder: Path, quick: bool, stages: Sequence[str]) -> list[Row]:
+    """Some stages on one device and scene."""
+    load = Workload.of(list_devices()[index], folder, quick)
+    rows: list[Row] = []
+    for work in dict.fromkeys(STAGES[stage][2] for stage in stages):
+        rows += work(load)
+        log(f"{folder.name}: {work.__name__} done")
+    return [row for row in rows if row.stage in stages]
+
+
+def report(results: Results, title: str, rows: Sequence[Row]) -> None:
+    """A table a stage."""
+    for stage, (what, error, _) in STAGES.items():
+        own = [row for row in rows if row.stage == stage]
+        if own:
+            columns = f"variant; seconds of {what}||.3g; {error}||.3g; bytes||,; default; on the Pareto front"
+            table = results.table(f"{title}: {stage}", f"{title}: {stage}", columns)
+            for row in sorted(own, key=lambda r: r.seconds):
+                marks = ["yes" if mark else "" for mark in (row.default, on_front(row, own))]
+                table.add(row.variant, row.seconds, row.error, row.nbytes, *marks)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", type=Path, nargs="+", help="default: lego and plush, or the excerpt if quick")
-    parser.add_argument("--device", help="as everywhere; default: all, or the best one if quick")
+    parser = scene_parser(__doc__, "*")
     parser.add_argument("--quick", action="store_true", help="the excerpt at half size, fewer variants")
-    parser.add_argument("--stages", nargs="+", choices=tuple(STAGES), default=list(STAGES))
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--from", dest="kept", type=Path, nargs="+", help="figures of earlier runs, instead of a run")
-    parser.add_argument("--one", nargs=3, help=argparse.SUPPRESS)
+    parser.add_argument("--stage", action="append", choices=tuple(STAGES), dest="stages")
     args = parser.parse_args()
-    if args.one:
-        index, name, folder = args.one
-        result = run(list_devices()[int(index)], Path(folder), name, args.quick, args.stages)
-        args.json.write_text(json.dumps(result))
-        return
-    if args.kept:
-        results = [result for path in args.kept for result in json.loads(path.read_text())]
-    else:
-        infos = [choose_device(args.device)] if args.device or args.quick else list_devices()
-        with tempfile.TemporaryDirectory() as scratch:
-            scenes = {folder.name: folder for folder in args.scenes or ()}
-            if not scenes and not args.quick:
-                scenes = {folder.name: folder for folder in (SCENES / "lego", SCENES / "plush") if folder.exists()}
-            scenes = scenes or {"excerpt": excerpt(Path(scratch) / "excerpt")}
-            results = [
-                {**circumstances(info), **in_process(info, folder, name, args.quick, args.stages)}
-                for info in infos
-                for name, folder in scenes.items()
-            ]
-    if args.json:
-        args.json.write_text(json.dumps(results, indent=1))
-    for result in results:
-        print_report(result)
-        if "failed" in result:
-            print(f"\nFailed, exit code {result['failed']}.")
+    infos = [choose_device(args.device)] if args.device or args.quick else list_devices()
+    results = Results(infos[0], args.json)
+    with tempfile.TemporaryDirectory() as scratch:
+        folders = args.scenes or ([] if args.quick else list(filter(Path.exists, (SCENES / "lego", SCENES / "plush"))))
+        for folder in folders or [excerpt(Path(scratch) / "excerpt")]:
+            for info in infos:
+                title = f"{folder.name}, {info}"
+                try:
+                    rows = in_process(run, info.index, folder, args.quick, args.stages or list(STAGES))
+                    report(results, title, rows)
+                except BrokenProcessPool:
+                    print(f"\n{title}: the process has ended")
 
 
 if __name__ == "__main__":

@@ -1,52 +1,39 @@
-"""How fast are the fit's steps, and how exact its derivatives?
+"""How fast are the fit's steps?
 
     python -m tools.bench.fit SCENE … [--keep 0.35] [--steps 200] [--device NAME] [--json FILE]
 
 A SCENE is a folder with point_cloud.ply and cameras.json. Its splats are pruned to a part (or, with --every, every so
-many are taken, which takes no time), and the fit's steps look at the training views. Tables:
-
-steps     steps a second, by views a step, and what the device does in that time, kernel by kernel
-errors    run time against error: Jᵀ r against float64, where r is the difference to a picture that is nearly the same,
-          by the unit that r is multiplied by while sums of it are integers, and by kernel family
+many are taken, which takes no time), and the fit's steps look at the training views: steps a second, by views a step,
+and what the device does in that time, kernel by kernel. tools.stress.run measures how exact the derivatives are.
 
 Times are the clock's on GPUs, and of processors together on CPUs, which other work may share.
 """
 
 from __future__ import annotations
 
-import itertools
-import time
+import argparse
 from collections.abc import Callable, Sequence
 
 import numpy as np
-import pyopencl as cl
 
 from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.opencl.memory import Memory
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.rules import INRIA
-from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.fitting.adam import Adam, Limits, Rates
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from potr_cl.stages.fitting.pictures import TargetPictures
 from potr_cl.stages.fitting.views import batches
 from potr_cl.stages.refitting.targets import RenderedTargets
-from tests.reference.derivatives import gradient
-from tests.reference.scenes import ring_of_cameras, visible_scene
 from tools.results import Column, Results
-from tools.workloads import read, reduced, scene_parser
+from tools.workloads import in_turn, read, reduced, scene_parser
 
 #: Steps so small that the scene, and with it the work, stays what it is.
 _RATES = Rates(1e-9, 1e-9, 1e-9, 1e-9, 1e-9, 1e-9)
 _LIMITS = Limits((-200.0, 200.0), (-200.0, 200.0))
 #: Kernels by what they are part of; all others prepare views.
 _PARTS = {"derivatives": "sums over pixels", "chain": "to parameters", "adam": "step", "activate": "step"}
-_UNITS = (1.0, 4096.0)
-#: Root mean squares of the differences that the errors are measured on.
-_DIFFERENCES = (1e-2, 1e-4)
 #: Repetitions that times are the least of.
 _REPEATS = 3
 
@@ -65,61 +52,44 @@ def main() -> None:
     results = Results(device.info, args.json)
     parts = ("views", *dict.fromkeys(_PARTS.values()))
     steps = results.table(
-        "steps", "Steps of the fit", Column("scene"), Column("splats", "", ",d"), Column("pixels of a view", "", ",d"),
-        Column("views a step"), Column("steps a second", "", ".1f"),
+        "steps", "Steps of the fit", "scene; splats||,d; pixels of a view||,d; views a step; steps a second||.1f",
         *(Column(f"of a step: {part}", "ms", ".2f") for part in parts),
     )  # fmt: skip
     for folder in args.scenes:
         scene, cameras = read(folder)
         train = train_views(cameras)[: args.views]
-        load = folder.name, scene, _left(scene, train, args, plain), train
+        load = scene, _left(scene, train, args, plain), train
         for batch in args.batches:
             steps.add(
-                folder.name, len(load[2]), train[0].width * train[0].height, batch,
+                folder.name, len(load[1]), train[0].width * train[0].height, batch,
                 *_steps(plain, device, load, batch, args.steps),
             )  # fmt: skip
-    errors = results.table(
-        "errors", "Error of derivatives against float64, and their time",
-        Column("kernels"), Column("differences", "", "g"), Column("unit", "", "g"),
-        Column("relative error of Jᵀ r", "", ".1e"),
-        Column("time of a view", "ms", ".3f"),
-    )  # fmt: skip
-    for family in ("cpu", "gpu") if device.info.family == "cpu" else ("gpu",):
-        for size, unit in itertools.product(_DIFFERENCES, _UNITS):
-            errors.add(family, size, unit, *_error(Device(args.device, family=family), size, unit))
 
 
-Load = tuple[str, Scene, Scene, list[Camera]]
+Load = tuple[Scene, Scene, list[Camera]]
 
 
-def _left(scene: Scene, train: Sequence[Camera], args: object, device: Device) -> Scene:
-    every, keep = getattr(args, "every", None), float(getattr(args, "keep", 1.0))
-    if every:
-        return scene.subset(np.arange(0, len(scene), every))
-    changes = {"prune": {"count": round(keep * len(scene))}, "compact": False, "refit": False, "between": {"views": 0}}
-    return reduced(scene, train, EncodeOptions.for_preset("fast", **changes), device)
-
-
-def _now(device: Device) -> float:
-    return time.process_time() if device.info.kind == "cpu" else time.perf_counter()
+def _left(scene: Scene, train: Sequence[Camera], args: argparse.Namespace, device: Device) -> Scene:
+    if args.every:
+        return scene.subset(np.arange(0, len(scene), args.every))
+    count = round(args.keep * len(scene))
+    changes = {"prune": {"count": count}, "compact": False, "refit": False, "between": {"views": 0}}
+    return reduced(scene, train, EncodeOptions.for_preset("fast", **changes), device).scene
 
 
 def _least(device: Device, work: Callable[[], None]) -> float:
     """Seconds of some work, after a run that is not counted."""
-    work()
-    device.queue.finish()
-    times = []
-    for _ in range(_REPEATS):
-        began = _now(device)
+
+    def whole() -> None:
         work()
         device.queue.finish()
-        times.append(_now(device) - began)
-    return min(times)
+
+    return min(in_turn({"": whole}, _REPEATS)[""][device.info.kind == "cpu"])
 
 
 def _steps(plain: Device, profiled: Device, load: Load, batch: int, count: int) -> tuple[float, ...]:
     """Steps a second without profiling, and milliseconds a step of each part of the device's work with it."""
-    _, scene, left, train = load
+    scene, left, train = load
     count = max(count // batch, 1)
     found: dict[str, float] = {}
     rate = 0.0
@@ -152,33 +122,6 @@ def _steps(plain: Device, profiled: Device, load: Load, batch: int, count: int) 
                 part = _PARTS.get(name, "views")
                 found[part] = found.get(part, 0.0) + 1e3 * seconds / count
     return rate, *(found.get(part, 0.0) for part in ("views", *dict.fromkeys(_PARTS.values())))
-
-
-def _error(device: Device, size: float, unit: float) -> tuple[float, float]:
-    """The largest relative error of a kind of parameters, and milliseconds of a view."""
-    scene = visible_scene(300, 3)
-    (camera,) = ring_of_cameras(1, size=96)
-    rng = np.random.default_rng(0)
-    with PictureDerivatives(device, scene, INRIA) as derivatives, Memory(device) as memory:
-        picture, _ = derivatives.rasterizer.render(camera)
-        wanted = picture + rng.normal(0, size, picture.shape).astype(np.float32)
-        target = memory.upload(wanted, "the target")
-        derivatives.add([camera], target, unit=unit)
-        found = derivatives.read().astype(np.float64)
-        seconds = _least(device, lambda: _some_views(derivatives, camera, target, unit))
-    exact = gradient(scene, camera, INRIA, (picture - wanted).astype(np.float64))
-    weight = REFERENCE_PIXELS / (camera.width * camera.height)
-    parts = np.split(found, [3, 6, 10, 11], axis=1)
-    arrays = [weight * array.reshape(len(scene), -1) for array in vars(exact).values()]
-    worst = max(
-        float(np.linalg.norm(part - array) / np.linalg.norm(array)) for part, array in zip(parts, arrays, strict=True)
-    )
-    return worst, 1e3 * seconds / 16
-
-
-def _some_views(derivatives: PictureDerivatives, camera: Camera, target: cl.Buffer, unit: float) -> None:
-    for _ in range(16):
-        derivatives.add([camera], target, unit=unit)
 
 
 if __name__ == "__main__":

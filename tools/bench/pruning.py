@@ -1,118 +1,62 @@
 """Quality and cost of pruning.
 
-    python -m tools.bench.pruning SCENE … [--parts curves skips] [--truth] [--json FILE] [options]
+    python -m tools.bench.pruning SCENE … [--part curves] [--part skips] [--json FILE] [options]
 
-A SCENE is a folder with point_cloud.ply, cameras.json and, for --truth, images. Parts (both by default):
+Parts (both by default):
 
 curves  PSNR on test views against the share of splats removed, for our schedule at several numbers of iterations (one
-        schedule for each count of survivors) and for other pruners' orders.
+        schedule for each count of survivors) and for orders by a score: importance Σ α T, MesonGS's Σ α T V^0.1 with
+        V the volume, opacity, and at random.
 skips   the schedule at q = 0.5 with everything computed, and with each of the things that it may skip or do otherwise:
-        time, tiles swept, splats kept, and what that costs, also at equal counts.
+        time, tiles swept, splats kept, and what that costs at equal counts. The Pareto front is marked.
 
-PSNR is the mean over test views, against the uncompressed scene's renders, and with --truth also what is lost against
-the photographs. Prints Markdown; --json writes the raw results.
+PSNR is the mean over test views against the uncompressed scene's renders; where a scene has photographs in images, what
+is lost against these stands beside.
 """
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import itertools
-import json
-import math
-import statistics
-import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.formats import load_cameras, load_scene
-from potr_cl.formats.images import read_ground_truth
-from potr_cl.model.camera import Camera, test_views, train_views
+from potr_cl.model.camera import Camera, train_views
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
-from potr_cl.quality.compare import find_ground_truth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import Pruned, PruningOptions
 from potr_cl.stages.pruning.sweep_options import SweepOptions
-from tools.results import circumstances
-from tools.study.pruning_baselines import KERNELS, mesongs_power, removal_order, scores, transmittance_sums
+from tools.results import Cell, Column, Results
+from tools.study.evaluation import EvaluatedScene
+from tools.workloads import log, scene_parser
 
-F64 = NDArray[np.float64]
 Indices = NDArray[np.int64]
-Image = NDArray[np.float32]
 Row = dict[str, Any]
 
-PARTS = ("curves", "skips")
 #: ΔMSE_MAX at q = 0.5.
 DELTA_MSE_MAX = 10**-9.8
-#: What is lost on the photographs where methods are compared, in dB.
-LOSS_LEVEL = 0.4
-ONE_ORDER = "one order"
 
 
 class Bench(Owner):
-    """One scene on one device: reference renders, and what pruned versions of it are worth.
+    """One scene on one device; every: only each so many-th view."""
 
-    Attributes:
-        train, test: the views to prune by and to judge by.
-    """
-
-    def __init__(self, folder: Path, device: Device, quick: bool, truth: bool) -> None:
-        self.name = folder.name
-        self.device = device
-        self.scene = load_scene(folder / "point_cloud.ply")
-        cameras = load_cameras(folder / "cameras.json")
-        every = 4 if quick else 1
-        self.train, self.test = train_views(cameras)[::every], test_views(cameras)[::every]
+    def __init__(self, folder: Path, device: Device, every: int = 1) -> None:
+        self.device, self.evaluator = device, EvaluatedScene(folder, device, every)
+        self.scene, self.train = self.evaluator.source, train_views(self.evaluator.cameras)[::every]
         self.rasterizer = Rasterizer(device, self.scene)
-        self._test_renders = self._renders(self.test)
-        self._train_renders: list[Image] | None = None
-        self._ground_truth: list[Image] | None = None
-        if truth:
-            files = find_ground_truth(folder / "images", self.test)
-            self._ground_truth = [read_ground_truth(files[c.name], self.rasterizer.background) for c in self.test]
-            pairs = zip(self._test_renders, self._ground_truth, strict=True)
-            self._uncompressed = [decibels(squared_error(render, photograph)) for render, photograph in pairs]
-        self._orders: dict[str, Indices] = {}
-        self._baselines: dict[str, Indices] = {}
         # Builds every kernel, so that no measurement pays for it.
         self.pruned(self.train[:1], PruningOptions(0, 1, count=len(self.scene) // 2), SweepOptions())
 
-    def _renders(self, cameras: Sequence[Camera]) -> list[Image]:
-        return [np.clip(self.rasterizer.render(camera)[0], 0, 1) for camera in cameras]
-
     def quality(self, survivors: Indices) -> Row:
-        """PSNR of what the survivors render against the uncompressed scene, and the loss against the photographs."""
-        with Rasterizer(self.device, self.scene.subset(survivors)) as rasterizer:
-            renders, losses = [], []
-            for number, camera in enumerate(self.test):
-                image = rasterizer.render(camera)[0]
-                renders.append(decibels(squared_error(image, self._test_renders[number])))
-                if self._ground_truth is not None:
-                    error = squared_error(image, self._ground_truth[number])
-                    losses.append(self._uncompressed[number] - decibels(error))
-        row: Row = {"kept": len(survivors), "psnr": statistics.mean(renders)}
-        if losses:
-            row["loss"] = statistics.mean(losses)
-        return row
-
-    def train_psnr(self, survivors: Indices) -> float:
-        """PSNR of the mean squared error over all training views: what pruning tries to keep."""
-        if self._train_renders is None:
-            self._train_renders = self._renders(self.train)
-        with Rasterizer(self.device, self.scene.subset(survivors)) as rasterizer:
-            errors = [
-                squared_error(rasterizer.render(camera)[0], reference)
-                for camera, reference in zip(self.train, self._train_renders, strict=True)
-            ]
-        return decibels(statistics.mean(errors))
+        """What the survivors keep of the test views."""
+        return self.evaluator(self.scene.subset(survivors))
 
     def pruned(self, cameras: Sequence[Camera], options: PruningOptions, sweep: SweepOptions) -> tuple[Pruned, Row]:
         """Run a schedule; its result and its cost in seconds and full sweeps."""
@@ -121,96 +65,41 @@ class Bench(Owner):
             prepared = time.perf_counter()
             result = prune_scene(removal, options)
             self.device.queue.finish()
-            ended = time.perf_counter()
-            sweeps = removal.sweeps
-        return result, {
-            "prepare_seconds": prepared - started,
-            "seconds": ended - started,
-            "sweeps": sweeps,
-            "rounds": result.iterations,
+            cost = {"preparing": prepared - started, "seconds": time.perf_counter() - started, "sweeps": removal.sweeps}
+        return result, cost
+
+    def scores(self) -> dict[str, NDArray[np.float64]]:
+        """Other pruners' scores of each splat; those with the lowest go first."""
+        with RemovalSweep(self.rasterizer, self.train, SweepOptions(transmittance_threshold=None)) as sweep:
+            importance = sweep.measure()[1]
+        volume = np.exp(self.scene.log_scales.sum(axis=1, dtype=np.float64))
+        return {
+            "importance": importance,
+            "MesonGS": importance * volume**0.1,
+            "opacity": self.scene.opacities.astype(np.float64),
+            "random": np.random.default_rng(0).random(len(self.scene)),
         }
-
-    def ours(self, kept: int, iterations: int) -> tuple[Pruned, Row]:
-        """Our schedule to an exact count, at the default skips."""
-        return self.pruned(self.train, PruningOptions(0, iterations, count=kept), SweepOptions())
-
-    def one_order(self, kept: int, iterations: int) -> Indices:
-        """The order of one schedule down to ``kept`` survivors, made once."""
-        key = f"{kept} {iterations}"
-        if key not in self._orders:
-            self._orders[key] = self.ours(kept, iterations)[0].order
-        return self._orders[key]
-
-    def baselines(self) -> dict[str, Indices]:
-        """The other pruners' orders."""
-        if not self._baselines:
-            with RemovalSweep(self.rasterizer, self.train, SweepOptions(transmittance_threshold=None)) as sweep:
-                importance = sweep.measure()[1]
-            transmittance = transmittance_sums(self.rasterizer, self.train)
-            found = scores(self.scene, importance, transmittance, mesongs_power(self.name))
-            self._baselines = {name: removal_order(score) for name, score in found.items()}
-        return self._baselines
 
     def close(self) -> None:
         """Give the device's memory back."""
         self.rasterizer.close()
+        self.evaluator.close()
 
 
-def log(text: str) -> None:
-    """Progress, to standard error."""
-    print(f"[{time.strftime('%H:%M:%S')}] {text}", file=sys.stderr, flush=True)
-
-
-def squared_error(image: Image, reference: Image) -> float:
-    """Mean over pixels and channels; the reference is clamped already."""
-    difference = (np.clip(image, 0, 1) - reference).ravel()
-    return float(difference @ difference) / difference.size
-
-
-def decibels(error: float) -> float:
-    """PSNR of a mean squared error."""
-    return -10 * math.log10(error) if error > 0 else math.inf
-
-
-def ours_name(iterations: int) -> str:
-    """What our schedule is called in tables and plots."""
-    return f"ours, {iterations} iteration{'s' if iterations > 1 else ''}"
-
-
-def curves(bench: Bench, shares: Sequence[float], iterations: Sequence[int]) -> list[Row]:
-    """One row a method and share removed."""
-    splats = len(bench.scene)
-    counts = {share: round(splats * (1 - share)) for share in shares}
-    rows: list[Row] = []
-
-    def add(method: str, share: float, survivors: Indices, cost: Row) -> None:
-        rows.append({"method": method, "removed": share, **bench.quality(survivors), **cost})
-        log(f"{bench.name}: {method}, {share:.0%} removed: {rows[-1]['psnr']:.2f} dB")
-
-    for name, order in bench.baselines().items():
-        for share, kept in counts.items():
-            add(name, share, order[splats - kept :], {})
+def curves(bench: Bench, shares: Sequence[float], iterations: Sequence[int]) -> Iterator[tuple[str, list[Row]]]:
+    """A method, and what it keeps at each share removed."""
+    counts = [round(len(bench.scene) * (1 - share)) for share in shares]
+    for name, score in bench.scores().items():
+        order = np.argsort(score, kind="stable")
+        yield name, [bench.quality(order[len(order) - kept :]) for kept in counts]
     for rounds in iterations:
-        for share, kept in counts.items():
-            result, cost = bench.ours(kept, rounds)
-            add(ours_name(rounds), share, result.survivors, cost)
-    order = bench.one_order(min(counts.values()), max(iterations))
-    for share, kept in counts.items():
-        add(f"{ours_name(max(iterations))}, {ONE_ORDER}", share, order[splats - kept :], {})
-    return rows
+        results = (bench.pruned(bench.train, PruningOptions(0, rounds, count=kept), SweepOptions()) for kept in counts)
+        yield f"ours, {rounds} iterations", [bench.quality(result.survivors) for result, _ in results]
 
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """One row of the skips.
-
-    Attributes:
-        name: what is skipped.
-        iterations: of the schedule.
-        sweep: what its measurements skip.
-        every: only each so many-th training view counts.
-        pruning: other options of the schedule.
-    """
+    """One row of the skips: its name, iterations, what measurements skip, every so many-th view, other options."""
 
     name: str
     iterations: int
@@ -232,8 +121,7 @@ def skip_settings(iterations: Sequence[int]) -> list[Setting]:
     settings += [Setting(f"tolerance {t:g}", most, SweepOptions(t)) for t in (0.002, 0.005, 0.01, 0.02, 0.05)]
     settings += [Setting(f"{n} iterations", n) for n in fewer]
     settings += [Setting(f"views in {n} turns", most, SweepOptions(turns=n)) for n in (2, 4)]
-    settings += [Setting(f"every {name} view", most, every=n) for name, n in (("2nd", 2), ("4th", 4))]
-    return settings
+    return settings + [Setting(f"every {name} view", most, every=n) for name, n in (("2nd", 2), ("4th", 4))]
 
 
 def skips(bench: Bench, iterations: Sequence[int]) -> list[Row]:
@@ -245,118 +133,58 @@ def skips(bench: Bench, iterations: Sequence[int]) -> list[Row]:
         result, cost = bench.pruned(views, options, setting.sweep)
         cost["sweeps"] *= len(views) / len(bench.train)
         kept = rows[0]["kept"] if rows else result.kept
-        at_equal_count = result.order[len(result.order) - kept :]
-        own, equal = bench.quality(result.survivors), bench.quality(at_equal_count)
-        rows.append(
-            {
-                "skipped": setting.name,
-                "iterations": setting.iterations,
-                "views": len(views),
-                **own,
-                "psnr_at_equal_count": equal["psnr"],
-                "train_psnr_at_equal_count": bench.train_psnr(at_equal_count),
-                **cost,
-            }
-        )
-        log(f"{bench.name}: skipping {setting.name}: {cost['seconds']:.1f} s, {equal['psnr']:.2f} dB")
+        equal = bench.quality(result.order[len(result.order) - kept :])["psnr"]
+        quality = bench.quality(result.survivors)
+        rows.append({"skipped": setting.name, "kept": result.kept, **quality, "equal": equal, **cost})
+        log(f"{bench.evaluator.name}: skipping {setting.name}: {cost['seconds']:.1f} s, {equal:.2f} dB")
     return rows
-
-
-def _at(rows: Sequence[Row], level: float) -> float | None:
-    """The share removed at which a curve's loss reaches ``level`` dB, by interpolation from nothing removed."""
-    points = [(0.0, 0.0), *sorted((r["removed"], r["loss"]) for r in rows)]
-    for (share0, loss0), (share1, loss1) in itertools.pairwise(points):
-        if loss0 <= level < loss1:
-            return float(share0 + (share1 - share0) * (level - loss0) / (loss1 - loss0))
-    return None
-
-
-def print_curves(rows: Sequence[Row]) -> None:
-    """PSNR and loss by method and share."""
-    shares = sorted({r["removed"] for r in rows})
-    methods = list(dict.fromkeys(r["method"] for r in rows))
-    truth = "loss" in rows[0]
-    print("| removed | " + " | ".join(f"{s:.0%}" for s in shares) + (" | kept at 0.4 dB |" if truth else " |"))
-    print("|---" * (len(shares) + 1 + truth) + "|")
-    for method in methods:
-        mine = {r["removed"]: r for r in rows if r["method"] == method}
-        cells = [
-            f"{mine[s]['psnr']:.1f}" + (f" / {mine[s]['loss']:.2f}" if truth else "") if s in mine else ""
-            for s in shares
-        ]
-        if truth:
-            removed = _at(list(mine.values()), LOSS_LEVEL)
-            cells.append("" if removed is None else f"{1 - removed:.1%}")
-        print(f"| {method} | " + " | ".join(cells) + " |")
 
 
 def pareto(rows: Sequence[Row]) -> list[Row]:
     """The rows that no other beats in both time and PSNR at equal count, by ascending time."""
     front: list[Row] = []
-    for row in sorted(rows, key=lambda r: (r["seconds"], -r["psnr_at_equal_count"])):
-        if not front or row["psnr_at_equal_count"] > front[-1]["psnr_at_equal_count"]:
+    for row in sorted(rows, key=lambda r: (r["seconds"], -r["equal"])):
+        if not front or row["equal"] > front[-1]["equal"]:
             front.append(row)
     return front
 
 
-def print_skips(rows: Sequence[Row]) -> None:
-    """Cost and error of each setting; those on the Pareto front in bold."""
-    front = {r["skipped"] for r in pareto(rows)}
-    full = rows[0]
-    truth = "loss" in full
-    print(
-        "| skipped | iterations | s | of it preparing | full sweeps | kept | PSNR |"
-        + (" loss by photo |" if truth else "")
-        + " PSNR at equal count | against the full computation | on training views |"
-    )
-    print("|---" * (10 + truth) + "|")
-    for r in rows:
-        name = f"**{r['skipped']}**" if r["skipped"] in front else r["skipped"]
-        print(
-            f"| {name} | {r['iterations']} | {r['seconds']:.2f} | {r['prepare_seconds']:.2f} | {r['sweeps']:.1f} | "
-            f"{r['kept']:,} | {r['psnr']:.2f} | "
-            + (f"{r['loss']:.3f} | " if truth else "")
-            + f"{r['psnr_at_equal_count']:.2f} | {r['psnr_at_equal_count'] - full['psnr_at_equal_count']:+.2f} | "
-            f"{r['train_psnr_at_equal_count'] - full['train_psnr_at_equal_count']:+.2f} |"
-        )
-
-
-def run(arguments: argparse.Namespace) -> Row:
-    """Measure what the command line asks for."""
-    device = Device(arguments.device, variants=KERNELS)
-    results: Row = {**circumstances(device.info), "device": device.info.name, "scenes": {}}
-    for folder in arguments.scenes:
-        with Bench(folder, device, arguments.quick, arguments.truth) as bench:
-            found: Row = {"splats": len(bench.scene), "train": len(bench.train), "test": len(bench.test)}
-            results["scenes"][folder.name] = found
-            if "curves" in arguments.parts:
-                found["curves"] = curves(bench, [p / 100 for p in arguments.removed], arguments.iterations)
-            if "skips" in arguments.parts:
-                found["skips"] = skips(bench, arguments.iterations)
-    return results
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="+", type=Path)
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
-    parser.add_argument("--device")
-    parser.add_argument("--quick", action="store_true", help="every 4th training view, every 4th test view")
-    parser.add_argument("--truth", action="store_true", help="judge by the photographs too")
+    parser = scene_parser(__doc__)
+    parser.add_argument("--part", action="append", choices=("curves", "skips"), dest="parts")
+    parser.add_argument("--every", type=int, default=1, metavar="N", help="every N-th view only")
     parser.add_argument("--removed", nargs="+", type=float, default=list(range(10, 90, 10)), help="per cent")
     parser.add_argument("--iterations", nargs="+", type=int, default=[1, 4, 8, 16, 48])
-    parser.add_argument("--json", type=Path, help="write the raw results here")
-    arguments = parser.parse_args()
-    results = run(arguments)
-    if arguments.json:
-        arguments.json.write_text(json.dumps(results, indent=1) + "\n")
-    for name, found in results["scenes"].items():
-        print(f"\n## {name}: {found['splats']:,} splats, {found['train']} training and {found['test']} test views")
-        print(f"\n{results['device']}")
-        for part, printer in (("curves", print_curves), ("skips", print_skips)):
-            if part in found:
-                print(f"\n### {part}\n")
-                printer(found[part])
+    args = parser.parse_args()
+    device = Device(args.device)
+    results = Results(device.info, args.json)
+    for folder in args.scenes:
+        with Bench(folder, device, args.every) as bench:
+            name = bench.evaluator.name
+            if not args.parts or "curves" in args.parts:
+                truth = "psnr_loss" in bench.evaluator(bench.scene)
+                form = "{:.1f} / {:.2f}" if truth else ".1f"
+                table = results.table(
+                    f"curves_{name}", f"PSNR{' / loss against the photographs' if truth else ''}, dB, by part removed",
+                    "order", *(Column(f"{share:g} %", format=form) for share in args.removed),
+                )  # fmt: skip
+                for method, points in curves(bench, [share / 100 for share in args.removed], args.iterations):
+                    cells: list[Cell] = [[p["psnr"], p["psnr_loss"]] if truth else p["psnr"] for p in points]
+                    table.add(method, *cells)
+            if not args.parts or "skips" in args.parts:
+                table = results.table(
+                    f"skips_{name}", f"What the schedule may skip: {name}, q = 0.5",
+                    "skipped; time|s|.2f; of it preparing|s|.2f; full sweeps||.1f; kept||,; PSNR|dB|.2f; "
+                    "lost on the photographs|dB|.3f; at equal count|dB|.2f; against the full computation|dB|+.2f; "
+                    "Pareto front",
+                )  # fmt: skip
+                rows = skips(bench, args.iterations)
+                front = pareto(rows)
+                for r in rows:
+                    table.add(
+                        r["skipped"], r["seconds"], r["preparing"], r["sweeps"], r["kept"], r["psnr"],
+                        r.get("psnr_loss"), r["equal"], r["equal"] - rows[0]["equal"], "yes" if r in front else "",
+                    )  # fmt: skip
 
 
 if __name__ == "__main__":

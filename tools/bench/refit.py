@@ -1,50 +1,39 @@
 """What the joint re-fit of the colours brings and takes.
 
-    python -m tools.bench.refit measure SCENE … --json OUT.json [--removed PART …] [--drops X …] [options]
-    python -m tools.bench.refit report OUT.json
+    python -m tools.bench.refit SCENE … [--removed PART …] [--drops X …] [--json FILE] [options]
 
-A SCENE is a folder with point_cloud.ply, cameras.json with test views and, if it has any, photographs in images.
-``measure`` looks at bytes and PSNR after removing a part of the splats, for each way to treat the colours of those that
-are left (WAYS); every re-fit is on the geometry and the opacities that a decoder sees.
-
-``--every N`` looks at every N-th view only, for machines that are slow. ``report`` prints Markdown.
+A SCENE has test views and, if it has any, photographs in images. Bytes and PSNR after removing a part of the splats,
+for each way to treat the colours of those that are left (WAYS); every re-fit is on the geometry and the opacities that
+a decoder sees. Then bytes against those of the paper's way at equal PSNR, by interpolation.
 """
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import json
-import math
-import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import decode
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.quantize import ac_sparsity
-from potr_cl.formats import load_cameras, load_scene
-from potr_cl.model.camera import test_views, train_views
-from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.model.camera import train_views
+from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.opencl.memory import Owner
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.ground_truth import GroundTruth
-from potr_cl.quality.metrics import psnr
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.refitting.colour_refit import ColourRefit
 from potr_cl.stages.refitting.refit import active_coefficients
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets, Targets
-from tools.results import circumstances, write_json
+from tools.results import Cell, Results
+from tools.study.evaluation import EvaluatedScene
 from tools.study.rate_distortion import size_at
-from tools.workloads import reduced, study_parser
+from tools.workloads import log, reduced, scene_parser
 
 #: By name: whether splat by splat (the paper's compaction) comes first, and how the re-fit is done, if at all.
 WAYS = {
@@ -55,201 +44,110 @@ WAYS = {
     "splat by splat, then joint, to photographs": (True, "ground_truth"),
 }
 PAPER = "splat by splat"
-REMOVED = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
-DROPS = (1e-11, 1e-10, 1e-9)
 CODER = EntropyCoder("zstd", 9)
 
 
-def log(text: str) -> None:
-    print(f"[{time.strftime('%H:%M:%S')}] {text}", file=sys.stderr, flush=True)
-
-
-class Bench(Owner):
+class Bench:
     """One scene on one device."""
 
-    def __init__(self, folder: Path, device: Device, options: EncodeOptions, refit: RefitOptions, every: int) -> None:
-        self.name, self.device, self.options, self.refit = folder.resolve().name, device, options, refit
-        self.scene = load_scene(folder / "point_cloud.ply")
-        cameras = load_cameras(folder / "cameras.json")
-        self.train, self.test = train_views(cameras)[::every], test_views(cameras)[::every]
-        self.rasterizer = Rasterizer(device, self.scene)
-        self.renders = [self.rasterizer.render(c)[0] for c in self.test]
-        self.ground_truth: GroundTruth | None = None
-        self.truths: list[FloatArray] = []
+    def __init__(self, folder: Path, evaluator: EvaluatedScene, device: Device, rasterizer: Rasterizer, every: int):
+        self.evaluator, self.device = evaluator, device
+        self.train = train_views(evaluator.cameras)[::every]
+        self.targets: dict[str, Targets] = {"": RenderedTargets(rasterizer, self.train)}
         if (folder / "images").is_dir():
-            self.ground_truth = GroundTruth(folder / "images", [*self.train, *self.test])
-            self.truths = [self.ground_truth.picture(c) for c in self.test]
-        self.targets = RenderedTargets(self.rasterizer, self.train)
-
-    def close(self) -> None:
-        """Give the device's memory back."""
-        self.rasterizer.close()
-
-    def evaluator(self, candidate: Scene) -> dict[str, float]:
-        """Means over the test views."""
-        with Rasterizer(self.device, candidate) as rasterizer:
-            images = [rasterizer.render(c)[0] for c in self.test]
-        values = [psnr(a, b) for a, b in zip(images, self.renders, strict=True)]
-        finite = [v for v in values if math.isfinite(v)]
-        figures = {"psnr": float(np.mean(finite))} if finite else {}
-        if self.truths:
-            figures["truth_psnr"] = float(np.mean([psnr(a, b) for a, b in zip(images, self.truths, strict=True)]))
-        return figures
-
-    def reduced(self, removed: float, compact: bool) -> Scene:
-        count = max(round((1 - removed) * len(self.scene)), 1)
-        return reduced(
-            self.scene, self.train, self.options.changed(prune={"count": count}, compact=compact), self.device
-        )
-
-    def decoded(self, scene: Scene) -> tuple[int, Scene, NDArray[np.int64]]:
-        """Bytes, the decoded scene, and the number in ``scene`` of each of its splats."""
-        coded = code_scene(scene, self.options.parameters, self.train, entropy=CODER)
-        return coded.nbytes, decode(b"".join(coded.pieces)), coded.order
-
-    def on_decoded_geometry(self, scene: Scene) -> Scene:
-        """The scene's colours on the geometry and the opacities that a decoder sees."""
-        _, decoded, order = self.decoded(dataclasses.replace(scene, sh=scene.sh[:, :1]))
-        place = np.empty(len(scene), np.int64)
-        place[order] = np.arange(len(scene))
-        return dataclasses.replace(decoded.subset(place), sh=scene.sh)
-
-    def active(self, scene: Scene) -> NDArray[np.bool_]:
-        return active_coefficients(scene.sh, self.options.parameters.sf_sh)
-
-    # -------------------------------------------------------------------------------------- curves
-
-    def point(self, scene: Scene, removed: float) -> dict[str, Any]:
-        """What coding a reduced scene takes, and what is left of it."""
-        nbytes, decoded, _ = self.decoded(scene)
-        sparsity = ac_sparsity(scene.sh, self.options.parameters.sf_sh)
-        return {
-            "removed": removed,
-            "splats": len(scene),
-            "bytes": nbytes,
-            "sparsity": sparsity,
-            **self.evaluator(decoded),
-        }
+            truth = GroundTruth(folder / "images", self.train)
+            self.targets["ground_truth"] = GroundTruthTargets(device, truth, self.train)
 
     def refitted(
-        self, scene: Scene, targets: Targets, options: RefitOptions, active: NDArray[np.bool_] | None
-    ) -> tuple[Scene, dict[str, Any]]:
+        self, scene: Scene, options: EncodeOptions, refit: RefitOptions, how: str, chosen: bool
+    ) -> tuple[Scene, float]:
+        """Colours re-fitted on what a decoder sees, and seconds; chosen: the coefficients that are left stay."""
         began = time.perf_counter()
-        with ColourRefit(self.device, self.on_decoded_geometry(scene), self.train) as refit:
-            result = refit.solve(scene.sh, targets, options, active)
-        facts = {"steps": result.steps, "errors": result.errors, "seconds": time.perf_counter() - began}
-        return dataclasses.replace(scene, sh=result.sh), facts
-
-    def curves(self, removed: tuple[float, ...], drops: tuple[float, ...], note: Callable[[Any], None]) -> None:
-        curves: dict[str, list[dict[str, Any]]] = {name: [] for name in WAYS}
-        curves |= {f"joint, drop {drop:g}": [] for drop in drops}
-        lam = self.options.parameters.lam
-        for part in removed:
-            scenes = {compact: self.reduced(part, compact) for compact in (False, True)}
-
-            def add(name: str, scene: Scene, facts: dict[str, Any], part: float = part) -> None:
-                curves[name].append({**self.point(scene, part), **facts})
-                p = curves[name][-1]
-                log(f"{self.name} {part:.0%} removed, {name}: {p['bytes']} bytes, {p.get('psnr', math.inf):.2f} dB")
-
-            for name, (compact, how) in WAYS.items():
-                scene = scenes[compact]
-                facts: dict[str, Any] = {}
-                targets: Targets = self.targets
-                if how == "ground_truth":
-                    if self.ground_truth is None:
-                        continue
-                    targets = GroundTruthTargets(self.device, self.ground_truth, self.train)
-                if how is not None:
-                    options = dataclasses.replace(self.refit, lam=lam) if how == "lambda" else self.refit
-                    active = self.active(scene) if compact else None
-                    scene, facts = self.refitted(scene, targets, options, active)
-                add(name, scene, facts)
-            for drop in drops:
-                options = dataclasses.replace(self.refit, drop=drop)
-                add(f"joint, drop {drop:g}", *self.refitted(scenes[False], self.targets, options, None))
-            note({name: curve for name, curve in curves.items() if curve})
-
-
-def _measure(args: argparse.Namespace) -> None:
-    device = Device(args.device)
-    options = EncodeOptions.for_preset(args.preset, q=args.quality, prune={"iterations": args.iterations})
-    refit = RefitOptions(steps=args.steps, prior=args.prior)
-    results: dict[str, Any] = {
-        **circumstances(device.info), "device": device.info.name, "q": args.quality, "preset": args.preset,
-        "steps": args.steps, "prior": args.prior, "every": args.every, "scenes": {},
-    }  # fmt: skip
-    for folder in args.scenes:
-        with Bench(folder, device, options, refit, args.every) as bench:
-            entry: dict[str, Any] = {
-                "splats": len(bench.scene),
-                "train_views": len(bench.train),
-                "test_views": len(bench.test),
-                "uncompressed": bench.evaluator(bench.scene),
-            }
-            results["scenes"][bench.name] = entry
-
-            def note(curves: Any, entry: dict[str, Any] = entry) -> None:
-                entry["curves"] = curves
-                write_json(args.json, results)
-
-            bench.curves(tuple(args.removed), tuple(args.drops), note)
-
-
-# ------------------------------------------------------------------------------------------------ report
-
-
-def _smaller(curves: dict[str, Any], name: str, key: str) -> str:
-    """How many bytes less than the paper's way a way takes at equal PSNR: the mean over its points within both."""
-    parts = []
-    for p in curves[name]:
-        paper = size_at(curves[PAPER], key, p[key])
-        if paper is not None:
-            parts.append(p["bytes"] / paper - 1)
-    return f"{100 * float(np.mean(parts)):+.0f} % ({len(parts)} points)" if parts else ""
-
-
-def _report(args: argparse.Namespace) -> None:
-    results = json.loads(args.results.read_text())
-    for name, entry in results["scenes"].items():
-        if "curves" not in entry:
-            continue
-        curves, ground_truth = entry["curves"], "truth_psnr" in entry["uncompressed"]
-        keys = ["psnr", "truth_psnr"] if ground_truth else ["psnr"]
-        print(
-            f"### {name}: {entry['splats']:,} splats, {entry['train_views']} training and {entry['test_views']} test "
-            f"views, preset {results['preset']}, q = {results['q']:g}, up to {results['steps']} steps, prior "
-            f"{results['prior']:g}, on {results['device']}\n"
+        coded = code_scene(
+            dataclasses.replace(scene, sh=scene.sh[:, :1]), options.parameters, self.train, entropy=CODER
         )
-        print("Bytes against the paper's way at equal PSNR:\n")
-        heads = ["against uncompressed", "against photographs"][: len(keys)]
-        print("| colours | " + " | ".join(heads) + " |\n|---|" + "---|" * len(keys))
-        for way in curves:
-            if way != PAPER:
-                print(f"| {way} | " + " | ".join(_smaller(curves, way, key) for key in keys) + " |")
-        print("\n| removed | colours | MB | AC zeros | " + " | ".join(f"PSNR {h}" for h in heads) + " |")
-        print("|---|---|---|---|" + "---|" * len(keys))
-        for number, part in enumerate(p["removed"] for p in curves[PAPER]):
-            for way, points in curves.items():
-                p = points[number]
-                cells = " | ".join(f"{p[key]:.2f} dB" for key in keys)
-                print(f"| {part:.0%} | {way} | {p['bytes'] / 1e6:.3f} | {p['sparsity']:.1%} | {cells} |")
-        if ground_truth:
-            print(f"\nUncompressed against the photographs: {entry['uncompressed']['truth_psnr']:.2f} dB.")
+        place = np.empty(len(scene), np.int64)
+        place[coded.order] = np.arange(len(scene))
+        geometry = dataclasses.replace(decode(b"".join(coded.pieces)).subset(place), sh=scene.sh)
+        active = active_coefficients(scene.sh, options.parameters.sf_sh) if chosen else None
+        with ColourRefit(self.device, geometry, self.train) as solver:
+            solved = solver.solve(scene.sh, self.targets.get(how, self.targets[""]), refit, active)
+        return dataclasses.replace(scene, sh=solved.sh), time.perf_counter() - began
+
+    def points(self, part: float, options: EncodeOptions, refit: RefitOptions, drops: list[float]) -> dict[str, Any]:
+        """By way: what coding the scene takes without a part of its splats, and what is left of it."""
+        count = max(round((1 - part) * len(self.evaluator.source)), 1)
+        scenes = {}
+        for compact in (False, True):
+            changed = options.changed(prune={"count": count}, compact=compact)
+            scenes[compact] = reduced(self.evaluator.source, self.train, changed, self.device).scene
+        jobs = {
+            name: (compact, how, dataclasses.replace(refit, lam=options.parameters.lam) if how == "lambda" else refit)
+            for name, (compact, how) in WAYS.items()
+            if how != "ground_truth" or how in self.targets
+        }
+        jobs |= {f"joint, drop {drop:g}": (False, "", dataclasses.replace(refit, drop=drop)) for drop in drops}
+        found = {}
+        for name, (compact, how, chosen) in jobs.items():
+            scene, seconds = scenes[compact], 0.0
+            if how is not None:
+                scene, seconds = self.refitted(scene, options, chosen, how, compact)
+            coded = code_scene(scene, options.parameters, self.train, entropy=CODER)
+            figures = self.evaluator(decode(b"".join(coded.pieces)))
+            zeros = ac_sparsity(scene.sh, options.parameters.sf_sh)
+            found[name] = {"bytes": coded.nbytes, "zeros": zeros, "seconds": seconds, **figures}
+            log(f"{self.evaluator.name} {part:.0%} removed, {name}: {coded.nbytes} bytes, {figures['psnr']} dB")
+        return found
+
+
+def smaller(points: list[Any], paper: list[Any], key: str) -> Cell:
+    """Bytes against the paper's way at equal quality, per cent: the mean over the points within both."""
+    if any(p.get(key) is None for p in [*points, *paper]):
+        return None
+    at = [(p["bytes"], size_at(paper, key, p[key])) for p in points]
+    parts = [100 * (size / usual - 1) for size, usual in at if usual is not None]
+    return float(np.mean(parts)) if parts else None
 
 
 def main() -> None:
-    parser, measure, _ = study_parser(__doc__, _measure, _report)
-    measure.add_argument("--removed", nargs="+", type=float, default=REMOVED, help="parts of the splats")
-    measure.add_argument("--drops", nargs="*", type=float, default=DROPS, help="mean squared errors a coefficient")
-    measure.add_argument("--quality", type=float, default=0.5)
-    measure.add_argument("--preset", default="paper")
-    measure.add_argument("--iterations", type=int, default=48, help="of pruning")
-    measure.add_argument("--steps", type=int, default=RefitOptions.steps, help="of the curves' re-fits")
-    measure.add_argument("--prior", type=float, default=RefitOptions.prior)
-    measure.add_argument("--every", type=int, default=1, help="look at every N-th view only")
+    parser = scene_parser(__doc__)
+    parts = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
+    parser.add_argument("--removed", nargs="+", type=float, default=parts, help="parts of the splats")
+    parser.add_argument("--drops", nargs="*", type=float, default=(1e-11, 1e-10, 1e-9), help="errors a coefficient")
+    parser.add_argument("--quality", type=float, default=0.5)
+    parser.add_argument("--preset", default="paper")
+    parser.add_argument("--iterations", type=int, default=48, help="of pruning")
+    parser.add_argument("--steps", type=int, default=RefitOptions.steps, help="of the re-fits")
+    parser.add_argument("--prior", type=float, default=RefitOptions.prior)
+    parser.add_argument("--every", type=int, default=1, help="look at every N-th view only")
     args = parser.parse_args()
-    args.run(args)
+    device = Device(args.device)
+    options = EncodeOptions.for_preset(args.preset, q=args.quality, prune={"iterations": args.iterations})
+    refit = RefitOptions(steps=args.steps, prior=args.prior)
+    results = Results(device.info, args.json)
+    for folder in args.scenes:
+        with (
+            EvaluatedScene(folder, device, args.every) as evaluator,
+            Rasterizer(device, evaluator.source) as rasterizer,
+        ):
+            bench = Bench(folder, evaluator, device, rasterizer, args.every)
+            table = results.table(
+                f"curves_{evaluator.name}", f"Colours of what is left: {evaluator.name}, q = {args.quality:g}",
+                "removed||.0%; colours; size|MB|.3f; AC zeros||.1%; PSNR against uncompressed|dB|.2f; "
+                "PSNR against photographs|dB|.2f; re-fit|s|.1f",
+            )  # fmt: skip
+            curves: dict[str, list[Any]] = {}
+            for part in args.removed:
+                for name, p in bench.points(part, options, refit, args.drops).items():
+                    curves.setdefault(name, []).append(p)
+                    row = p["bytes"] / 1e6, p["zeros"], p["psnr"], p.get("truth_psnr"), p["seconds"]
+                    table.add(part, name, *row)
+            table = results.table(
+                f"smaller_{evaluator.name}", f"Bytes against the paper's way at equal PSNR: {evaluator.name}",
+                "colours; against uncompressed|%|+.1f; against photographs|%|+.1f",
+            )  # fmt: skip
+            for name, points in curves.items():
+                table.add(name, *(smaller(points, curves[PAPER], key) for key in ("psnr", "truth_psnr")))
 
 
 if __name__ == "__main__":

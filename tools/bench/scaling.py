@@ -19,9 +19,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -38,9 +35,9 @@ from potr_cl.opencl.discovery import list_devices
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.workers.host import HostPool
-from tools.bench.memory import reset_peak, resident
 from tools.make.city import City, building_of, write_cameras, write_city
 from tools.results import Column, Results
+from tools.workloads import growth, in_process, plain_parser, resident
 
 #: What is fitted, with what the table calls it, and the numbers that it is fitted with.
 FIGURES = {
@@ -75,20 +72,19 @@ class Point:
     left: int = 0
     stages: dict[str, float] = dataclasses.field(default_factory=dict)
 
+    def of(self, *stages: str) -> float:
+        """Seconds of some stages."""
+        return sum(self.stages.get(stage, 0.0) for stage in stages)
+
     @property
     def pruning(self) -> float:
         """Seconds of preparing views and of pruning."""
-        return self.stages.get("prepare views", 0.0) + self.stages.get("prune", 0.0)
+        return self.of("prepare views", "prune")
 
     @property
     def refit(self) -> float:
         """Seconds of the re-fit."""
-        return self.stages.get("refit", 0.0)
-
-    @property
-    def coding(self) -> float:
-        """Seconds of coding."""
-        return self.stages.get("octree", 0.0) + self.stages.get("quantise and code", 0.0)
+        return self.of("refit")
 
 
 def devices(workers: int) -> list[Device]:
@@ -115,11 +111,15 @@ def measure(point: Point, folder: Path, rounds: int | None, memory: float | None
         taken = max(taken, sum(device.allocated for device in opened))
 
     pool = HostPool(opened) if point.workers > 1 else None
-    reset_peak()
-    began = time.perf_counter()
-    encoded = encode(scene, train_views(cameras), options, progress, opened[0], pool=pool)
+    before, began = resident("VmRSS"), time.perf_counter()
+    encoded: Any = None
+
+    def work() -> None:
+        nonlocal encoded
+        encoded = encode(scene, train_views(cameras), options, progress, opened[0], pool=pool)
+
+    host = before + growth(work) - (taken if opened[0].info.kind == "cpu" else 0)
     seconds = time.perf_counter() - began
-    host = 1e9 * resident("VmHWM") - (taken if opened[0].info.kind == "cpu" else 0)
     return dataclasses.replace(
         point, seconds=seconds, host=host, device=taken, left=len(encoded.order), stages=encoded.seconds
     )
@@ -144,18 +144,16 @@ def exponents(measured: Sequence[Point], figure: str) -> tuple[dict[str, float],
     return dict(zip(varied, found[1:].tolist(), strict=True)), deviation
 
 
-def measured_in_turn(
-    wanted: Sequence[Point], scenes: Sequence[str], size: str, passed: Sequence[str], limit: float | None
-) -> Iterator[Point]:
+def measured_in_turn(wanted: Sequence[Point], scenes: Sequence[str], args: argparse.Namespace) -> Iterator[Point]:
     """Encode each point's city in a process of its own; after so many seconds none is begun any more."""
-    width, height = map(int, size.split("x"))
+    width, height = map(int, args.size.split("x"))
     began = time.monotonic()
     buildings = [building_of(scene) for scene in scenes]
     for splats, alike in groupby(wanted, key=lambda point: point.splats):
         with tempfile.TemporaryDirectory() as name:
             folder, city, written = Path(name), City(buildings, splats), False
             for point in alike:
-                if limit is not None and time.monotonic() - began > limit:
+                if args.limit is not None and time.monotonic() - began > args.limit:
                     return
                 views = city.views(point.views, width, height)
                 if written:
@@ -163,21 +161,11 @@ def measured_in_turn(
                 else:
                     write_city(folder, city, views)
                     written = True
-                yield in_process(point, folder, passed)
-
-
-def in_process(point: Point, folder: Path, passed: Sequence[str]) -> Point:
-    """Encode the city of a folder in a process of its own."""
-    key = [str(getattr(point, number)) for number in NUMBERS]
-    command = [sys.executable, "-m", "tools.bench.scaling", str(folder), "--one", *key, *passed]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise SystemExit(done.stderr.strip() or f"exit code {done.returncode}")
-    return Point(**json.loads(done.stdout.splitlines()[-1]))
+                yield in_process(measure, point, folder, args.iterations, args.memory)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = plain_parser(__doc__)
     parser.add_argument("scenes", nargs="+", metavar="SCENE", help="as of tools.make.city")
     parser.add_argument("--splats", type=float, nargs="+", default=[1e6, 2e6, 4e6], metavar="N")
     parser.add_argument("--views", type=int, nargs="+", default=[50, 100, 200], metavar="N")
@@ -186,47 +174,26 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, metavar="N", help="of pruning; default: the preset's")
     parser.add_argument("--memory", type=float, metavar="GB", help="as encode's")
     parser.add_argument("--limit", type=float, metavar="S", help="begin no encode after so many seconds")
-    parser.add_argument("--json", type=Path, metavar="FILE")
-    parser.add_argument("--one", type=int, nargs=3, help=argparse.SUPPRESS)
     args = parser.parse_args()
-    if args.one:
-        found = measure(Point(*args.one), Path(args.scenes[0]), args.iterations, args.memory)
-        print(json.dumps(dataclasses.asdict(found)))
-        return
-    passed: list[str] = []
-    for name in ("iterations", "memory"):
-        value: Any = getattr(args, name)
-        passed += [] if value is None else [f"--{name}", str(value)]
     results = Results(Device().info, args.json)
     table = results.table(
-        "points",
-        f"Encodes of cities, views of {args.size}, preset best without views between",
-        Column("splats", "", ",.0f"),
-        Column("views", "", ".0f"),
-        Column("workers", "", ".0f"),
-        Column("time", "s", ".1f"),
-        Column("pruning", "s", ".1f"),
-        Column("re-fit", "s", ".1f"),
-        Column("coding", "s", ".1f"),
-        Column("host peak", "GB", ".2f"),
-        Column("device peak", "GB", ".2f"),
-        Column("splats left", "", ",.0f"),
-    )
+        "points", f"Encodes of cities, views of {args.size}, preset best without views between",
+        "splats||,.0f; views||.0f; workers||.0f; time|s|.1f; pruning|s|.1f; re-fit|s|.1f; coding|s|.1f; "
+        "host peak|GB|.2f; device peak|GB|.2f; splats left||,.0f",
+    )  # fmt: skip
     measured = []
     wanted = points([int(n) for n in args.splats], args.views, args.workers)
-    for found in measured_in_turn(wanted, args.scenes, args.size, passed, args.limit):
+    for found in measured_in_turn(wanted, args.scenes, args):
         measured.append(found)
         table.add(
-            found.splats, found.views, found.workers, found.seconds, found.pruning, found.refit, found.coding,
+            found.splats, found.views, found.workers, found.seconds, found.pruning, found.refit,
+            found.of("octree", "quantise and code"),
             found.host / 1e9, found.device / 1e9, found.left,
         )  # fmt: skip
     fitted = results.table(
-        "exponents",
-        "Exponents that fit them",
-        Column("figure"),
-        *(Column(name, "", ".2f") for name in NUMBERS),
-        Column("largest deviation", "%", ".0f"),
-    )
+        "exponents", "Exponents that fit them",
+        "figure", *(Column(name, format=".2f") for name in NUMBERS), "largest deviation|%|.0f",
+    )  # fmt: skip
     for figure, called in FIGURES.items():
         powers, deviation = exponents(measured, figure)
         fitted.add(called, *(powers.get(name) for name in NUMBERS), 100 * deviation)

@@ -12,10 +12,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import sys
 import time
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -29,8 +27,8 @@ from potr_cl.pipeline.encoded import Encoded
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.placement.virtual import place_cameras
 from potr_cl.quality.metrics import psnr
-from tools.results import Column, Results
-from tools.workloads import pictures, scene_parser
+from tools.results import Results
+from tools.workloads import log, pictures, scene_parser
 
 _FILES = ("point_cloud.ply", "meta.json", "lod-meta.json")
 
@@ -75,18 +73,8 @@ def main() -> None:
     table = results.table(
         "places",
         f"Without cameras, preset best, q = {args.q:g}",
-        Column("scene"),
-        Column("splats", format=","),
-        Column("views"),
-        Column("placed in", "s", ".1f"),
-        Column("resolved", "%", ".1f"),
-        Column("encoded in", "s", ".1f"),
-        Column("bytes", format=","),
-        Column("PSNR told", "dB", ".1f"),
-        Column("worst told", "dB", ".1f"),
-        Column("where people stand", "dB", ".1f"),
-        Column("worst there", "dB", ".1f"),
-        Column("bytes against true cameras", "%", "+.1f"),
+        "scene; splats||,; views; placed in|s|.1f; resolved|%|.1f; encoded in|s|.1f; bytes||,; PSNR told|dB|.1f; "
+        "worst told|dB|.1f; where people stand|dB|.1f; worst there|dB|.1f; bytes against true cameras|%|+.1f",
     )
     best = EncodeOptions.for_preset("best")
     for folder in args.scenes:
@@ -106,22 +94,14 @@ def main() -> None:
             here, there = told(encoded), people(encoded) if people is not None else None
             unseen = encoded.unseen
             more = None
-            if guarded and people is not None and there is not None and any(c.split == "train" for c in cameras):
+            if guarded and people is not None and there is not None and train_views(cameras):
                 more = _against_true(device, scene, cameras, placed, args.q, people, there)
             table.add(
-                _name(folder) + ("" if guarded else ", without the guard"),
-                len(scene),
-                f"{len(train_views(placed))} of {placed[0].width}",
-                placing,
-                100 * (1 - unseen.splats / unseen.of) if guarded and unseen is not None else None,
-                seconds,
-                encoded.nbytes,
-                here.mean,
-                here.worst,
-                None if there is None else there.mean,
-                None if there is None else there.worst,
-                more,
-            )
+                folder.name + ("" if guarded else ", without the guard"), len(scene),
+                f"{len(train_views(placed))} of {placed[0].width}", placing,
+                100 * (1 - unseen.splats / unseen.of) if guarded and unseen is not None else None, seconds,
+                encoded.nbytes, here.mean, here.worst, *((there.mean, there.worst) if there else (None, None)), more,
+            )  # fmt: skip
 
 
 def _against_true(
@@ -134,15 +114,10 @@ def _against_true(
     there: Judged,
 ) -> float:
     """Bytes without cameras, in per cent more than with the true ones at their PSNR."""
-    best = EncodeOptions.for_preset("best")
-    true = people(encode(scene, train_views(cameras), dataclasses.replace(best, q=q), device=device))
-    further = people(encode(scene, placed, dataclasses.replace(best, q=q + 0.1), device=device))
-    print(f"  with the true cameras: {true}", file=sys.stderr, flush=True)
+    true = people(encode(scene, train_views(cameras), EncodeOptions.for_preset("best", q=q), device=device))
+    further = people(encode(scene, placed, EncodeOptions.for_preset("best", q=q + 0.1), device=device))
+    log(f"with the true cameras: {true}")
     return 100 * (bytes_at((there, further), true.mean) / true.nbytes - 1)
-
-
-def _name(folder: Path) -> str:
-    return folder.name
 
 
 if __name__ == "__main__":

@@ -97,9 +97,8 @@ def load(folder: Path | None = None) -> Results:
     for path in sorted((folder or RESULTS).glob("*.json")):
         for name, raw in json.loads(path.read_text("utf-8")).items():
             try:
-                columns = tuple(Column(**{k: v for k, v in each.items() if k != "default"}) for each in raw["columns"])
+                columns = tuple(Column(**each) for each in raw["columns"])
                 rows, command = tuple(map(tuple, raw["rows"])), tuple(raw["command"])
-                raw = {key: value for key, value in raw.items() if key not in ("state", "options")}
                 found[f"{path.stem}/{name}"] = Result(**{**raw, "columns": columns, "rows": rows, "command": command})
             except (TypeError, KeyError) as error:
                 raise ResultError(f"{path.name}, '{name}': {error}") from error

@@ -28,7 +28,7 @@ from potr_cl.model.camera import Camera, camera_centres, focus, test_views, trai
 from potr_cl.model.scene import Scene
 from tests.reference.captures import looking
 from tests.reference.frames import moved
-from tools.cameras_json import entry
+from tools.workloads import camera_entry
 
 F64 = NDArray[np.float64]
 
@@ -125,7 +125,7 @@ class City:
             there = self._place((copy + self.copies // 2 + (split == "test")) % self.copies)
             found.append(looking(here, there))
         return [
-            _of_size(dataclasses.replace(camera, name=f"{split}_{number:04}", split=split), width, height)
+            of_size(dataclasses.replace(camera, name=f"{split}_{number:04}", split=split), width, height)
             for number, camera in enumerate(found)
         ]
 
@@ -149,7 +149,7 @@ def write_city(folder: Path, city: City, cameras: Sequence[Camera]) -> None:
 
 def write_cameras(folder: Path, cameras: Sequence[Camera]) -> None:
     """Write cameras.json alone."""
-    (folder / "cameras.json").write_text(json.dumps([entry(number, view) for number, view in enumerate(cameras)]))
+    (folder / "cameras.json").write_text(json.dumps([camera_entry(n, view) for n, view in enumerate(cameras)]))
 
 
 def _yaw(turn: int) -> F64:
@@ -163,7 +163,7 @@ def _moved_camera(camera: Camera, axes: F64, scale: float, shift: F64) -> Camera
     return dataclasses.replace(camera, rotation=rotation, translation=-rotation @ centre, image_path=None, lens=None)
 
 
-def _of_size(camera: Camera, width: int, height: int) -> Camera:
+def of_size(camera: Camera, width: int, height: int) -> Camera:
     """The same field from left to right, with square pixels and the principal point in the middle."""
     focal = camera.fx * width / camera.width
     return dataclasses.replace(camera, width=width, height=height, fx=focal, fy=focal, cx=width / 2, cy=height / 2)

@@ -21,7 +21,7 @@ def cli_page() -> str:
         "# Command line",
         NOTICE,
         "Every command is called as `python -m potr_cl COMMAND`, or as `potr-cl COMMAND` once the package is "
-        "installed. The [README](../README.md#usage) shows what they are for.",
+        "installed. [Usage](usage.md) shows what they are for.",
         "Exit codes: 0 success; 1 bad data, a device that fails, or a target that no quality reaches; 2 wrong usage; "
         "130 interrupted, 143 terminated, 129 the terminal was closed. An output file appears only when it is "
         "whole, and never in the place of an input. Errors are one line on standard error.",

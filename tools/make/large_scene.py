@@ -1,27 +1,34 @@
 """A scene of any size with the statistics of a real one: splats of a trained scene, drawn again with jitter.
 
-    python -m tools.make.large_scene SPLATS -o OUT.ply [--like SCENE.ply] [--split] [--cameras OUT.json] [options]
+    python -m tools.make.large_scene SPLATS -o OUT.ply [--like SCENE.ply] [--split]
 
-The views are those of the cameras.json beside the scene, drawn again with jitter too.
+tools.make.city makes large scenes that have views, too.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from potr_cl.formats import load_cameras, load_scene
+from potr_cl.formats import load_scene
 from potr_cl.formats.scenes import ply
-from potr_cl.model.camera import Camera, camera_centres
 from potr_cl.model.scene import Scene
+from tools.workloads import SCENES, TEST_DATA
 
-DEFAULT_SCENE = Path(__file__).parents[3] / "shared" / "scenes" / "plush" / "point_cloud.ply"
-EXCERPT = Path(__file__).parents[2] / "tests" / "data" / "plush_excerpt.ply"
+_EXCERPT = TEST_DATA / "plush_excerpt.ply"
+
+
+def default_scene() -> Path:
+    """Plush, or the excerpt of it where that is not there."""
+    whole = SCENES / "plush" / "point_cloud.ply"
+    return whole if whole.exists() else _EXCERPT
+
+
+def cameras_beside(scene: Path) -> Path:
+    """The cameras of a scene's file."""
+    return scene.with_name("plush_excerpt_cameras.json" if scene == _EXCERPT else "cameras.json")
 
 
 def large_scene(like: Scene, splats: int, seed: int = 0, split: bool = False) -> Scene:
@@ -42,57 +49,13 @@ def large_scene(like: Scene, splats: int, seed: int = 0, split: bool = False) ->
     return Scene(means, log_scales, scene.quaternions, scene.opacity_logits, sh)
 
 
-def more_views(like: Sequence[Camera], views: int, width: int, height: int, seed: int = 0) -> list[dict[str, Any]]:
-    """The entries of a cameras.json: ``views`` training views with the field of view and the whereabouts of ``like``.
-
-    Each is one of ``like``, moved and turned a little, so that no two are the same.
-    """
-    rng = np.random.default_rng(seed)
-    spread = camera_centres(like).std(axis=0).mean()
-    entries = []
-    for number in range(views):
-        camera = like[number * len(like) // views]
-        angles = rng.normal(0, 0.02, 3)
-        skew = np.array([[0, -angles[2], angles[1]], [angles[2], 0, -angles[0]], [-angles[1], angles[0], 0]])
-        turn = np.linalg.qr(np.eye(3) + skew)[0]
-        turn *= np.sign(np.diag(turn))
-        camera_centre = camera_centres([camera])[0] + rng.normal(0, 0.02 * spread, 3)
-        entries.append(
-            {
-                "id": number,
-                "img_name": f"view_{number:04}",
-                "width": width,
-                "height": height,
-                "position": camera_centre.tolist(),
-                "rotation": (camera.rotation.T @ turn).tolist(),
-                "fx": camera.fx * width / camera.width,
-                "fy": camera.fx * width / camera.width,
-                "split": "train",
-            }
-        )
-    return entries
-
-
-def cameras_beside(scene: Path) -> Path:
-    """The cameras of a scene's file."""
-    return scene.with_name("plush_excerpt_cameras.json" if scene.resolve() == EXCERPT.resolve() else "cameras.json")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("splats", type=int)
     parser.add_argument("-o", "--output", type=Path, required=True)
-    parser.add_argument("--like", type=Path, default=DEFAULT_SCENE if DEFAULT_SCENE.exists() else EXCERPT)
+    parser.add_argument("--like", type=Path, default=default_scene())
     parser.add_argument("--split", action="store_true", help="smaller splats, as many cover what one did")
-    parser.add_argument("--cameras", type=Path, metavar="OUT.json")
-    parser.add_argument("--views", type=int, default=200, metavar="N")
-    parser.add_argument("--size", default="1600x1064", metavar="WxH")
     args = parser.parse_args()
-    if args.cameras is not None:
-        width, height = map(int, args.size.split("x"))
-        args.cameras.write_text(
-            json.dumps(more_views(load_cameras(cameras_beside(args.like)), args.views, width, height))
-        )
     ply.save(args.output, large_scene(load_scene(args.like), args.splats, split=args.split))
 
 

@@ -1,9 +1,10 @@
-"""Make tests/data/other_tools: a few splats in the formats of other tools, and how splat-transform reads each.
+"""Make tests/data/foreign, the excerpt in splat-transform's formats, and tests/data/other_tools: some splats in those
+of more tools, and how splat-transform reads each.
 
     python -m tools.make.other_tools PLUSH.ply --modules FOLDER [--node NODE] [--python PYTHON]
 
 FOLDER is where npm has installed @playcanvas/splat-transform (it wants Node 22), @mkkellogg/gaussian-splats-3d, three
-and spz-js. PYTHON has gaussforge, gsply and ply2splat. Everything in the folder is made anew.
+and spz-js. PYTHON has gaussforge, gsply and ply2splat. All is made anew.
 """
 
 from __future__ import annotations
@@ -18,9 +19,20 @@ from pathlib import Path
 import numpy as np
 
 from potr_cl.formats.scenes import ply
+from tools.workloads import TEST_DATA
 
-_DATA = Path(__file__).resolve().parents[2] / "tests" / "data" / "other_tools"
+_DATA = TEST_DATA.resolve() / "other_tools"
 _SPLATS = 150
+#: Of tests/data/foreign: names, and what splat-transform is told besides.
+_FOREIGN: dict[str, tuple[str, ...]] = {
+    "version_3.spz": ("--spz-version", "3"),
+    "version_4.spz": (),
+    "degree_1.spz": ("--filter-harmonics", "1"),
+    "degree_0.sog": ("--filter-harmonics", "0"),
+    "degree_3.sog": (),
+    "degree_3.compressed.ply": (),
+    "degree_0.compressed.ply": ("--filter-harmonics", "0"),
+}
 _KSPLATS = {"GaussianSplats3D_level_0.ksplat": (0, 2), "GaussianSplats3D_level_1.ksplat": (1, 1)}
 _KSPLATS |= {"GaussianSplats3D_level_2.ksplat": (2, 2)}
 #: Run by PYTHON in the folder, with the PLY's path.
@@ -64,6 +76,8 @@ def main() -> None:
         command = [args.node, cli, "-q", "-w", "-g", "cpu", *arguments]
         subprocess.run(list(map(str, command)), check=True)
 
+    for name, options in _FOREIGN.items():  # those before the output apply to the splats, others may stand anywhere
+        transform(TEST_DATA / "plush_excerpt.ply", *options, TEST_DATA / "foreign" / name)
     for name in ("splat-transform.splat", "splat-transform.glb", "splat-transform_sog/meta.json"):
         transform(source, _DATA / name)
     with tempfile.TemporaryDirectory() as scratch:

@@ -23,10 +23,12 @@ from numpy.typing import NDArray
 
 from potr_cl.formats import load_scene
 from potr_cl.model.camera import Camera
+from potr_cl.model.quaternions import quaternions_of
 from potr_cl.model.scene import Scene, joined
 from tests.reference.captures import looking
 from tests.reference.frames import moved
-from tools.cameras_json import entry
+from tools.make.city import of_size
+from tools.workloads import camera_entry
 
 F64 = NDArray[np.float64]
 
@@ -182,13 +184,8 @@ def _splats(means: F64, scales: F64, quaternions: F64, opacities: F64, colours: 
     logits = np.log(opacities / (1 - opacities))
     sh = ((colours - 0.5) / _SH0)[:, None]
     single = np.float32
-    return Scene(
-        means.astype(single),
-        np.log(scales).astype(single),
-        quaternions.astype(single),
-        logits.astype(single),
-        sh.astype(single),
-    )
+    shapes = means.astype(single), np.log(scales).astype(single), quaternions.astype(single)
+    return Scene(*shapes, logits.astype(single), sh.astype(single))
 
 
 def _panel(rng: np.random.Generator, corner: F64, along: F64, across: F64, seed: int, spacing: float) -> Scene:
@@ -203,16 +200,12 @@ def _panel(rng: np.random.Generator, corner: F64, along: F64, across: F64, seed:
     scales = np.column_stack([sizes, np.full(count, 0.1 * spacing)])
     colours = _textured(place * lengths, seed) + rng.normal(0, 0.03, (count, 3))
     return _splats(
-        means, scales, np.tile(_quaternion(axes), (count, 1)), rng.beta(4, 1.2, count).clip(0.02, 0.99), colours
+        means,
+        scales,
+        np.tile(quaternions_of(axes.T[None]), (count, 1)),
+        rng.beta(4, 1.2, count).clip(0.02, 0.99),
+        colours,
     )
-
-
-def _quaternion(axes: F64) -> F64:
-    """Of the rotation that has these axes for columns, w first."""
-    from potr_cl.model.quaternions import quaternions_of
-
-    found: F64 = quaternions_of(axes.T[None])[0]
-    return found
 
 
 def _cloud(rng: np.random.Generator, middle: F64, radius: float, colour: F64, count: int) -> Scene:
@@ -267,7 +260,9 @@ def build(kind: str, things: Sequence[Scene], splats: int, views: int, degree: i
     coefficients = (degree + 1) ** 2
     parts = [_of_degree(part, coefficients) for part in parts]
     cameras = [
-        dataclasses.replace(_sized(looking(at, ahead, name=f"{kind}_{number:03d}", wide=0.75)), split="test")
+        dataclasses.replace(
+            of_size(looking(at, ahead, name=f"{kind}_{number:03d}", wide=0.75), 1080, 720), split="test"
+        )
         for number, (at, ahead) in enumerate(place.spots)
     ]
     return joined(parts), cameras
@@ -278,13 +273,6 @@ def _of_degree(scene: Scene, coefficients: int) -> Scene:
     shared = min(coefficients, scene.sh.shape[1])
     sh[:, :shared] = scene.sh[:, :shared]
     return dataclasses.replace(scene, sh=sh)
-
-
-def _sized(camera: Camera, width: int = 1080, height: int = 720) -> Camera:
-    factor = width / camera.width
-    return dataclasses.replace(
-        camera, width=width, height=height, fx=camera.fx * factor, fy=camera.fy * factor, cx=width / 2, cy=height / 2
-    )
 
 
 def main() -> None:
@@ -301,7 +289,7 @@ def main() -> None:
     )
     args.output.mkdir(parents=True, exist_ok=True)
     scene.save(args.output / "point_cloud.ply")
-    (args.output / "cameras.json").write_text(json.dumps([entry(n, camera) for n, camera in enumerate(cameras)]))
+    (args.output / "cameras.json").write_text(json.dumps([camera_entry(n, camera) for n, camera in enumerate(cameras)]))
     print(f"{len(scene):,} splats and {len(cameras)} views in {args.output}")
 
 

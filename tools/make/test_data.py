@@ -22,7 +22,7 @@ from potr_cl.formats import load_cameras
 from potr_cl.formats.scenes import ply
 from potr_cl.model.camera import Camera, test_views, train_views
 from potr_cl.model.scene import Scene
-from tools.cameras_json import entry
+from tools.workloads import camera_entry
 
 _DATA = Path(__file__).resolve().parents[2] / "tests" / "data"
 _SPLATS = 1500
@@ -41,7 +41,7 @@ def main() -> None:
     _DATA.mkdir(exist_ok=True)
     excerpt = _splats(source / "point_cloud.ply")
     views = _views_of_the_excerpt(load_cameras(source / "cameras.json"), excerpt)
-    _write_json(_DATA / "plush_excerpt_cameras.json", [entry(number, view) for number, view in enumerate(views)])
+    _write_json(_DATA / "plush_excerpt_cameras.json", [camera_entry(number, view) for number, view in enumerate(views)])
     _write_transforms(views)
     _views_of_the_whole(source)
     print(f"{sum(f.stat().st_size for f in _DATA.rglob('*') if f.is_file())} bytes in {_DATA}")

@@ -8,35 +8,28 @@ if one is not.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 from pathlib import Path
 
-from tools.results import Column, Results
+from tools.results import Results
 from tools.stress.hostile.bomb_files import BOMBS
 from tools.stress.hostile.judge import Verdict
 from tools.stress.hostile.supervisor import read_again
 from tools.stress.hostile.worker import Job, keep
+from tools.workloads import plain_parser
 
 _MIB = 1 << 20
-_COLUMNS = (
-    Column("format"),
-    Column("bomb"),
-    Column("file", "bytes", ","),
-    Column("outcome"),
-    Column("time", "s of processor time", ".2f"),
-    Column("memory", "MiB", ".1f"),
-)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = plain_parser(__doc__)
     parser.add_argument("--format", action="append", choices=list(BOMBS), dest="formats", help="default: all")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="keep the figures")
     args = parser.parse_args()
-    results = Results(None, args.json)
-    table = results.table("bombs", "Files that unpack to far more than they are, or claim to", *_COLUMNS)
+    table = Results(None, args.json).table(
+        "bombs", "Files that unpack to far more than they are, or claim to",
+        "format; bomb; file|bytes|,; outcome; time|s of processor time|.2f; memory|MiB|.1f",
+    )  # fmt: skip
     wrong = []
     for form in args.formats or BOMBS:
         with tempfile.TemporaryDirectory() as scratch:

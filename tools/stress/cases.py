@@ -72,7 +72,8 @@ class RefitCase:
 
 def known_cases() -> Iterator[Case]:
     """What scenes and users come up with at their worst."""
-    near = np.float32(INRIA.near)
+    near, ahead = np.float32(INRIA.near), straight_camera()
+    colours = np.random.default_rng(1).uniform(0, 1, (5000, 3))
     for label, depth in (
         ("in the camera centre", 0.0),
         ("behind", -0.2),
@@ -80,85 +81,67 @@ def known_cases() -> Iterator[Case]:
         ("on the near plane", near),
         ("a last digit behind the near plane", np.nextafter(near, np.float32(1))),
     ):
-        yield Case(f"one splat {label}", plain_splats([0.01, 0.01, depth], sigma=0.02, logit=3), straight_camera())
-    yield Case(
-        "close to the camera centre and to the side",
-        plain_splats([[3, 2, 0.25], [-0.5, 0.1, 0.21], [0.3, -4, 0.3]], sigma=0.3, logit=2),
-        straight_camera(),
-    )
+        yield Case(f"one splat {label}", plain_splats([0.01, 0.01, depth], sigma=0.02, logit=3), ahead)
+    aside = [[3, 2, 0.25], [-0.5, 0.1, 0.21], [0.3, -4, 0.3]]
+    yield Case("close to the camera centre and to the side", plain_splats(aside, sigma=0.3, logit=2), ahead)
     for sigma in (1e-30, 1e-6, 10, 1e3, 1e6, 1e20, 1e38):
-        yield Case(
-            f"sigma {sigma:g}", plain_splats([[0, 0, 2], [0.3, 0.2, 3]], sigma=sigma, logit=1), straight_camera()
-        )
-    rng = np.random.default_rng(0)
-    needles = random_splats(40, 0, seed=9)
-    for label, thin, long in (("1 : 1e5", -9.0, 3.0), ("1 : 1e9, flat", -20.0, 2.0), ("1 : 1e13", -20.0, 10.0)):
-        log_scales = np.tile(np.array([thin, thin if "flat" not in label else long, long], np.float32), (40, 1))
-        logits = rng.normal(2, 1, 40).astype(np.float32)
+        yield Case(f"sigma {sigma:g}", plain_splats([[0, 0, 2], [0.3, 0.2, 3]], sigma=sigma, logit=1), ahead)
+    needles, logits = random_splats(40, 0, seed=9), np.random.default_rng(0).normal(2, 1, 40).astype(np.float32)
+    for label, scales in (
+        ("1 : 1e5", (-9, -9, 3)),
+        ("1 : 1e9, flat", (-20, 2, 2)),
+        ("1 : 1e13", (-20, -20, 10)),
+    ):
+        log_scales = np.tile(np.array(scales, np.float32), (40, 1))
         scene = dataclasses.replace(needles, log_scales=log_scales, opacity_logits=logits)
         yield Case(f"needles {label}", scene, tilted_camera(9, 80, 60))
     for logit in (-200.0, -50.0, -5.6, -5.5373, -5.5, 0.0, 16.118095, 50.0, 200.0):
+        two = plain_splats([[0.01, 0.02, 2], [0, 0, 3]], sigma=0.3, logit=logit)
         for rules in (GSPLAT, INRIA):
-            name = f"opacity logit {logit:g}, alpha cap {rules.alpha_cap:g}"
-            yield Case(
-                name, plain_splats([[0.01, 0.02, 2], [0, 0, 3]], sigma=0.3, logit=logit), straight_camera(), rules
-            )
+            yield Case(f"opacity logit {logit:g}, alpha cap {rules.alpha_cap:g}", two, ahead, rules)
     for length in (1e-12, 1e-3, 1e6, 1e18):
         scene = random_splats(30, 0, seed=11)
         unit = scene.quaternions / np.linalg.norm(scene.quaternions, axis=1, keepdims=True)
         scene = dataclasses.replace(scene, quaternions=unit * np.float32(length))
         yield Case(f"quaternions {length:g} long", scene, tilted_camera(11, 40, 40))
-    rng = np.random.default_rng(1)
+    rng = np.random.default_rng(2)
     layers = np.zeros((5000, 3))
     layers[:, 2] = rng.uniform(1, 5, 5000)
-    colours = rng.uniform(0, 1, (5000, 3))
     yield Case("5000 layers of alpha 0.0055", plain_splats(layers, 5, -5.2, colours), straight_camera(4, 4))
     for in_front in (0, 10, 100, 300):
         yield layered(in_front)
-    yield Case(
-        "40 identical splats", plain_splats(np.tile([0.0, 0, 2], (40, 1)), 0.2, -2, colours[:40]), straight_camera()
-    )
+    alike = plain_splats(np.tile([0.0, 0, 2], (40, 1)), 0.2, -2, colours[:40])
+    yield Case("40 identical splats", alike, ahead)
     grid = np.stack(np.meshgrid(np.linspace(-1, 1, 12), np.linspace(-1, 1, 12), [2.0]), axis=-1).reshape(-1, 3)
-    yield Case("144 splats of one depth", plain_splats(grid, 0.2, -1, colours[:144]), straight_camera())
-    yield Case(
-        "144 splats of one depth, tilted",
-        plain_splats(grid - [0, 0, 2], 0.2, -1, colours[:144]),
-        tilted_camera(3, 50, 40),
-    )
+    yield Case("144 splats of one depth", plain_splats(grid, 0.2, -1, colours[:144]), ahead)
+    tilted = plain_splats(grid - [0, 0, 2], 0.2, -1, colours[:144])
+    yield Case("144 splats of one depth, tilted", tilted, tilted_camera(3, 50, 40))
     for width, height in ((1, 1), (1, 40), (16384, 4), (4, 16384), (17, 16)):
         longest = float(max(width, height))
-        view = straight_camera(width, height, focal=longest, fy=longest)
-        rng = np.random.default_rng(width)
-        n = 30 if longest < 1000 else 6
+        rng, n = np.random.default_rng(width), 30 if longest < 1000 else 6
         places = np.ones((n, 3))
         places[:, :2] = rng.uniform(-0.6, 0.6, (n, 2)) * (width, height) / longest
-        spread = rng.uniform(1e-3, 3e-2, (n, 3))
-        yield Case(f"{width} x {height} pixels", plain_splats(places, spread, rng.normal(0, 2, n), colours[:n]), view)
+        scene = plain_splats(places, rng.uniform(1e-3, 3e-2, (n, 3)), rng.normal(0, 2, n), colours[:n])
+        view = straight_camera(width, height, focal=longest, fy=longest)
+        yield Case(f"{width} x {height} pixels", scene, view)
     for offset in (1e3, 1e5, 1e6):
         scene = random_splats(100, 3, seed=12)
         scene = dataclasses.replace(scene, means=scene.means + np.array([offset, 0, 0], np.float32))
         yield Case(f"{offset:g} from the origin", scene, tilted_camera(12, 60, 50, offset))
     rng = np.random.default_rng(4)
     far = plain_splats(rng.uniform(-1e6, 1e6, (500, 3)), np.exp(rng.normal(5, 5, (500, 3))), 1, colours[:500])
-    yield Case("coordinates up to 1e6", far, straight_camera())
+    yield Case("coordinates up to 1e6", far, ahead)
     for brightness in (1e3, 1e10, 1e30):
-        yield Case(
-            f"colours of {brightness:g}", plain_splats(grid, 0.2, -1, brightness * colours[:144]), straight_camera()
-        )
+        yield Case(f"colours of {brightness:g}", plain_splats(grid, 0.2, -1, brightness * colours[:144]), ahead)
     for label, mean in (("behind", [0, 0, -3]), ("beside", [100, 0, 1]), ("in the camera centre", [0, 0, 0])):
-        yield Case(f"a view that sees nothing: {label}", plain_splats(mean), straight_camera())
+        yield Case(f"a view that sees nothing: {label}", plain_splats(mean), ahead)
     for degree, rules in itertools.product(range(4), (INRIA, GSPLAT)):
         name = f"100 random splats of degree {degree}, alpha cap {rules.alpha_cap:g}"
         yield Case(name, random_splats(100, degree, seed=degree), tilted_camera(degree, 45, 37), rules)
     for seed in range(3):
         yield Case("extremes of every parameter", extremes(300), tilted_camera(seed, 40, 30))
-    n = 5_000
-    means = np.concatenate([rng.uniform(-0.05, 0.05, (n, 2)), rng.uniform(1, 2, (n, 1))], axis=1)
-    yield Case(
-        "a tile with 5000 intersections",
-        plain_splats(means, 1e-3, -2, rng.uniform(0, 1, (n, 3))),
-        straight_camera(4, 4),
-    )
+    means = np.concatenate([rng.uniform(-0.05, 0.05, (5000, 2)), rng.uniform(1, 2, (5000, 1))], axis=1)
+    yield Case("a tile with 5000 intersections", plain_splats(means, 1e-3, -2, colours), straight_camera(4, 4))
 
 
 def layered(in_front: int) -> Case:

@@ -15,11 +15,11 @@ from PIL import Image
 from potr_cl.api.pictures import render
 from potr_cl.errors import DataError
 from potr_cl.formats import load_scene, save_scene
-from potr_cl.model.camera import Camera
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from tests.reference.scenes import ring_of_cameras, visible_scene
 from tools.results import ROOT
+from tools.workloads import camera_entry
 
 SPLATS, VIEWS, SIDE = 400, 6, 48
 
@@ -117,16 +117,9 @@ def prepare(folder: Path) -> dict[str, str]:
     save_scene(inputs / "scene.ply", scene)
     coded = encode(scene, None, EncodeOptions().changed(prune=False, compact=False, refit=False))
     (inputs / "scene.potr").write_bytes(b"".join(coded.pieces))
-    (inputs / "cameras.json").write_text(json.dumps([_entry(camera) for camera in cameras]))
+    (inputs / "cameras.json").write_text(json.dumps([camera_entry(n, view) for n, view in enumerate(cameras)]))
     render(scene, cameras, output=inputs / "photos")
     return hashes(inputs)
-
-
-def _entry(camera: Camera) -> dict[str, object]:
-    return {
-        "img_name": camera.name, "width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy,
-        "rotation": camera.rotation.T.tolist(), "position": camera.centre.tolist(), "split": camera.split,
-    }  # fmt: skip
 
 
 def environment(folder: Path, **more: str) -> dict[str, str]:

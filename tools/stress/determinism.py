@@ -8,22 +8,16 @@ two seconds later: what a file would hold of any of that shows. Reports (.html) 
 
 from __future__ import annotations
 
-import argparse
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
-from tools.results import Column, Results
+from tools.results import Results
 from tools.stress.commands import Command, commands, environment, hashes, prepare
+from tools.workloads import plain_parser
 
-_COLUMNS = (
-    Column("command"),
-    Column("files"),
-    Column("bytes", format=","),
-    Column("same bytes"),
-)
 _CIRCUMSTANCES = (
     {"PYTHONHASHSEED": "1", "TZ": "UTC", "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"},
     {"PYTHONHASHSEED": "2", "TZ": "Asia/Tokyo", "OMP_NUM_THREADS": "2", "NUMBA_NUM_THREADS": "2"},
@@ -31,15 +25,13 @@ _CIRCUMSTANCES = (
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--command", action="append", dest="names", metavar="NAME", help="default: all")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="keep the figures")
+    parser = plain_parser(__doc__)
+    there = [each for each in commands() if each.repeats]
+    parser.add_argument("--command", action="append", choices=[each.name for each in there], dest="names")
     args = parser.parse_args()
-    chosen = [each for each in commands() if each.repeats and (args.names is None or each.name in args.names)]
-    if not chosen:
-        parser.error(f"no such command; there are: {'; '.join(each.name for each in commands() if each.repeats)}")
-    results = Results(None, args.json)
-    table = results.table("determinism", "Every command twice, in other circumstances", *_COLUMNS)
+    chosen = [each for each in there if args.names is None or each.name in args.names]
+    columns = "command; files; bytes||,; same bytes"
+    table = Results(None, args.json).table("determinism", "Every command twice, in other circumstances", columns)
     different = []
     with tempfile.TemporaryDirectory() as scratch:
         runs, sizes = [], {}

@@ -32,10 +32,7 @@ WHAT = {
     "fit: steps": "what steps of the fit add to the held-out error, relative; or a parameter that is not finite",
     "fit: settling": "a value that is not finite after coefficients were chosen, geometry rounded and the rest fitted",
     "surely seen": "splats of which a device and float64 say that views see them and that none does",
-    "same bits: picked splats": "pixels of splats drawn out of a larger scene, and of a scene of their own",
-    "same bits: view by view": "removal effects measured view by view, and with all splats for all views",
     "same bits: to a device": "values of a file decoded into a device's memory, and on the host",
-    "same bits: slices": "coefficients of a re-fit in slices, and in one piece",
     "ridge": "weighted colour error above the optimum, relative to the largest coefficient or 1",
     "re-fit: optimum": "colour error in the pictures above the optimum, or above where the solver had to stop",
     "re-fit: loss": "how much more squared error than the start has, relative",
@@ -46,8 +43,6 @@ PROMISES = ("ridge", "re-fit: optimum", "re-fit: loss")
 NONE_OF_IT = tuple(
     name for name in WHAT if name.startswith(("same bits: ", "surely seen", "fit: steps", "fit: settling"))
 )
-#: Measures of roads that GPU kernels alone take.
-GPU_ONLY = ("same bits: picked splats", "same bits: view by view")
 
 
 @dataclasses.dataclass

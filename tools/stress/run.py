@@ -13,28 +13,21 @@ problem's condition; an error of more than LIMIT times that is the kernel's own,
 made as small as it goes. Pixels within rounding of a threshold (alpha 1/255, the end of a pixel) or of a tie in depth
 are left out where a flip would say nothing; what may not happen anywhere is a value that is not finite.
 
-Every device and kernel family runs in a process of its own. Prints Markdown; --json writes the inputs too, and
---from reads it again.
+Every device and kernel family runs in a process of its own.
 """
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import json
 import os
-import subprocess
-import sys
-import tempfile
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 from hypothesis import strategies as st
 
 from potr_cl.opencl.device import Device
-from potr_cl.opencl.discovery import DeviceInfo, list_devices
-from tools.results import circumstances
+from potr_cl.opencl.discovery import Family, list_devices
+from tools.results import Column, Results
 from tools.stress.cases import (
     Case,
     RefitCase,
@@ -47,7 +40,6 @@ from tools.stress.cases import (
     small_scenes,
 )
 from tools.stress.measures import (
-    GPU_ONLY,
     LIMIT,
     PROMISES,
     WHAT,
@@ -58,8 +50,10 @@ from tools.stress.measures import (
     search,
     smallest_failure,
 )
+from tools.stress.platforms import families
 from tools.stress.solvers import check_refit, check_ridge
 from tools.stress.views import check
+from tools.workloads import in_process, log, plain_parser
 
 
 def run_device(device: Device, examples: int, only: str = "") -> dict[str, Any]:
@@ -91,11 +85,11 @@ def run_device(device: Device, examples: int, only: str = "") -> dict[str, Any]:
         measure: (view, small_scenes()) for measure in WHAT
     }
     searches["ridge"] = system, ridge_systems()
-    for measure in ("re-fit: optimum", "re-fit: loss", "same bits: slices"):
+    for measure in ("re-fit: optimum", "re-fit: loss"):
         searches[measure] = problem, refit_problems()
     failures = {}
     for measure, (run, strategy) in searches.items():
-        if not measure.startswith(beginnings) or (measure in GPU_ONLY and device.family != "gpu"):
+        if not measure.startswith(beginnings):
             continue
         if examples:
             search(measure, strategy, run, worst, examples)
@@ -106,93 +100,64 @@ def run_device(device: Device, examples: int, only: str = "") -> dict[str, Any]:
     return {"worst": kept, "failures": failures}
 
 
-def families(info: DeviceInfo) -> tuple[str, ...]:
-    """The kernel families that a device can run: GPU kernels anywhere, row kernels where vectors pay."""
-    return ("cpu", "gpu") if info.family == "cpu" else ("gpu",)
-
-
-def in_process(info: DeviceInfo, family: str, examples: int, only: str = "") -> dict[str, Any]:
-    """The run in a process of its own, so that a runtime that crashes is one line of the table."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "result.json"
-        command = [sys.executable, "-m", "tools.stress.run", "--device", str(info.index), "--family", family]
-        command += ["--examples", str(examples), "--only", only, "--json", str(path)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode:
-            message = done.stderr.strip().splitlines()
-            return {"failed": message[-1] if message else f"exit code {done.returncode}"}
-        result: dict[str, Any] = json.loads(path.read_text())[0]
-        return result
-
-
 def shortened(name: str) -> str:
     """For a table's cell."""
     return name if len(name) <= 120 else "found: " + name[:60] + " …"
 
 
-def print_report(results: list[dict[str, Any]]) -> None:
-    """Markdown: the worst of every kernel over all devices, then a row for every device and family."""
-    sound = [r for r in results if "failed" not in r]
-    print("| kernel | error | worst | of it explained by rounding | with | worst ratio | with | inputs |")
-    print("|---|---|---|---|---|---|---|---|")
-    for measure, what in WHAT.items():
-        rows = [r["worst"][measure] for r in sound if measure in r["worst"]]
-        if not rows:
-            continue
-        by_error, by_ratio = (max(rows, key=lambda w: w[key]) for key in ("error", "ratio"))
-        print(
-            f"| {measure} | {what} | {by_error['error']:.1e} | {by_error['expected']:.1e} "
-            f"| {shortened(by_error['at'])} "
-            f"| {by_ratio['ratio']:.2g} | {shortened(by_ratio['ratio_at'])} | {sum(w['checked'] for w in rows)} |"
-        )
-    print("\nWorst error (worst ratio) by device:\n")
-    measured = [measure for measure in WHAT if any(measure in r["worst"] for r in sound)]
-    print("| device | kernels | " + " | ".join(measured) + " |")
-    print("|---" * (len(measured) + 2) + "|")
-    for r in results:
-        if "failed" in r:
-            print(f"| {r['device']} | {r['family']} | failed: {r['failed']}" + " |" * len(measured))
-            continue
-        found = [r["worst"].get(measure) for measure in measured]
-        cells = (f"{w['error']:.0e} ({w['ratio']:.1g})" if w else "" for w in found)
-        print(f"| {r['device']} | {r['family']} | " + " | ".join(cells) + " |")
-    failures = [(r, *failure) for r in sound for failure in r["failures"].items()]
-    print(
-        f"\nBeyond {LIMIT:g} times what rounding explains, or beyond the promise ({', '.join(PROMISES)}): "
-        f"{len(failures) or 'none'}."
+def report(results: Results, runs: list[dict[str, Any]]) -> None:
+    """The worst of every kernel over all devices, a row for every device and family, and what is a fault."""
+    sound = [run for run in runs if "failed" not in run]
+    table = results.table(
+        "kernels", "The worst of every kernel",
+        "kernel; error; worst||.1e; of it explained by rounding||.1e; with; worst ratio||.2g; with this; inputs",
+    )  # fmt: skip
+    measured = [measure for measure in WHAT if any(measure in run["worst"] for run in sound)]
+    for measure in measured:
+        rows = [run["worst"][measure] for run in sound if measure in run["worst"]]
+        error, ratio = (max(rows, key=lambda w: w[key]) for key in ("error", "ratio"))
+        table.add(
+            measure, WHAT[measure], error["error"], error["expected"], shortened(error["at"]), ratio["ratio"],
+            shortened(ratio["ratio_at"]), sum(row["checked"] for row in rows),
+        )  # fmt: skip
+    table = results.table(
+        "devices", "Worst error (worst ratio) by device", "device; kernels; failed", *map(Column, measured)
     )
-    for r, measure, name in failures:
-        print(f"\n- {measure} on {r['device']}, {r['family']} kernels: {name}")
+    for run in runs:
+        found = [run.get("worst", {}).get(measure) for measure in measured]
+        cells = (f"{w['error']:.0e} ({w['ratio']:.1g})" if w else None for w in found)
+        table.add(run["device"], run["family"], run.get("failed", ""), *cells)
+    title = f"Beyond {LIMIT:g} times what rounding explains, or beyond the promise ({', '.join(PROMISES)})"
+    table = results.table("failures", title, "kernel; device; kernels; smallest input that was found")
+    for run in sound:
+        for measure, name in run["failures"].items():
+            table.add(measure, run["device"], run["family"], name)
+
+
+def on_device(index: int, family: Family, examples: int, only: str) -> dict[str, Any]:
+    """The run on one device of the list."""
+    return run_device(Device(list_devices()[index], family=family), examples, only)
 
 
 def main() -> None:
     os.environ.setdefault("RUSTICL_ENABLE", "llvmpipe")
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = plain_parser(__doc__)
     parser.add_argument("--device", type=int, help="index of one device; default: every one there is")
     parser.add_argument("--family", choices=("cpu", "gpu"), help="one family of kernels; default: all that run")
     parser.add_argument("--examples", type=int, default=100, help="attempts of the search at every measure")
     parser.add_argument("--only", default="", metavar="PREFIX,…", help="measures whose names begin so, such as fit")
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--from", dest="kept", type=Path, nargs="+", help="results of earlier runs, instead of a run")
     args = parser.parse_args()
-    if args.kept:
-        print_report([result for path in args.kept for result in json.loads(path.read_text())])
-        return
-    results = []
+    runs: list[dict[str, Any]] = []
     chosen = [info for info in list_devices() if args.device in (None, info.index)]
-    for info in chosen:
-        for family in families(info):
-            if args.family not in (None, family):
-                continue
-            if args.device is None:
-                result = in_process(info, family, args.examples, args.only)
-            else:
-                result = run_device(Device(info, family=family), args.examples, args.only)  # type: ignore[arg-type]
-            results.append({**circumstances(info), "device": str(info), "family": family, **result})
-            print(f"{info}, {family} kernels: done", file=sys.stderr, flush=True)
-            if args.json is not None:
-                args.json.write_text(json.dumps(results, indent=1))
-    print_report(results)
+    for info, family in ((each, family) for each in chosen for family in families(each)):
+        if args.family in (None, family):
+            try:
+                found = in_process(on_device, info.index, family, args.examples, args.only)
+            except Exception as error:  # whatever a runtime does
+                found = {"failed": (str(error).splitlines() or [type(error).__name__])[-1]}
+            runs.append({"device": str(info), "family": family, **found})
+            log(f"{info}, {family} kernels: done")
+    report(Results(None, args.json), runs)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ it likes: such moments are told by /proc and counted apart; what is on the disk 
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import os
 import shutil
@@ -28,25 +27,14 @@ from collections import Counter
 from pathlib import Path
 from random import Random
 
-from tools.results import Column, Results
+from tools.results import Results
 from tools.stress.commands import Command, commands, environment, hashes, is_whole, prepare
+from tools.workloads import plain_parser, processor_time
 
 _SIGNALS = (signal.SIGKILL, signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 #: A command that has not ended so long after a signal hangs, seconds.
 _PATIENCE = 30.0
 _OLD = b"what was there before"
-_COLUMNS = (
-    Column("command"),
-    Column("usual time", "s", ".2f"),
-    Column("moments"),
-    Column("while it was writing"),
-    Column("before its first lines or after its last"),
-    Column("ended by the signal"),
-    Column("done already"),
-    Column("outputs new"),
-    Column("left by SIGKILL"),
-    Column("wrong"),
-)
 
 
 @dataclasses.dataclass
@@ -59,17 +47,17 @@ class Usual:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = plain_parser(__doc__)
     parser.add_argument("--moments", type=int, default=500, metavar="N", help="of all commands; default 500")
     parser.add_argument("--seed", type=int, default=1, help="default 1")
-    parser.add_argument("--command", action="append", dest="names", metavar="NAME", help="default: all")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="keep the figures")
+    parser.add_argument("--command", action="append", choices=[each.name for each in commands()], dest="names")
     args = parser.parse_args()
     chosen = [each for each in commands() if args.names is None or each.name in args.names]
-    if not chosen:
-        parser.error(f"no such command; there are: {'; '.join(each.name for each in commands())}")
-    results = Results(None, args.json)
-    table = results.table("signals", "Commands ended at random moments", *_COLUMNS)
+    table = Results(None, args.json).table(
+        "signals", "Commands ended at random moments",
+        "command; usual time|s|.2f; moments; while it was writing; before its first lines or after its last; "
+        "ended by the signal; done already; outputs new; left by SIGKILL; wrong",
+    )  # fmt: skip
     wrong: list[str] = []
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
@@ -80,9 +68,10 @@ def main() -> None:
             counts: Counter[str] = Counter()
             for k in range(moments):
                 rng = Random(f"{args.seed}/{command.name}/{k}")
-                found = try_moment(folder, command, usual, inputs, _SIGNALS[k % len(_SIGNALS)], rng, counts)
+                moment = Moment(folder, command, usual, inputs, _SIGNALS[k % len(_SIGNALS)], rng, counts)
+                found = moment.attempt()
                 counts["wrong"] += bool(found)
-                wrong += [f"{command.name}, seed {args.seed}, moment {k}: {each}" for each in found]
+                wrong += [f"{command.name}, seed {args.seed}, moment {k}: {moment.number.name}: {e}" for e in found]
             kinds = ("writing", "before", "ended", "done", "new", "left", "wrong")
             table.add(command.name, round(usual.seconds, 3), moments, *(counts[kind] for kind in kinds))
     print("\n".join(wrong), file=sys.stderr)
@@ -97,11 +86,11 @@ def run_usually(folder: Path, command: Command) -> Usual:
     """
     for _ in range(2):
         _clear(folder)
-        began, used = time.monotonic(), _of_children()
+        began, used = time.monotonic(), processor_time()
         done = subprocess.run(
             command.argv(), cwd=folder, env=environment(folder), capture_output=True, text=True, check=False
         )
-        seconds, processor_seconds = time.monotonic() - began, _of_children() - used
+        seconds, processor_seconds = time.monotonic() - began, processor_time() - used
         written = hashes(folder / "out")
         left = sorted(_temporary(folder))
         if done.returncode != 0 or set(written) != set(command.outputs) or left:
@@ -109,123 +98,88 @@ def run_usually(folder: Path, command: Command) -> Usual:
     return Usual(seconds, processor_seconds, written)
 
 
-def try_moment(
-    folder: Path,
-    command: Command,
-    usual: Usual,
-    inputs: dict[str, str],
-    number: signal.Signals,
-    rng: Random,
-    counts: Counter[str],
-) -> list[str]:
-    """Start a command, end it at a random moment, and look at what there is; what is wrong, a line each."""
-    _clear(folder)
-    old = [name for name in command.outputs if rng.random() < 0.5]
-    for name in old:
-        (folder / "out" / name).write_bytes(_OLD)
-    waits_for_file = rng.random() < 0.35
-    moment = rng.random() * (0.02 if waits_for_file else usual.processor_seconds * 1.02)
-    process = subprocess.Popen(
-        command.argv(), cwd=folder, env=environment(folder), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE, start_new_session=True,
-    )  # fmt: skip
-    try:
-        if waits_for_file:
-            counts["writing"] += _wait_for_file(folder, process, set(old))
-            time.sleep(moment)
-        else:
-            _wait_for_work(process, moment)
-        ready = _handles(process.pid, signal.SIGTERM)
-        process.send_signal(number)
+@dataclasses.dataclass
+class Moment:
+    """One start of a command, and one signal to it; ``counts`` is told what came of it."""
+
+    folder: Path
+    command: Command
+    usual: Usual
+    inputs: dict[str, str]
+    number: signal.Signals
+    rng: Random
+    counts: Counter[str]
+
+    def attempt(self) -> list[str]:
+        """Start the command, end it at a random moment, and look at what there is; what is wrong, a line each."""
+        _clear(self.folder)
+        old = {name for name in self.command.outputs if self.rng.random() < 0.5}
+        for name in old:
+            (self.folder / "out" / name).write_bytes(_OLD)
+        waits_for_file = self.rng.random() < 0.35
+        moment = self.rng.random() * (0.02 if waits_for_file else self.usual.processor_seconds * 1.02)
+        process = subprocess.Popen(
+            self.command.argv(), cwd=self.folder, env=environment(self.folder), stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True,
+        )  # fmt: skip
         try:
-            _, said = process.communicate(timeout=_PATIENCE)
-        except subprocess.TimeoutExpired:
-            return [f"{number.name}: it did not end in {_PATIENCE:.0f} s"]
-    finally:
-        if process.poll() is None:
-            process.kill()
-            process.wait()
-    counts["before"] += not ready and process.returncode != 0
-    found = _exit(process.returncode, number, ready, said.decode("utf-8", "replace"), counts)
-    found += _disk(folder, command, usual, inputs, set(old), process.returncode, number, counts)
-    return [f"{number.name} ({'writing' if waits_for_file else f'{moment:.3f} s'}): {each}" for each in found]
+            while process.poll() is None:
+                if waits_for_file and set(os.listdir(self.folder / "out")) - old:
+                    self.counts["writing"] += 1
+                    time.sleep(moment)
+                    break
+                if not waits_for_file and _used(process.pid) >= moment:
+                    break
+                time.sleep(0.0005)
+            ready = _handles(process.pid, signal.SIGTERM)
+            process.send_signal(self.number)
+            try:
+                _, said = process.communicate(timeout=_PATIENCE)
+            except subprocess.TimeoutExpired:
+                return [f"it did not end in {_PATIENCE:.0f} s"]
+        finally:
+            if process.poll() is None:
+                process.kill()
+                process.wait()
+        code = process.returncode
+        self.counts["before"] += not ready and code != 0
+        self.counts["done"] += code == 0
+        return self._exit(code, ready, said.decode("utf-8", "replace")) + self._disk(old, code)
 
+    def _exit(self, code: int, ready: bool, said: str) -> list[str]:
+        if self.number != signal.SIGKILL and not ready:
+            return []
+        expected = -self.number if self.number == signal.SIGKILL else 128 + self.number
+        self.counts["ended"] += code == expected
+        found = [] if code in (expected, 0) else [f"exit code {code}\n{said}"]
+        return found + ([f"it said\n{said}"] if "Traceback" in said or "Error" in said else [])
 
-def _exit(code: int, number: signal.Signals, ready: bool, said: str, counts: Counter[str]) -> list[str]:
-    if code == 0:
-        counts["done"] += 1
-    if number == signal.SIGKILL:
-        counts["ended"] += code != 0
-        return [] if code in (-number, 0) else [f"exit code {code}\n{said}"]
-    if not ready:
-        return []
-    counts["ended"] += code == 128 + number
-    found = []
-    if code not in (128 + number, 0):
-        found.append(f"exit code {code}\n{said}")
-    if "Traceback" in said or "Error" in said:
-        found.append(f"it said\n{said}")
-    return found
-
-
-def _disk(
-    folder: Path,
-    command: Command,
-    usual: Usual,
-    inputs: dict[str, str],
-    old: set[str],
-    code: int,
-    number: signal.Signals,
-    counts: Counter[str],
-) -> list[str]:
-    found = []
-    if hashes(folder / "in") != inputs:
-        found.append("an input was harmed")
-    there = hashes(folder / "out")
-    varies = not command.repeats or (command.ends_early and number == signal.SIGINT)
-    fresh = 0
-    for name in command.outputs:
-        path = folder / "out" / name
-        if name not in there:
-            if name in old:
-                found.append(f"'{name}' is gone")
-        elif path.read_bytes() == _OLD:
-            if name not in old:
-                found.append(f"'{name}' is not what it can be")
-        elif there[name] == usual.outputs[name] or (varies and is_whole(path)):
-            fresh += 1
-        else:
-            found.append(f"'{name}' is neither the old file nor the new one, {path.stat().st_size} bytes")
-    counts["new"] += fresh == len(command.outputs)
-    if code == 0 and fresh != len(command.outputs):
-        found.append("it says that all went well, and did not write all")
-    left = [*(set(there) - set(command.outputs)), *_temporary(folder)]
-    if left and number == signal.SIGKILL:
-        counts["left"] += 1
-    elif left:
-        found.append(f"left behind: {', '.join(left)}")
-    return found
+    def _disk(self, old: set[str], code: int) -> list[str]:
+        found = ["an input was harmed"] if hashes(self.folder / "in") != self.inputs else []
+        there = hashes(self.folder / "out")
+        varies = not self.command.repeats or (self.command.ends_early and self.number == signal.SIGINT)
+        fresh = 0
+        for name in self.command.outputs:
+            path = self.folder / "out" / name
+            if name not in there or path.read_bytes() == _OLD:
+                if (name in there) != (name in old):
+                    found.append(f"'{name}' is gone, or is what it cannot be")
+            elif there[name] == self.usual.outputs[name] or (varies and is_whole(path)):
+                fresh += 1
+            else:
+                found.append(f"'{name}' is neither the old file nor the new one, {path.stat().st_size} bytes")
+        self.counts["new"] += fresh == len(self.command.outputs)
+        if code == 0 and fresh != len(self.command.outputs):
+            found.append("it says that all went well, and did not write all")
+        left = [*(set(there) - set(self.command.outputs)), *_temporary(self.folder)]
+        self.counts["left"] += bool(left) and self.number == signal.SIGKILL
+        return found + ([f"left behind: {', '.join(left)}"] if left and self.number != signal.SIGKILL else [])
 
 
 def _clear(folder: Path) -> None:
     for name in ("out", "tmp"):
         shutil.rmtree(folder / name)
         (folder / name).mkdir()
-
-
-def _wait_for_file(folder: Path, process: subprocess.Popen[bytes], there: set[str]) -> bool:
-    """Wait until a file appears beside the output that was not there; whether one did."""
-    while process.poll() is None:
-        if set(os.listdir(folder / "out")) - there:
-            return True
-        time.sleep(0.0005)
-    return False
-
-
-def _wait_for_work(process: subprocess.Popen[bytes], seconds: float) -> None:
-    """Wait until a process has had the processors for so long, or has ended."""
-    while process.poll() is None and _used(process.pid) < seconds:
-        time.sleep(0.0005)
 
 
 def _used(pid: int) -> float:
@@ -236,12 +190,6 @@ def _used(pid: int) -> float:
         return 0.0
     fields = status.rpartition(")")[2].split()  # the name in brackets before may hold spaces
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
-def _of_children() -> float:
-    """Seconds of processor time of all processes that were started here and have ended."""
-    times = os.times()
-    return times.children_user + times.children_system
 
 
 def _temporary(folder: Path) -> set[str]:

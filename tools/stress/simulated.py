@@ -78,7 +78,9 @@ from potr_cl.stages.refitting.targets import RenderedTargets
 from potr_cl.stages.refitting.vector_space import Layout
 from tests.reference import raster as reference
 from tests.reference.scenes import plain_splats, random_splats, straight_camera, tilted_camera
+from tools.results import Results
 from tools.stress.platforms import check_similarity
+from tools.workloads import plain_parser
 
 #: Kernel families and vector widths.
 KINDS = (("gpu", 1), ("cpu", 4), ("cpu", 8), ("cpu", 16))
@@ -324,15 +326,6 @@ def clusters(device: Device) -> None:
     cluster(device, points, generator.uniform(0.1, 2, (150, 3)).astype(np.float32), 40)
 
 
-def similarity(device: Device) -> None:
-    """SSIM of noisy, flat and bright pictures against float64.
-
-    Raises:
-        DeviceError: it is more than 1e-6 away.
-    """
-    check_similarity(device)
-
-
 def filling(device: Device) -> None:
     """A buffer that a kernel fills, as large ones are."""
     with patch.object(opencl_device, "_FILLED", 0), Memory(device) as memory:
@@ -344,7 +337,7 @@ def filling(device: Device) -> None:
 
 STEPS: tuple[Step, ...] = (
     pictures, long_lists, pruning, several_batches, view_by_view, part_by_part, some_of_a_scene, refit,
-    refit_of_reached, packing, marks, derivatives, fit, compaction, decoding, clusters, similarity, filling,
+    refit_of_reached, packing, marks, derivatives, fit, compaction, decoding, clusters, check_similarity, filling,
 )  # fmt: skip
 
 
@@ -410,27 +403,16 @@ def simulate(family: str, width: int, names: list[str], told: Path) -> None:
 # ------------------------------------------------------------------------------------------ outside of it
 
 
-@dataclasses.dataclass(frozen=True)
-class Found:
-    """What a run of one family and vector width told.
+def simulated(family: str, width: int, steps: list[str], api: bool = False) -> tuple[list[str], set[str]]:
+    """Run steps in Oclgrind, in a process of its own.
 
-    Attributes:
-        findings: a line each: the step, what Oclgrind said, and the kernel; or how the run failed.
-        kernels: "file: name" of those that were run.
-        seconds: that it took.
+    Returns:
+        What was found, a line each: the step, what Oclgrind said, and the kernel; or how the run failed. And the
+        kernels that were run, as "file: name".
     """
-
-    findings: list[str]
-    kernels: set[str]
-    seconds: float
-
-
-def simulated(family: str, width: int, steps: list[str], api: bool = False) -> Found:
-    """Run steps in Oclgrind, in a process of its own."""
     # Looking for uninitialised values it crashes where vectors are loaded from a work-item's own array, and where a
     # vector is made of shorter ones.
     checks = ["--data-races", *(["--uninitialized"] if family == "gpu" else []), *(["--check-api"] if api else [])]
-    began = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         told = Path(folder) / "kernels.json"
         # Its optimiser breaks stores of vectors; programs from pyopencl's cache lose their sources.
@@ -451,7 +433,7 @@ def simulated(family: str, width: int, steps: list[str], api: bool = False) -> F
     if done.returncode:
         last = [f"exit code {done.returncode}", *done.stderr.strip().splitlines()][-1]
         findings[f"{step}: the run failed: {last}"] = None
-    return Found(list(findings), kernels, time.perf_counter() - began)
+    return list(findings), kernels
 
 
 def all_kernels() -> set[str]:
@@ -466,7 +448,7 @@ def all_kernels() -> set[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = plain_parser(__doc__)
     parser.add_argument("--family", choices=("gpu", "cpu"), help="default: both")
     names = [step.__name__ for step in STEPS]
     parser.add_argument("--step", action="append", dest="steps", choices=names, help="default: all")
@@ -480,17 +462,18 @@ def main() -> None:
         return
     if shutil.which("oclgrind") is None:
         sys.exit("Oclgrind is not installed (Debian: apt-get install oclgrind)")
-    print("| kernels | vector | steps | found | kernels run | s |\n" + "|---" * 6 + "|")
+    columns = "kernels; vector; steps; found; kernels run; time|s|.0f"
+    table = Results(None, args.json).table("simulated", "Kernels in Oclgrind", columns)
     run: set[str] = set()
     findings: list[str] = []
     for family, width in KINDS:
         if args.family in (None, family):
-            found = simulated(family, width, steps, args.check_api)
-            run |= found.kernels
-            findings += found.findings
-            said = "; ".join(found.findings) or "nothing"
-            numbers = f"{len(steps)} | {said} | {len(found.kernels)} | {found.seconds:.0f}"
-            print(f"| {family} | {width if family == 'cpu' else ''} | {numbers} |", flush=True)
+            began = time.perf_counter()
+            found, kernels = simulated(family, width, steps, args.check_api)
+            seconds = time.perf_counter() - began
+            run |= kernels
+            findings += found
+            table.add(family, width, len(steps), "; ".join(found) or "nothing", len(kernels), seconds)
     if args.family is None and args.steps is None and (left := sorted(all_kernels() - run)):
         findings.append(f"no step runs {', '.join(left)}")
         print(f"\n{findings[-1]}")

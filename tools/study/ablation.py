@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,7 +31,7 @@ from potr_cl.report.file import file_report
 from potr_cl.stages.stage import State
 from tools.results import Column, Results, circumstances, write_json
 from tools.study.evaluation import EvaluatedScene
-from tools.workloads import reduced_state, study_parser
+from tools.workloads import reduced, study_parser
 
 #: The paper's properties, the sections of a file that hold each, and float32 values a splat in a PLY of degree 3.
 PROPERTIES = {
@@ -94,7 +93,7 @@ def measure_steps(evaluator: EvaluatedScene, device: Device, q: float) -> list[d
         ("SH compaction", options.changed(compact={"colour_model": "rgb"}), True),
         ("RGB → YCoCg", options, False),
     ):
-        left = reduced_state(evaluator.source, views, changed, device)
+        left = reduced(evaluator.source, views, changed, device)
         steps.append({"step": name, **_plain(evaluator, changed, left, rgb)})
     best = EncodeOptions.for_preset("best", q=q)
     for name, changed in (
@@ -118,19 +117,14 @@ def _measure(args: argparse.Namespace) -> None:
 
 
 def _report(args: argparse.Namespace) -> None:
-    measured = json.loads(args.results.read_text())
+    measured = json.loads(args.results[0].read_text())
     results = Results(None, args.json, measured)
     for name, entry in measured["scenes"].items():
         table = results.table(
             name,
             f"The steps of the paper's ablation, then those to preset best: {name}, q = {measured['q']:g}",
-            Column("step"),
-            Column("splats", format=","),
-            Column("size", "MB", ".3f"),
-            Column("PSNR against uncompressed", "dB", ".2f"),
-            Column("SSIM against uncompressed", format=".4f"),
-            Column("PSNR against photographs", "dB", ".2f"),
-            Column("SSIM against photographs", format=".4f"),
+            "step; splats||,; size|MB|.3f; PSNR against uncompressed|dB|.2f; SSIM against uncompressed||.4f; "
+            "PSNR against photographs|dB|.2f; SSIM against photographs||.4f",
         )
         plain, steps = entry["uncompressed"], entry["steps"]
         truth = (plain.get("truth_psnr"), plain.get("truth_ssim"))
@@ -141,7 +135,7 @@ def _report(args: argparse.Namespace) -> None:
         parts = results.table(
             f"bytes_{name}",
             f"Bytes a splat after each step: {name}, q = {measured['q']:g}",
-            Column("step"),
+            "step",
             *(Column(prop, format=".2f") for prop in (*PROPERTIES, "all")),
         )
         floats = [4.0 * values for _, values in PROPERTIES.values()]
@@ -152,9 +146,8 @@ def _report(args: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    parser, measure, report = study_parser(__doc__, _measure, _report)
+    parser, measure, _ = study_parser(__doc__, _measure, _report)
     measure.add_argument("--quality", type=float, default=0.5)
-    report.add_argument("--json", type=Path, help="keep the tables here")
     args = parser.parse_args()
     args.run(args)
 

@@ -22,6 +22,7 @@ class EvaluatedScene(Owner):
     Args:
         folder: holds point_cloud.ply, cameras.json with test views, and photographs in ``images`` if there are any.
         device: to render on.
+        every: judge by each so many-th test view only.
 
     Attributes:
         source: the uncompressed scene.
@@ -30,13 +31,13 @@ class EvaluatedScene(Owner):
         source_bytes: of the PLY file.
     """
 
-    def __init__(self, folder: Path, device: Device) -> None:
+    def __init__(self, folder: Path, device: Device, every: int = 1) -> None:
         path = folder / "point_cloud.ply"
         self.name = folder.resolve().name
         self.source: Scene = load_scene(path)
         self.source_bytes = path.stat().st_size
         self.cameras: list[Camera] = load_cameras(folder / "cameras.json")
-        self.views = test_views(self.cameras)
+        self.views = test_views(self.cameras)[::every]
         if not self.views:
             raise DataError(f"'{folder / 'cameras.json'}' has no test views")
         images = folder / "images"

@@ -7,7 +7,8 @@ A SCENE is a folder with point_cloud.ply, cameras.json and, if it has any, photo
 the name it gets and the options of EncodeOptions in which it differs from the defaults, those of a stage with its name,
 as in exact:preset=best,prune.tolerance=0; photos=True stands for --photos with the folder images. ``measure`` writes
 its results after every encode and goes on where an existing file stops; with --seconds it begins no encode after that
-many. Several files of ``measure`` become one curve (tools.study.curves); --series takes some of their series alone,
+many. Several files of ``measure`` become one curve: where a run was cut short, or another
+commit went on. --series takes some of their series alone,
 in that order. ``report`` prints the tables of docs/benchmarks, and keeps them with --json: the curves, the uncompressed
 scenes, and the seconds of each stage at quality 0.5. With --against it prints instead how many bytes more or fewer each
 series takes at the PSNR that the series NAME has at quality Q, by interpolation, and how long its encodes take.
@@ -22,6 +23,7 @@ import json
 import math
 import statistics
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +35,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.report.file import file_report
-from tools.results import Column, Results, circumstances, write_json
-from tools.study.curves import merged
+from tools.results import Cell, Column, Results, circumstances, write_json
 from tools.study.evaluation import EvaluatedScene
 from tools.workloads import study_parser
 
@@ -136,6 +137,69 @@ def _measure(args: argparse.Namespace) -> None:
 # ------------------------------------------------------------------------------------------------ report
 
 
+def merged(paths: Sequence[Path], chosen: Sequence[str] = ()) -> dict[str, Any]:
+    """What ``measure`` left in some files, as if one run had measured it; of equal points the later file's stays.
+
+    Args:
+        paths: files of ``measure``, one or more.
+        chosen: take these series alone, in this order; empty: all of them. A scene may lack some of them.
+
+    Returns:
+        The same structure. "commit" names every commit and, if there are several, the series that each has measured;
+        "machine", "date" and "command" are those of the files that a point is taken of, each once.
+
+    Raises:
+        UsageError: none of the files has a series of that name.
+    """
+    files = [json.loads(path.read_text()) for path in paths]
+    together: dict[str, Any] = {**files[0], "scenes": {}}
+    for number, file in enumerate(files):
+        about = {"commit": file.get("commit", "unknown"), "file": number}
+        for name, entry in file["scenes"].items():
+            kept = together["scenes"].setdefault(name, {**entry, "series": {}})
+            for series, curve in entry["series"].items():
+                points = {p["q"]: p for p in kept["series"].get(series, {"encodes": []})["encodes"]}
+                points |= {p["q"]: {**about, **p} for p in curve["encodes"]}
+                kept["series"][series] = {**curve, "encodes": [points[q] for q in sorted(points)]}
+    for entry in together["scenes"].values():
+        order = chosen or list(entry["series"])
+        entry["series"] = {name: entry["series"][name] for name in order if name in entry["series"]}
+    for name in chosen:
+        if not any(name in entry["series"] for entry in together["scenes"].values()):
+            raise UsageError(f"{', '.join(map(str, paths))}: there is no series '{name}'")
+    used = {
+        point.pop("file")
+        for entry in together["scenes"].values()
+        for curve in entry["series"].values()
+        for point in curve["encodes"]
+    }
+    together["commit"] = _commits(together["scenes"])
+    sources = [file for number, file in enumerate(files) if number in used]
+    for key, between in (("machine", "; "), ("date", ", ")):
+        together[key] = between.join(dict.fromkeys(file[key] for file in sources if key in file))
+    together["command"] = list(dict.fromkeys(command for file in sources for command in file.get("command", [])))
+    return together
+
+
+def _commits(scenes: dict[str, Any]) -> str:
+    """The commits of all points: one, or each with the series (and, where they differ, the scenes) that it measured."""
+    of_commit: dict[str, dict[str, list[str]]] = {}
+    for scene, entry in scenes.items():
+        for series, curve in entry["series"].items():
+            for commit in dict.fromkeys(point["commit"] for point in curve["encodes"]):
+                of_commit.setdefault(commit, {}).setdefault(series, []).append(scene)
+    if len(of_commit) <= 1:
+        return "".join(of_commit)
+    parts = []
+    for commit, parted in of_commit.items():
+        texts = [
+            series if len(measured) == len(scenes) else f"{series} of {' and '.join(measured)}"
+            for series, measured in parted.items()
+        ]
+        parts.append(f"{commit} ({', '.join(texts)})")
+    return "; ".join(parts)
+
+
 def size_at(points: list[dict[str, Any]], key: str, value: float) -> float | None:
     """Bytes at which a curve reaches ``value`` of ``key``; None beyond its ends."""
     ordered = sorted(points, key=lambda p: float(p[key]))
@@ -145,26 +209,27 @@ def size_at(points: list[dict[str, Any]], key: str, value: float) -> float | Non
     return float(np.exp(np.interp(value, values, np.log([p["bytes"] for p in ordered]))))
 
 
-def print_gaps(scenes: dict[str, Any], against: str, q: float) -> None:
-    """Bytes at equal PSNR, a row a series."""
-    print(
-        "| | "
-        + " | ".join(f"{name}: bytes | encode" for name in scenes)
-        + " |\n"
-        + "|---" * (2 * len(scenes) + 1)
-        + "|"
-    )
+def print_gaps(results: Results, scenes: dict[str, Any], against: str, q: float) -> None:
+    """Bytes at equal PSNR, a row a series.
+
+    Raises:
+        UsageError: a scene has no encode of ``against`` at quality ``q``.
+    """
+    heads = (Column(f"{scene}: {what}", unit, form) for scene in scenes for what, unit, form in
+             (("bytes", "%", "+.1f"), ("encode", "s", ".2f")))  # fmt: skip
+    table = results.table("gaps", f"Against {against} at quality {q:g}, at equal PSNR", "series", *heads)
     for series in next(iter(scenes.values()))["series"]:
-        cells = []
-        for entry in scenes.values():
+        cells: list[Cell] = []
+        for name, entry in scenes.items():
             points = entry["series"][series]["encodes"]
-            reference = entry["series"][against]["encodes"]
-            (at,) = (point["psnr"] for point in reference if point["q"] == q)
-            size, usual = size_at(points, "psnr", at), size_at(reference, "psnr", at)
-            gap = f"{100 * size / usual - 100:+.1f} %" if size and usual else "beyond its ends"
-            seconds = statistics.median(sum(point["seconds"].values()) for point in points)
-            cells.append(f"{gap} | {seconds:.2f} s")
-        print(f"| {series} | " + " | ".join(cells) + " |")
+            reference = entry["series"].get(against, {"encodes": []})["encodes"]
+            at = next((point for point in reference if point["q"] == q), None)
+            if at is None:
+                raise UsageError(f"{name} has no encode of '{against}' at quality {q:g}")
+            size = size_at(points, "psnr", at["psnr"])
+            cells.append(100 * size / at["bytes"] - 100 if size else "beyond its ends")
+            cells.append(statistics.median(sum(point["seconds"].values()) for point in points))
+        table.add(series, *cells)
 
 
 def keep_tables(measured: dict[str, Any], path: Path | None) -> None:
@@ -175,18 +240,10 @@ def keep_tables(measured: dict[str, Any], path: Path | None) -> None:
         table = results.table(
             name,
             f"Size and quality of {name} by preset and quality, all test views",
-            Column("preset", default="{preset}"),
-            Column("q", default="{quality:g}"),
-            Column("splats", format=","),
-            Column("size", "MB", ".3f"),
-            Column("times smaller", format=".1f"),
-            Column("bytes a splat", format=".2f"),
-            Column("PSNR against uncompressed", "dB", ".2f"),
-            Column("SSIM against uncompressed", format=".4f"),
-            Column("PSNR against photographs", "dB", ".2f"),
-            Column("SSIM against photographs", format=".4f"),
-            Column("lost", "dB", ".2f"),
-        )
+            "preset; q; splats||,; size|MB|.3f; times smaller||.1f; bytes a splat||.2f; "
+            "PSNR against uncompressed|dB|.2f; SSIM against uncompressed||.4f; "
+            "PSNR against photographs|dB|.2f; SSIM against photographs||.4f; lost|dB|.2f",
+        )  # fmt: skip
         for series, curve in entry["series"].items():
             for p in curve["encodes"]:
                 size = (p["bytes"] / 1e6, entry["source_bytes"] / p["bytes"], p["bytes"] / p["splats"])
@@ -195,12 +252,7 @@ def keep_tables(measured: dict[str, Any], path: Path | None) -> None:
     table = results.table(
         "uncompressed",
         "The uncompressed scenes against their photographs, all test views",
-        Column("scene"),
-        Column("splats", format=","),
-        Column("PLY bytes", format=","),
-        Column("test views"),
-        Column("PSNR against photographs", "dB", ".2f"),
-        Column("SSIM against photographs", format=".4f"),
+        "scene; splats||,; PLY bytes||,; test views; PSNR against photographs|dB|.2f; SSIM against photographs||.4f",
     )
     for name, entry in scenes.items():
         plain = entry["uncompressed"]
@@ -209,16 +261,11 @@ def keep_tables(measured: dict[str, Any], path: Path | None) -> None:
     table = results.table(
         "stages",
         "Whole encodes at quality 0.5, stage by stage, in a process that has encoded before",
-        Column("scene"),
-        Column("preset", default="{preset}"),
-        Column("splats kept", format=","),
-        Column("bytes", format=","),
-        Column("times smaller than the PLY", format=".1f"),
-        Column("PSNR against the uncompressed renders", "dB", ".2f"),
-        Column("lost on the photographs", "dB", ".2f"),
+        "scene; preset; splats kept||,; bytes||,; times smaller than the PLY||.1f; "
+        "PSNR against the uncompressed renders|dB|.2f; lost on the photographs|dB|.2f",
         *(Column(stage, "s", ".2f") for stage in _STAGES),
-        Column("in all", "s", ".2f"),
-    )
+        "in all|s|.2f",
+    )  # fmt: skip
     for name, entry in scenes.items():
         for series, curve in entry["series"].items():
             for p in curve["encodes"]:
@@ -232,15 +279,11 @@ def keep_tables(measured: dict[str, Any], path: Path | None) -> None:
 
 
 def _report(args: argparse.Namespace) -> None:
-    results = merged([args.results, *args.more], args.series)
+    measured = merged(args.results, args.series)
     if args.against is not None:
-        for name, entry in results["scenes"].items():
-            measured = {point["q"] for point in entry["series"].get(args.against, {"encodes": []})["encodes"]}
-            if args.at not in measured:
-                raise UsageError(f"{args.results}: {name} has no encode of '{args.against}' at quality {args.at:g}")
-        print_gaps(results["scenes"], args.against, args.at)
-        return
-    keep_tables(results, args.json)
+        print_gaps(Results(None, args.json, measured), measured["scenes"], args.against, args.at)
+    else:
+        keep_tables(measured, args.json)
 
 
 def main() -> None:
@@ -248,9 +291,7 @@ def main() -> None:
     measure.add_argument("--qualities", nargs="+", type=float, default=QUALITIES, metavar="Q")
     measure.add_argument("--seconds", type=float, default=math.inf, metavar="S")
     measure.add_argument("--series", nargs="+", default=["default"], metavar="NAME[:OPTION=VALUE,…]")
-    report.add_argument("more", nargs="*", type=Path, metavar="OUT.json", help="further files of measure")
     report.add_argument("--series", nargs="+", default=[], metavar="NAME", help="these alone, in this order")
-    report.add_argument("--json", type=Path, metavar="FILE", help="keep tables for docs/benchmarks")
     report.add_argument("--against", metavar="NAME")
     report.add_argument("--at", type=float, default=0.5, metavar="Q")
     args = parser.parse_args()

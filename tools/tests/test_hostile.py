@@ -145,6 +145,6 @@ def test_findings_are_read_again(tmp_path):
 def test_a_run_goes_on_where_another_ended(tmp_path):
     whole = attack("png", 5, 0, 300, 600, tmp_path)
     parts = [attack("png", 5, first, 150, 600, tmp_path) for first in (0, 150)]
-    assert whole.files == 300
+    assert whole.number == 300
     assert whole.read == sum(part.read for part in parts)
     assert whole.findings == 0

@@ -71,21 +71,3 @@ def test_a_file_of_a_seed_is_always_the_same():
     files = [stress.changed_file(3, number) for number in range(40)]
     assert files == [stress.changed_file(3, number) for number in range(40)]
     assert len(set(files)) > 30
-
-
-@pytest.mark.slow
-def test_what_a_decode_takes_is_measured(tmp_path):
-    """On a small scene; NumPy and the native path, wherever there is one."""
-    from potr_cl.codec.native.library import native
-
-    if native() is None:
-        pytest.skip("the compiled library is not there")
-    result = run(
-        ["-m", "tools.bench.decode"], "--splats", 3000, "--runs", 2, "--part", "speed", "--part", "memory", "--json",
-        tmp_path / "decode.json",
-    )  # fmt: skip
-    assert result.returncode == 0, result.stderr
-    tables = json.loads(Path(tmp_path, "decode.json").read_text())
-    assert {row[0] for row in tables["speed"]["rows"]} == {"3000-best", "3000-fast"}
-    assert all(value > 0 for row in tables["speed"]["rows"] for value in row[3:])
-    assert all(row[3] > 0.5 for row in tables["memory"]["rows"])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import sys
 from pathlib import Path
 
@@ -13,17 +12,15 @@ import pytest
 from potr_cl.errors import UsageError
 from potr_cl.pipeline.options import EncodeOptions
 from tests.reference.scenes import random_scene
-from tools.study import ablation, compare_formats, rate_distortion
+from tools.study import ablation, formats, rate_distortion
+from tools.study.rate_distortion import merged
+from tools.workloads import excerpt
 
 
 @pytest.fixture
-def folder(tmp_path, data):
+def folder(tmp_path):
     """The excerpt as a scene's folder."""
-    scene = tmp_path / "excerpt"
-    scene.mkdir()
-    shutil.copy(data / "plush_excerpt.ply", scene / "point_cloud.ply")
-    shutil.copy(data / "plush_excerpt_cameras.json", scene / "cameras.json")
-    return scene
+    return excerpt(tmp_path / "excerpt")
 
 
 def call(monkeypatch, tool, *arguments):
@@ -70,13 +67,62 @@ def test_series_of_the_sweeps_options_and_their_gaps(monkeypatch, folder, tmp_pa
     capsys.readouterr()
     call(monkeypatch, rate_distortion, "report", out, "--against", "plain", "--at", 0.4)
     said = capsys.readouterr().out
-    rows = {line.split(" | ")[0].strip("| "): line for line in said.splitlines()[2:]}
-    assert "+0.0 %" in rows["plain"]
-    assert "+0.0 %" in rows["same"]
-    assert "+0.0 %" not in rows["lazy"]
+    rows = {line.split(" | ")[0].strip("| "): line for line in said.splitlines()}
+    assert "+0.0 |" in rows["plain"]
+    assert "+0.0 |" in rows["same"]
+    assert "+0.0 |" not in rows["lazy"]
     for name, quality in (("plane", 0.4), ("plain", 0.5)):
         with pytest.raises(UsageError, match=f"no encode of '{name}' at quality {quality}"):
             call(monkeypatch, rate_distortion, "report", out, "--against", name, "--at", quality)
+
+
+def run_of(path, commit, scenes, machine="a", **points):
+    """A file of measure: for each scene the same series, of each quality so many bytes."""
+    series = {
+        name: {"options": {}, "encodes": [{"q": q, "bytes": size} for q, size in of_it.items()]}
+        for name, of_it in points.items()
+    }
+    about = {"commit": commit, "machine": machine, "date": "2026-01-01", "command": [f"python {commit}"]}
+    entries = {scene: {"scene": scene, "source_bytes": 9, "series": series} for scene in scenes}
+    path.write_text(json.dumps({**about, "scenes": entries}))
+    return path
+
+
+def test_later_files_replace_points_and_add_others(tmp_path):
+    a = run_of(tmp_path / "a", "aaaaaaa", ["s", "t"], best={0.5: 5, 0.1: 1}, fast={0.5: 6})
+    b = run_of(tmp_path / "b", "bbbbbbb", ["s"], machine="b", best={0.3: 3, 0.5: 4})
+    both = merged([a, b])
+    points = both["scenes"]["s"]["series"]["best"]["encodes"]
+    assert [(p["q"], p["bytes"], p["commit"]) for p in points] == [
+        (0.1, 1, "aaaaaaa"),
+        (0.3, 3, "bbbbbbb"),
+        (0.5, 4, "bbbbbbb"),
+    ]
+    assert [p["bytes"] for p in both["scenes"]["t"]["series"]["best"]["encodes"]] == [1, 5]
+    assert both["commit"] == "aaaaaaa (best, fast); bbbbbbb (best of s)"
+    assert (both["machine"], both["date"]) == ("a; b", "2026-01-01")
+    assert both["command"] == ["python aaaaaaa", "python bbbbbbb"]
+
+
+def test_a_point_s_own_commit_counts(tmp_path):
+    """A run that goes on where a file of another commit stops leaves points of both."""
+    path = run_of(tmp_path / "a", "bbbbbbb", ["s"], best={0.1: 1, 0.5: 5})
+    content = json.loads(path.read_text())
+    content["scenes"]["s"]["series"]["best"]["encodes"][0]["commit"] = "aaaaaaa"
+    path.write_text(json.dumps(content))
+    assert merged([path])["commit"] == "aaaaaaa (best); bbbbbbb (best)"
+
+
+def test_series_in_the_order_asked_for(tmp_path):
+    a = run_of(tmp_path / "a", "aaaaaaa", ["s"], best={0.5: 5}, fast={0.5: 6}, paper={0.5: 7})
+    b = run_of(tmp_path / "b", "aaaaaaa", ["t"], best={0.5: 5})
+    both = merged([a, b], ["paper", "best"])
+    assert [list(entry["series"]) for entry in both["scenes"].values()] == [["paper", "best"], ["best"]]
+    assert both["commit"] == "aaaaaaa"
+    c = run_of(tmp_path / "c", "ccccccc", ["s"], machine="c", other={0.5: 5})
+    assert merged([a, b, c], ["paper", "best"])["machine"] == "a", "a file of which nothing is taken is named"
+    with pytest.raises(UsageError, match="there is no series 'slow'"):
+        merged([a, b], ["slow"])
 
 
 def test_interpolation_along_a_curve():
@@ -101,28 +147,35 @@ def test_tables_of_curves_and_formats(monkeypatch, folder, tmp_path, capsys):
     seconds = tables["stages"]["rows"][0][-6:]
     assert sum(seconds[:-1]) == pytest.approx(seconds[-1], rel=0.01)
 
-    monkeypatch.setattr(compare_formats, "EARLIER", {"excerpt": {"Other": (0.01, 9.0, 1.0)}})
     sizes = {
         "columns": [{"name": n} for n in ("format", "excerpt: size", "excerpt: PSNR", "excerpt: lost")],
         "rows": [["PLY", 9.0, None, None], ["`.spz` (version 4)", 0.05, points[0]["psnr"], 0.1], ["Other", 1, 1, 1]],
     }
-    formats, curves = tmp_path / "formats.json", measured["scenes"]["excerpt"]["series"]
-    for point in (*curves["best"]["encodes"], *curves["fast"]["encodes"]):
+    (tmp_path / "known.json").write_text(json.dumps({"sizes": sizes}))
+    monkeypatch.setattr(formats, "KNOWN", tmp_path / "known.json")
+    files = tmp_path / "formats.json"
+    words = ("--json", files, "--q", 0.3, 0.5, "--formats", ".spz:2", "--transform", "/nowhere")
+    call(monkeypatch, formats, "measure", folder, *words)
+    for point in (point for series in measured["scenes"]["excerpt"]["series"].values() for point in series["encodes"]):
         point["psnr_loss"] = 50 - point["psnr"]
     out.write_text(json.dumps(measured))
-    formats.write_text(json.dumps({"sizes": sizes}))
-    call(monkeypatch, compare_formats, "report", formats, out, "--json", kept)
-    spz, other = json.loads(kept.read_text())["excerpt"]["rows"]
-    assert spz[0] == ".spz"
+    call(monkeypatch, formats, "report", files, "--json", kept, "--curves", out)
+    tables = json.loads(kept.read_text())
+    assert [row[:3] for row in tables["outputs_excerpt"]["rows"]] == [
+        ["encode", ".spz:2", 0.3],
+        ["encode", ".spz:2", 0.5],
+        ["convert", ".spz", 1.0],
+    ]
+    assert [row[0] for row in tables[".spz:2_excerpt"]["rows"]] == [".spz"]
+    spz, other = tables["excerpt"]["rows"]
     assert spz[3:5] == pytest.approx([points[0]["bytes"] / 1e6, 5e4 / points[0]["bytes"]])
-    assert other[0] == "Other *"
+    assert other[0] == "Other"
     assert other[3].startswith("below")
-
-    call(monkeypatch, compare_formats, "report", formats, out, "--json", kept, "--series", "fast")
+    call(monkeypatch, formats, "report", files, "--json", kept, "--curves", out, "--series", "fast")
     heads = [column["name"] for column in json.loads(kept.read_text())["excerpt"]["columns"]]
     assert "fast at that PSNR" in heads
     with pytest.raises(UsageError, match="there is no series 'smallest'"):
-        call(monkeypatch, compare_formats, "report", formats, out, "--json", kept, "--series", "smallest")
+        call(monkeypatch, formats, "report", files, "--curves", out, "--series", "smallest")
 
 
 def test_rgb_streams_keep_r_g_and_b():

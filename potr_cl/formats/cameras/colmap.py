@@ -21,16 +21,14 @@ from numpy.typing import NDArray
 from potr_cl.errors import DataError
 from potr_cl.formats.cameras.points import points_beside
 from potr_cl.formats.cameras.view_files import (
-    camera_of,
+    FoundView,
+    cameras_of,
     every_eighth,
     excerpt,
     image_name,
     image_side,
     lens_coefficients,
-    lens_of,
-    pinhole_fields,
     read_bytes,
-    tell_of_lenses,
     view_names,
 )
 from potr_cl.formats.declaration import CameraFormat
@@ -72,8 +70,9 @@ class _Lens:
     height: int
     params: tuple[float, ...]
 
-    def fields(self, where: str) -> dict[str, Any]:
-        """What :func:`camera_of` takes of it."""
+    def view(self, path: Path, name: str, rest: dict[str, Any]) -> FoundView:
+        """A view of it, which is in that file under that name."""
+        where = f"'{path}', {name}"
         named = dict(zip(_READ[self.model].split(), self.params, strict=True))
         fx = named.get("fx", named.get("f"))
         size = {
@@ -81,13 +80,7 @@ class _Lens:
             "height": image_side(self.height, f"{where}: the height of its camera"),
         }
         frame = {**size, "fx": fx, "fy": named.get("fy", fx), "cx": named["cx"], "cy": named["cy"]}
-        lens = lens_coefficients(named, fisheye="FISHEYE" in self.model)
-        if lens is None:
-            return frame
-        try:
-            return pinhole_fields(lens_of(**frame, **lens))
-        except DataError as error:
-            raise DataError(f"{where}: {error}") from error
+        return FoundView(path, name, frame, lens_coefficients(named, fisheye="FISHEYE" in self.model), rest)
 
 
 @dataclass(frozen=True)
@@ -132,12 +125,11 @@ def load(folder: Path) -> list[Camera]:
             raise DataError(f"'{folder}' is a damaged COLMAP model: image {image.number} has an unknown camera")
     files = [image_name(image.name, f"'{path}': the name of image {image.number}") for image in images]
     ground_truth, points = _ground_truth(folder), points_beside(folder, "points3D.bin", "points3D.txt")
-    cameras = [
-        _camera(path, image, lenses[image.lens], name, split, ground_truth / file if ground_truth else None, points)
+    views = [
+        _view(path, image, lenses[image.lens], name, split, ground_truth / file if ground_truth else None, points)
         for image, name, file, split in zip(images, view_names(files, path), files, every_eighth(files), strict=True)
     ]
-    tell_of_lenses(folder, cameras)
-    return cameras
+    return cameras_of(folder, views)
 
 
 FORMAT = CameraFormat(
@@ -153,21 +145,20 @@ FORMAT = CameraFormat(
 )
 
 
-def _camera(
+def _view(
     path: Path, image: _Image, lens: _Lens, name: str, split: str, ground_truth: Path | None, points: Path | None
-) -> Camera:
+) -> FoundView:
     if not abs(math.hypot(*image.rotation) - 1) < 1e-3:
         raise DataError(f"'{path}', view '{name}': its rotation is not a unit quaternion")
-    return camera_of(
-        path,
-        name=name,
-        **lens.fields(f"'{path}', view '{name}'"),
-        rotation=_matrix(*image.rotation),
-        translation=np.array(image.translation),
-        split=split,
-        image_path=ground_truth if ground_truth and os.path.isfile(ground_truth) else None,
-        points_path=points,
-    )
+    rest = {
+        "name": name,
+        "rotation": _matrix(*image.rotation),
+        "translation": np.array(image.translation),
+        "split": split,
+        "image_path": ground_truth if ground_truth and os.path.isfile(ground_truth) else None,
+        "points_path": points,
+    }
+    return lens.view(path, f"view '{name}'", rest)
 
 
 def _matrix(w: float, x: float, y: float, z: float) -> NDArray[np.float64]:

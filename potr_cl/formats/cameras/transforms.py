@@ -27,18 +27,16 @@ from numpy.typing import NDArray
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.cameras.view_files import (
     IMAGE_SUFFIXES,
-    camera_of,
+    FoundView,
+    cameras_of,
     every_eighth,
     excerpt,
     image_name,
     image_side,
     lens_coefficients,
-    lens_of,
     matrix,
     number,
-    pinhole_fields,
     read_json,
-    tell_of_lenses,
     view_names,
 )
 from potr_cl.formats.declaration import CameraFormat
@@ -137,12 +135,11 @@ def parse(contents: list[tuple[Any, Path]]) -> list[Camera]:
         frames += of_file
     names = view_names([frame.file for frame in frames], contents[0][1])
     placements = {path: _placement(content, path) for content, path in contents}
-    cameras = [
-        _camera(frame, name, split, *placements[frame.path])
+    views = [
+        _view(frame, name, split, *placements[frame.path])
         for frame, name, split in zip(frames, names, splits, strict=True)
     ]
-    tell_of_lenses(contents[0][1], cameras)
-    return cameras
+    return cameras_of(contents[0][1], views)
 
 
 def _frames(content: Any, path: Path) -> list[_Frame]:
@@ -182,7 +179,7 @@ def _listed(content: dict[str, Any], key: str, files: list[str], path: Path) -> 
     return listed
 
 
-def _camera(frame: _Frame, name: str, split: str, placement: NDArray[np.float64], scale: float) -> Camera:
+def _view(frame: _Frame, name: str, split: str, placement: NDArray[np.float64], scale: float) -> FoundView:
     distortion = _distortion(frame)
     image = _image_path(frame)
     width, height = _image_size(frame, image)
@@ -204,20 +201,14 @@ def _camera(frame: _Frame, name: str, split: str, placement: NDArray[np.float64]
         "cx": width / 2 if cx is None else cx,
         "cy": height / 2 if cy is None else cy,
     }
-    if distortion is not None:
-        try:
-            fields = pinhole_fields(lens_of(**fields, **distortion))
-        except DataError as error:
-            raise DataError(f"'{frame.path}', frame {frame.index}: {error}") from error
-    return camera_of(
-        frame.path,
-        name=name,
-        **fields,
-        rotation=rotation,
-        translation=-rotation @ (scale * to_world[:3, 3]),
-        split=split,
-        image_path=image if os.path.isfile(image) else None,
-    )
+    rest = {
+        "name": name,
+        "rotation": rotation,
+        "translation": -rotation @ (scale * to_world[:3, 3]),
+        "split": split,
+        "image_path": image if os.path.isfile(image) else None,
+    }
+    return FoundView(frame.path, f"frame {frame.index}", fields, distortion, rest)
 
 
 def _distortion(frame: _Frame) -> dict[str, Any] | None:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import collections
-import functools
 import json
 import logging
 import math
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from potr_cl.errors import DataError, UsageError
 from potr_cl.host.unchanged import unchanged
 from potr_cl.model.camera import Camera
-from potr_cl.model.lens import MOST_HALF_FIELD, Lens, Pinhole
+from potr_cl.model.lens import MOST_HALF_FIELD, Lens, Pinhole, coverings
 
 _log = logging.getLogger("potr_cl")
 
@@ -129,19 +129,60 @@ def camera_of(path: Path, **fields: Any) -> Camera:
         raise DataError(f"'{path}', {error}") from error
 
 
-@functools.lru_cache(maxsize=64)
-def lens_of(**values: Any) -> Lens:
-    """A lens; views mostly share one.
+@dataclass(frozen=True)
+class FoundView:
+    """A view as a file describes it.
+
+    Attributes:
+        path: of the file, and ``name`` which of its views it is, for messages.
+        frame: size, focal lengths and principal point of the photograph, as :func:`camera_of` takes them.
+        distortion: what :func:`lens_coefficients` gives.
+        rest: what :func:`camera_of` takes besides.
+    """
+
+    path: Path
+    name: str
+    frame: dict[str, Any]
+    distortion: dict[str, Any] | None
+    rest: dict[str, Any]
+
+    @property
+    def where(self) -> str:
+        """For messages."""
+        return f"'{self.path}', {self.name}"
+
+
+def cameras_of(path: Path, views: Sequence[FoundView]) -> list[Camera]:
+    """Cameras of views, of distorted photographs pinhole views that cover their fields; logs one line about these.
+
+    Args:
+        path: what they come from, for the line.
+        views: as they were found.
 
     Raises:
-        DataError: the values are no lens's.
+        DataError: a lens or a camera has values that are none's, or would have more pixels on a side than are read.
     """
-    return Lens(**values)
-
-
-@functools.lru_cache(maxsize=64)
-def _covering(lens: Lens) -> tuple[Pinhole, bool]:
-    return lens.covering()
+    lenses: dict[Lens, str] = {}  # views mostly share one, and reconstructions can have one for each
+    of_views: list[Lens | None] = []
+    for view in views:
+        try:
+            lens = None if view.distortion is None else Lens(**view.frame, **view.distortion)
+        except DataError as error:
+            raise DataError(f"{view.where}: {error}") from error
+        of_views.append(lens)
+        if lens is not None:
+            lenses.setdefault(lens, view.where)
+    covered: dict[Lens, tuple[Pinhole, bool]] = {}
+    for (lens, where), found in zip(lenses.items(), coverings(list(lenses)), strict=True):
+        if isinstance(found, DataError):
+            raise DataError(f"{where}: {found}")
+        width, height = found[0][:2]
+        if max(width, height) > _MAX_SIDE:
+            raise DataError(f"{where}: a pinhole view of its field has {width} x {height} pixels, too many")
+        covered[lens] = found
+    _tell_of_lenses(path, [None if lens is None else covered[lens][1] for lens in of_views])
+    seen = [{} if lens is None else covered[lens][0]._asdict() | {"lens": lens} for lens in of_views]
+    return [camera_of(view.path, **view.rest, **(view.frame | each)) for view, each in zip(views, seen, strict=True)]
 
 
 def lens_coefficients(values: Mapping[str, float], fisheye: bool) -> dict[str, Any] | None:
@@ -164,29 +205,16 @@ def lens_coefficients(values: Mapping[str, float], fisheye: bool) -> dict[str, A
     return {"fisheye": fisheye, "radial": radial, "quotient": quotient, "tangential": tangential, "prism": prism}
 
 
-def pinhole_fields(lens: Lens) -> dict[str, Any]:
-    """What :func:`camera_of` takes of a view that covers the field of a distorted photograph.
-
-    Raises:
-        DataError: the view would have more pixels on a side than are read.
-    """
-    view, _ = _covering(lens)
-    if max(view.width, view.height) > _MAX_SIDE:
-        raise DataError(f"a pinhole view of its field has {view.width} x {view.height} pixels, too many")
-    return {**view._asdict(), "lens": lens}
-
-
-def tell_of_lenses(path: Path, cameras: Sequence[Camera]) -> None:
-    """Log one line if views have lens distortion."""
-    lenses = [camera.lens for camera in cameras if camera.lens is not None]
-    if not lenses:
+def _tell_of_lenses(path: Path, whole: Sequence[bool | None]) -> None:
+    """Log one line if views have lens distortion: None has not, and True says that all of its field is covered."""
+    bent, cut = sum(each is not None for each in whole), whole.count(False)
+    if not bent:
         return
-    cut = sum(not _covering(lens)[1] for lens in lenses)
     widest = 2 * math.degrees(MOST_HALF_FIELD)
     beyond = f"; of {cut} the edges are left out, beyond {widest:.0f} degrees or what the lens's formula describes"
     _log.warning(
-        "'%s': %d of %d views have lens distortion: pinhole views that cover the same field stand for them%s",
-        path, len(lenses), len(cameras), beyond if cut else "",
+        "'%s': %d of %d views have lens distortion: replaced by pinhole views that cover the same area%s",
+        path, bent, len(whole), beyond if cut else "",
     )  # fmt: skip
 
 

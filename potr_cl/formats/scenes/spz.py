@@ -44,7 +44,7 @@ _EXTENSION_BYTES = 1 << 20
 _VERSIONS = (2, 3, 4)
 #: The same with what sets each apart.
 VERSIONS = {
-    2: "which all readers that were tried take",
+    2: "read by every tool we tested",
     3: "with finer rotations",
     4: "packed by zstd, for new readers only",
 }

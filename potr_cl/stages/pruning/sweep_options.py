@@ -45,7 +45,7 @@ class SweepOptions:
         if self.turns < 1:
             raise UsageError(f"views cannot be swept every {self.turns} measurements: at least 1 is needed")
         if self.memory is not None and self.memory < 0:
-            raise UsageError(f"a memory budget of {self.memory} bytes is less than nothing")
+            raise UsageError(f"the memory budget must not be negative ({self.memory} bytes)")
         if self.transmittance_threshold is not None and not _LEAST_THRESHOLD <= self.transmittance_threshold < 1:
             raise UsageError(
                 f"a pixel cannot end at a transmittance of {self.transmittance_threshold:g}: at least "

@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from potr_cl.formats import load_cameras
+from potr_cl.model import lens
 from potr_cl.model.lens import Lens
 from tests.cases.cameras import IDENTITY, nerfstudio, pixel, refused, write_image, write_json
 from tests.cases.images import png_of
@@ -114,7 +115,7 @@ def test_views_are_moved_to_nerfstudios_training_space(tmp_path: Path, caplog: p
 
 
 @pytest.mark.parametrize(
-    ("changes", "lens"),
+    ("changes", "terms"),
     [
         ({"k1": 0.01}, {"radial": (0.01,)}),
         ({"k1": 0.01, "k2": 0.002, "p1": 1e-3, "p2": 2e-3}, {"radial": (0.01, 0.002), "tangential": (1e-3, 2e-3)}),
@@ -125,9 +126,9 @@ def test_views_are_moved_to_nerfstudios_training_space(tmp_path: Path, caplog: p
         ({"camera_model": "SIMPLE_RADIAL", "k1": 0.02}, {"radial": (0.02,)}),
     ],
 )
-def test_lenses(changes: dict[str, Any], lens: dict[str, Any], tmp_path: Path) -> None:
+def test_lenses(changes: dict[str, Any], terms: dict[str, Any], tmp_path: Path) -> None:
     cameras = load_cameras(write_json(tmp_path / "transforms.json", nerfstudio(["a.png", "b.png"], **changes)))
-    expected = Lens(40, 30, 50, 60, 21, 14, **lens)
+    expected = Lens(40, 30, 50, 60, 21, 14, **terms)
     assert [camera.lens for camera in cameras] == [expected] * 2
     assert (cameras[0].width, cameras[0].height) == expected.covering()[0][:2]
 
@@ -138,6 +139,22 @@ def test_a_frame_has_its_own_lens(tmp_path: Path) -> None:
     a, b, c = load_cameras(write_json(tmp_path / "transforms.json", content))
     assert (a.lens, c.lens) == (None, None)
     assert b.lens == Lens(40, 30, 50, 60, 21, 14, radial=(-0.05,))
+
+
+def test_a_lens_for_each_frame_costs_no_more_calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are looked at together: a file of hostile lenses takes as long as its size lets expect."""
+    calls: list[int] = []
+    bent = lens._Terms.bent
+    monkeypatch.setattr(lens._Terms, "bent", lambda terms, points: calls.append(points.size) or bent(terms, points))
+    counts = []
+    for views in (1, 60):
+        calls.clear()
+        content = nerfstudio([f"{number}.png" for number in range(views)])
+        for number, frame in enumerate(content["frames"]):
+            frame |= {"k1": -0.05 - 1e-4 * number, "k2": 0.01}
+        load_cameras(write_json(tmp_path / "transforms.json", content))
+        counts.append(len(calls))
+    assert counts[1] <= 2 * counts[0]
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,8 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable
+from functools import partial
+from random import Random
 from typing import Any
 
 import numpy as np
@@ -21,17 +23,27 @@ from tests.reference.file_parts import STREAMS, File, Section
 from tests.reference.scenes import random_scene
 from tools.stress.hostile import (
     camera_files,
+    gltf_files,
     picture_files,
     ply_files,
     potr_files,
-    scene_bomb_files,
     sog_files,
+    splat_files,
     spz_files,
-)
-from tools.stress.hostile.formats import Files
+)  # fmt: skip
+from tools.stress.hostile.changes import Files
 
 _LONG = 1 << 26
 _ORDER = [prop.value for prop in ORDER]
+Bomb = Callable[[], Files]
+
+
+def _is(name: str, data: bytes) -> Bomb:
+    return lambda: {name: data}
+
+
+def _nested(name: str, opening: bytes) -> dict[str, Bomb]:
+    return {"100,000 nested objects": _is(name, opening * 100_000)}
 
 
 # .potr ---------------------------------------------------------------------------------------------------------------
@@ -54,18 +66,10 @@ def _run(name: bytes, value: int, size: int, before: bytes = b"") -> Section:
     return Section(name, zstandard.ZstdCompressor(level=3).compress(raw), len(raw))
 
 
-def _one_splat(name: bytes, value: int) -> Callable[[], Files]:
-    return lambda: _potr(1, 52, [_run(name, value, _LONG)])
-
-
 def _one_leaf(splats: int, depth: int = 0) -> list[Section]:
     crowded = np.packbits(np.ones(depth, bool), bitorder="little").tobytes()
     tree = [Section(b"OCCU", b"\1" * depth, depth), Section(b"SEVE", crowded, len(crowded))]
     return [*(tree if depth else []), Section(b"MULT", splats.to_bytes(4, "little"), 4)]
-
-
-def _leaf(splats: int) -> Files:
-    return _potr(splats, 0, _one_leaf(splats))
 
 
 def _equal_splats() -> Files:
@@ -90,15 +94,11 @@ def _long_metadata() -> Files:
     return {"a.potr": file.bytes()}
 
 
-def _blocks_of_one_splat(number: int) -> Callable[[], Files]:
+def _blocks_of_one_splat(number: int) -> Files:
     """Each costs time of its own."""
-
-    def made() -> Files:
-        file = File.of(potr_files.originals()[4])
-        file.blocks = file.blocks * number
-        return {"a.potr": file.bytes()}
-
-    return made
+    file = File.of(potr_files.originals()[4])
+    file.blocks = file.blocks * number
+    return {"a.potr": file.bytes()}
 
 
 def _all_cells() -> Files:
@@ -108,78 +108,37 @@ def _all_cells() -> Files:
     cells = sum(8**level for level in range(1, levels + 1)) + splats * 40
     several = np.packbits(np.arange(cells) < cells - splats, bitorder="little").tobytes()
     packer = zstandard.ZstdCompressor(level=3)
-    sections = [
-        Section(b"OCCU", packer.compress(occupancy), len(occupancy)),
-        Section(b"SEVE", packer.compress(several), len(several)),
-        _run(b"LEAF", 0, splats),
-    ]
-    return _potr(splats, levels + 40, sections)
+    sections = [Section(n, packer.compress(raw), len(raw)) for n, raw in ((b"OCCU", occupancy), (b"SEVE", several))]
+    return _potr(splats, levels + 40, [*sections, _run(b"LEAF", 0, splats)])
 
 
-def _as_much_as_is_let_through(planes: int) -> Callable[[], Files]:
+def _as_much_as_is_let_through(planes: int) -> Files:
     """The most splats that a file may claim, with every attribute as long as can be."""
-
-    def made() -> Files:
-        splats = 64_000 + 8 * 8_000
-        sections = _one_leaf(splats, 52)
-        for name in (b"SCAL", b"ROTA", b"SHC0", b"SHC1", b"SHC2", b"SHC3"):
-            streams = STREAMS[name]
-            sections.append(_run(name, 255, planes * splats * streams, bytes([planes] * streams)))
-        file = File.of(_potr(splats, 52, sections, degree=3)["a.potr"])
-        noise = np.random.default_rng(0).integers(0, 256, 8_000, np.uint8).tobytes()
-        file.blocks[0].sections.append(Section(b"junk", noise, len(noise)))
-        return {"a.potr": file.bytes()}
-
-    return made
+    splats = 64_000 + 8 * 8_000
+    sections = _one_leaf(splats, 52)
+    for name in (b"SCAL", b"ROTA", b"SHC0", b"SHC1", b"SHC2", b"SHC3"):
+        sections.append(_run(name, 255, planes * splats * STREAMS[name], bytes([planes] * STREAMS[name])))
+    file = File.of(_potr(splats, 52, sections, degree=3)["a.potr"])
+    noise = np.random.default_rng(0).integers(0, 256, 8_000, np.uint8).tobytes()
+    file.blocks[0].sections.append(Section(b"junk", noise, len(noise)))
+    return {"a.potr": file.bytes()}
 
 
 # Scenes of other tools ------------------------------------------------------------------------------------------------
 
-
-def _plain(header: list[str], body: bytes) -> Files:
-    return {"a.ply": "\n".join([*header, "end_header", ""]).encode() + body}
-
-
 _PROPERTIES = [f"property float {name}" for name in ply_files.names_of(0)]
+_ONE = ["element vertex 1", *_PROPERTIES]
 
 
-def _ply_count(kind: str, count: int) -> Files:
-    return _plain(["ply", f"format {kind} 1.0", f"element vertex {count}", *_PROPERTIES], b"0 " * 1000)
-
-
-def _ply_empty_elements() -> Files:
-    header = ["ply", "format ascii 1.0", "element nothing 1000000000000", "element vertex 1", *_PROPERTIES]
-    return _plain(header, b"0 " * len(_PROPERTIES) + b"\n")
-
-
-def _ply_properties() -> Files:
-    more = [f"property double p{i}" for i in range(30_000)]
-    return _plain(["ply", "format binary_little_endian 1.0", "element vertex 1", *_PROPERTIES, *more], bytes(300_000))
-
-
-def _ply_elements() -> Files:
-    many = [f"element e{i} 0" for i in range(50_000)]
-    return _plain(["ply", "format ascii 1.0", *many, "element vertex 1", *_PROPERTIES], b"0 " * 20)
-
-
-def _ply_long_line() -> Files:
-    return _plain(["ply", "format ascii 1.0", "element vertex 1", *_PROPERTIES], b"0 " * 500_000)
-
-
-def _ply_long_number() -> Files:
-    rest = b" 0" * (len(_PROPERTIES) - 1) + b"\n"
-    return _plain(["ply", "format ascii 1.0", "element vertex 1", *_PROPERTIES], b"9" * 1_000_000 + rest)
-
-
-def _ply_comments() -> Files:
-    return _plain(["ply", "format ascii 1.0", *["comment"] * 100_000], b"")
+def _ply(layout: str, lines: list[str], body: bytes) -> Bomb:
+    return lambda: {"a.ply": "\n".join(["ply", f"format {layout} 1.0", *lines, "end_header", ""]).encode() + body}
 
 
 def _compressed_count(count: int) -> Files:
     data = ply_files.compressed(1, 3)
-    data = data.replace(b"element vertex 1\n", b"element vertex %d\n" % count)
-    data = data.replace(b"element sh 1\n", b"element sh %d\n" % count)
-    return {"a.compressed.ply": data.replace(b"element chunk 1\n", b"element chunk %d\n" % -(-count // 256))}
+    for name, number in (("vertex", count), ("sh", count), ("chunk", -(-count // 256))):
+        data = data.replace(f"element {name} 1\n".encode(), f"element {name} {number}\n".encode())
+    return {"a.compressed.ply": data}
 
 
 def _spz_gzip(version: int, splats: int, more: int = 0, flags: int = 0) -> Files:
@@ -198,86 +157,95 @@ def _spz_streams(splats: int, said: int | None = None) -> Files:
     return {"a.spz": spz_files.streamed(said or splats, 3, streams, sizes)}
 
 
-def _sog_pictures(side: int, splats: int) -> Files:
-    return {"a.sog": sog_files.archive(sog_files.equal_splats(side, splats))}
-
-
-def _sog_member(name: str, content: bytes) -> Files:
-    return {"a.sog": sog_files.archive(sog_files.parts(4, 0) | {name: content}, zipfile.ZIP_DEFLATED)}
+def _sog(files: Files, **meta: Any) -> Files:
+    described = json.dumps(json.loads(files["meta.json"]) | meta).encode() if meta else files["meta.json"]
+    return {"a.sog": sog_files.archive(files | {"meta.json": described}, zipfile.ZIP_DEFLATED)}
 
 
 def _sog_overlapping() -> Files:
     """Thousands of names for the same packed bytes."""
     crc, packed = zlib.crc32(bytes(1 << 24)), zlib.compress(bytes(1 << 24), 9)[2:-4]
-    name = b"a.webp"
-    local = struct.pack("<4sHHHHHIIIHH", b"PK\3\4", 20, 0, 8, 0, 0, crc, len(packed), 1 << 24,
-                        len(name), 0) + name + packed  # fmt: skip
-    entries = b"".join(
-        struct.pack("<4sHHHHHHIIIHHHHHII", b"PK\1\2", 20, 20, 0, 8, 0, 0, crc, len(packed),
-                    1 << 24, 6, 0, 0, 0, 0, 0, 0) + (b"%06d" % i)
-        for i in range(3000)
-    )  # fmt: skip
-    end = struct.pack("<4sHHHHIIH", b"PK\5\6", 0, 0, 3000, 3000, len(entries), len(local), 0)
-    return {"a.sog": local + entries + end}
+    sizes = (8, 0, 0, crc, len(packed), 1 << 24, 6, 0)
+    local = struct.pack("<4sHHHHHIIIHH", b"PK\3\4", 20, 0, *sizes) + b"a.webp" + packed
+    entry = struct.pack("<4sHHHHHHIIIHHHHHII", b"PK\1\2", 20, 20, 0, *sizes, 0, 0, 0, 0, 0)
+    entries = b"".join(entry + b"%06d" % i for i in range(3000))
+    return {
+        "a.sog": local + entries + struct.pack("<4sHHHHIIH", b"PK\5\6", 0, 0, 3000, 3000, len(entries), len(local), 0)
+    }
 
 
-def _sog_meta(**changes: Any) -> Files:
-    files = sog_files.parts(4, 0)
-    meta = json.loads(files["meta.json"]) | changes
-    return {"a.sog": sog_files.archive(files | {"meta.json": json.dumps(meta).encode()}, zipfile.ZIP_DEFLATED)}
+def _levels(folders: int) -> Files:
+    meta = json.loads(sog_files.folder_originals()[0]["meta.json"])
+    small = json.dumps(meta | {"count": 65_536, "scales": {}, "sh0": {}}).encode()
+    leaves = [{"lods": {"0": {"file": k, "offset": 0, "count": 65_536}}} for k in range(folders)]
+    names = [f"{k}.json" for k in range(folders)]
+    tree = {"lodLevels": 1, "filenames": names, "tree": {"children": leaves}}
+    return {"lod-meta.json": json.dumps(tree).encode()} | dict.fromkeys(names, small)
 
 
-# Cameras --------------------------------------------------------------------------------------------------------------
+def _leaves(number: int, count: int) -> Files:
+    leaves = [{"lods": {"0": {"file": 0, "offset": 0, "count": count}}}] * number
+    meta = {"lodLevels": 1, "filenames": ["0/meta.json"], "tree": {"children": leaves}}
+    return sog_files.streamed(meta, {"0": (5, 0)})
 
 
-def _json(name: str, data: bytes) -> Callable[[], Files]:
-    return lambda: {name: data}
+def _gltf(name: str, splats: int = 5, **changes: Any) -> Files:
+    """An asset with parts of its description replaced; a function is applied to each of a list's entries."""
+    description, content = gltf_files.asset(splats, 0, False, Random(0))
+    for key, value in changes.items():
+        description[key] = [each | value for each in description[key]] if isinstance(value, dict) else value
+    text = gltf_files.glb(json.dumps(description).encode(), content)
+    return {name: text if name.endswith("glb") else gltf_files.gltf(description, content, None)}
 
 
-def _views(**changes: Any) -> Callable[[], Files]:
-    def made() -> Files:
-        views = json.loads(camera_files.cameras_json())
-        views[0] |= changes
-        return {"cameras.json": json.dumps(views).encode()}
+def _nodes(name: str, number: int, node: dict[str, int], splats: int = 5) -> Bomb:
+    return partial(_gltf, name, splats, nodes=[node] * number, scenes=[{"nodes": list(range(number))}])
 
-    return made
+
+def _ksplat(at: int, size: int, value: int) -> Files:
+    data = bytearray(splat_files.ksplat_originals()[8])
+    data[at : at + size] = value.to_bytes(size, "little")
+    return {"a.ksplat": bytes(data)}
+
+
+def _gzipped_zeros() -> Files:
+    splats = (1 << 24) // (4 * len(_PROPERTIES))
+    plain = _ply(
+        "binary_little_endian", [f"element vertex {splats}", *_PROPERTIES], bytes(4 * len(_PROPERTIES) * splats)
+    )
+    return {"a.ply.gz": gzip.compress(plain()["a.ply"], 9, mtime=0)}
+
+
+# Cameras and pictures -------------------------------------------------------------------------------------------------
+
+
+def _views(**changes: Any) -> Files:
+    views = json.loads(camera_files.cameras_json())
+    return {"cameras.json": json.dumps([views[0] | changes, *views[1:]]).encode()}
 
 
 def _frames(count: int) -> Files:
     content = json.loads(camera_files.transforms_json())
-    content["frames"] *= count // 3
-    return {"transforms.json": json.dumps(content).encode()}
+    return {"transforms.json": json.dumps(content | {"frames": content["frames"] * (count // 3)}).encode()}
 
 
-def _colmap(cameras: int, images: int, points: int) -> Files:
-    files = camera_files.good_colmap_binary()[0]
+def _colmap(cameras: int = 2, images: int = 3, points: int = 0, name: bytes = b"view_0.png\0") -> Files:
+    files = camera_files.colmap_binary_originals()[0]
+    poses = struct.pack("<Q", images) + files["images.bin"][8:].replace(b"view_0.png\0", name)
+    end = poses.index(name) + len(name)
     lenses = struct.pack("<Q", cameras) + files["cameras.bin"][8:]
-    poses = struct.pack("<Q", images) + files["images.bin"][8:]
-    end = poses.index(b"view_0.png\0") + len(b"view_0.png\0")
     return {"images.bin": poses[:end] + struct.pack("<Q", points) + poses[end + 8 :], "cameras.bin": lenses}
 
 
-def _colmap_name() -> Files:
-    files = camera_files.good_colmap_binary()[0]
-    return files | {"images.bin": files["images.bin"].replace(b"view_0.png\0", b"a" * 1_000_000 + b"\0")}
+def _colmap_text(line: bytes) -> Bomb:
+    files = camera_files.colmap_text_originals()[0]
+    return lambda: files | {"images.txt": files["images.txt"] + line}
 
 
-def _colmap_text(line: bytes) -> Files:
-    files = camera_files.good_colmap_text()[0]
-    return files | {"images.txt": files["images.txt"] + line}
-
-
-# Pictures -------------------------------------------------------------------------------------------------------------
-
-
-def _png(
-    width: int, height: int, *others: bytes, rows: int = 0, depth: int = 8, colour: int = 2
-) -> Callable[[], Files]:
+def _png(width: int, height: int, kind: bytes = b"", start: bytes = b"", rows: int = 0) -> Bomb:
+    """Of no rows, or of so many bytes of them; with a chunk of 64 MB behind its start if a kind is given."""
+    others = [picture_files.chunk(kind, start + zlib.compress(bytes(_LONG), 9))] if kind else []
     return lambda: {"a.png": picture_files.png(width, height, 8, 2, bytes(rows), *others)}
-
-
-def _packed(kind: bytes, start: bytes) -> bytes:
-    return picture_files.chunk(kind, start + zlib.compress(bytes(_LONG), 9))
 
 
 def _jpeg(side: int) -> Files:
@@ -287,103 +255,138 @@ def _jpeg(side: int) -> Files:
     return {"a.jpg": bytes(data)}
 
 
+_WEBP = struct.pack("<4sI8sIBI5x", b"RIFF", 22, b"WEBPVP8L", 10, 0x2F, 16382 | 16382 << 14)
+_BIG, _EQUAL = "pictures of 4,000², all splats claimed", "a million equal splats"
+
 #: By format and name.
-BOMBS: dict[str, dict[str, Callable[[], Files]]] = {
+BOMBS: dict[str, dict[str, Bomb]] = {
     "potr": {
-        "one splat, long several": _one_splat(b"SEVE", 0),
-        "one splat, long multiplicity": _one_splat(b"MULT", 0),
-        "one splat, long occupancy": _one_splat(b"OCCU", 1),
-        "one splat, long leaf levels": _one_splat(b"LEAF", 0),
-        "one splat, long tails": _one_splat(b"TAIL", 0),
+        **{
+            f"one splat, long {name.decode()}": partial(_potr, 1, 52, [_run(name, name == b"OCCU", _LONG)])
+            for name in (b"OCCU", b"SEVE", b"MULT", b"LEAF", b"TAIL")
+        },
         "one splat, long metadata": _long_metadata,
-        "a leaf of 4 million splats": lambda: _leaf(1 << 22),
-        "a leaf of 65,536 splats": lambda: _leaf(65_536),
+        "a leaf of 4 million splats": lambda: _potr(1 << 22, 0, _one_leaf(1 << 22)),
         "400,000 equal splats": _equal_splats,
         "a long description": _long_description,
         "1.3 million cells above 32,768 splats": _all_cells,
-        "the most splats that are let through": _as_much_as_is_let_through(1),
-        "the most splats, 7 planes each": _as_much_as_is_let_through(7),
+        "the most splats that are let through": partial(_as_much_as_is_let_through, 1),
+        "the most splats, 7 planes each": partial(_as_much_as_is_let_through, 7),
         "1,000 blocks of 65,536 splats": lambda: _potr(65_536, 0, _one_leaf(65_536), blocks=1000),
-        "2,000 blocks of a splat": _blocks_of_one_splat(2000),
+        "2,000 blocks of a splat": partial(_blocks_of_one_splat, 2000),
     },
     "ply": {
-        "2³¹ splats claimed, binary": lambda: _ply_count("binary_little_endian", 1 << 31),
-        "10¹⁸ splats claimed, text": lambda: _ply_count("ascii", 10**18),
-        "10¹² rows of an element without properties": _ply_empty_elements,
-        "30,000 properties": _ply_properties,
-        "50,000 elements": _ply_elements,
-        "a row of 500,000 numbers": _ply_long_line,
-        "a number of a million digits": _ply_long_number,
-        "100,000 comments": _ply_comments,
+        "2³¹ splats claimed": _ply("binary_little_endian", [f"element vertex {1 << 31}", *_PROPERTIES], bytes(1000)),
+        "10¹⁸ splats claimed": _ply("ascii", [f"element vertex {10**18}", *_PROPERTIES], b"0 " * 1000),
+        "10¹² empty rows": _ply("ascii", [f"element nothing {10**12}", *_ONE], b"0 " * len(_PROPERTIES) + b"\n"),
+        "30,000 properties": _ply(
+            "binary_little_endian", [*_ONE, *(f"property double p{i}" for i in range(30_000))], bytes(300_000)
+        ),
+        "50,000 elements": _ply("ascii", [*(f"element e{i} 0" for i in range(50_000)), *_ONE], b"0 " * 20),
+        "a row of 500,000 numbers": _ply("ascii", _ONE, b"0 " * 500_000),
+        "a number of a million digits": _ply("ascii", _ONE, b"9" * 1_000_000 + b" 0" * (len(_PROPERTIES) - 1) + b"\n"),
+        "100,000 comments": _ply("ascii", ["comment"] * 100_000, b""),
     },
-    "compressed.ply": {
-        "2³⁰ splats claimed": lambda: _compressed_count(1 << 30),
-        "10⁹ splats claimed": lambda: _compressed_count(10**9),
-    },
+    "compressed.ply": {"2³⁰ splats claimed": partial(_compressed_count, 1 << 30)},
     "spz": {
-        "a million equal splats, gzip": lambda: _spz_gzip(3, 1_000_000),
-        "65,536 equal splats, gzip": lambda: _spz_gzip(2, 65_536),
-        "64 MB behind one splat, gzip": lambda: _spz_gzip(3, 1, _LONG),
-        "64 MB as an extension, gzip": lambda: _spz_gzip(3, 1, _LONG, 2),
+        f"{_EQUAL}, gzip": partial(_spz_gzip, 3, 1_000_000),
+        "64 MB behind one splat, gzip": partial(_spz_gzip, 3, 1, _LONG),
+        "64 MB as an extension, gzip": partial(_spz_gzip, 3, 1, _LONG, 2),
         "128 MB in further members, gzip": _spz_members,
-        "a million equal splats, Zstandard": lambda: _spz_streams(1_000_000),
-        "65,536 equal splats, Zstandard": lambda: _spz_streams(65_536),
-        "streams of a million, one splat claimed": lambda: _spz_streams(1_000_000, 1),
+        f"{_EQUAL}, Zstandard": partial(_spz_streams, 1_000_000),
+        "streams of a million, one splat claimed": partial(_spz_streams, 1_000_000, 1),
     },
     "sog": {
-        "pictures of 4,000², all splats claimed": lambda: _sog_pictures(4000, 16_000_000),
-        "pictures of 4,000², one splat claimed": lambda: _sog_pictures(4000, 1),
-        "pictures of 256², all splats claimed": lambda: _sog_pictures(256, 65_536),
-        "64 MB of blanks as description": lambda: _sog_member("meta.json", b" " * _LONG + b"{}"),
-        "64 MB of brackets as description": lambda: _sog_member("meta.json", b"[" * _LONG),
-        "64 MB as a picture": lambda: _sog_member("means_l.webp", bytes(_LONG)),
+        _BIG: lambda: _sog(sog_files.equal_splats(4000, 16_000_000)),
+        "pictures of 4,000², one splat claimed": lambda: _sog(sog_files.equal_splats(4000, 1)),
+        "64 MB of blanks as description": lambda: _sog(sog_files.parts(4, 0) | {"meta.json": b" " * _LONG + b"{}"}),
+        "64 MB of brackets as description": lambda: _sog(sog_files.parts(4, 0) | {"meta.json": b"[" * _LONG}),
+        "64 MB as a picture": lambda: _sog(sog_files.parts(4, 0) | {"means_l.webp": bytes(_LONG)}),
         "48 GB by 3,000 names for one member": _sog_overlapping,
-        "a codebook of a million": lambda: _sog_meta(sh0={"codebook": [0] * 1_000_000, "files": ["sh0.webp"]}),
+        "a codebook of a million": lambda: _sog(
+            sog_files.parts(4, 0), sh0={"codebook": [0] * 1_000_000, "files": ["sh0.webp"]}
+        ),
     },
-    **scene_bomb_files.BOMBS,
+    "sog-folder": {
+        _BIG: lambda: sog_files.equal_splats(4000, 16_000_000),
+        "a device as a picture": lambda: {
+            **sog_files.parts(5, 0),
+            "meta.json": sog_files.parts(5, 0)["meta.json"].replace(b'"sh0.webp"', b'"/dev/zero"'),
+        },
+    },
+    "sog-levels": {
+        "1,000 folders of 65,536 splats claimed": partial(_levels, 1000),
+        "one splat in 100,000 leaves": partial(_leaves, 100_000, 1),
+        "2⁶⁰ splats claimed in a leaf": partial(_leaves, 1, 1 << 60),
+        **_nested("lod-meta.json", b'{"tree":{"children":['),
+    },
+    "glb": {
+        "65,536 nodes with one mesh": _nodes("a.glb", 65_536, {"mesh": 0}, 100),
+        "65,536 nodes with one splat": _nodes("a.glb", 65_536, {"mesh": 0}, 1),
+        "2³¹ splats claimed": partial(_gltf, "a.glb", accessors={"count": (1 << 31) - 1}),
+        "16 million splats claimed in nothing": partial(
+            _gltf, "a.glb", accessors={"count": 1 << 24, "bufferView": None}
+        ),
+        "a stride of nothing": partial(_gltf, "a.glb", accessors={"count": 1 << 24}, bufferViews={"byteStride": 0}),
+        "4 GB claimed in the header": _is("a.glb", b"glTF\2\0\0\0" + b"\xff" * 4 + b"\xf0\xff\xff\xffJSON{}"),
+        "100,000 nested objects": lambda: {"a.glb": gltf_files.glb(b'{"asset":' * 100_000, b"")},
+    },
+    "gltf": {
+        "500,000 empty nodes": _nodes("a.gltf", 500_000, {}),
+        "a chain of 20,000 nodes": partial(
+            _gltf, "a.gltf", nodes=[*({"children": [k + 1], "scale": [2] * 3} for k in range(20_000)), {"mesh": 0}]
+        ),
+        "16 MB in base64 that is none": lambda: {
+            "a.gltf": gltf_files.gltf(
+                gltf_files.asset(5, 0, False, Random(0))[0], b"", "data:;base64," + "!" * (1 << 24)
+            )
+        },
+    },
+    "splat": {"empty": _is("a.splat", b"")},
+    "ksplat": {
+        "2³² sections claimed": partial(_ksplat, 4, 4, 0xFFFFFFFF),
+        "2³² splats claimed": partial(_ksplat, 4100, 4, 0xFFFFFFFF),
+        "2³² buckets of 2³² claimed": partial(_ksplat, 4104, 4, 0xFFFFFFFF),
+        "a bucket of 2³² splats": partial(_ksplat, 5120, 4, 0xFFFFFFFF),
+    },
+    "ply.gz": {
+        "64 MB of blanks": lambda: {"a.ply.gz": gzip.compress(b" " * _LONG, 9, mtime=0)},
+        "16 MB of splats in zeros": _gzipped_zeros,
+        "members without content": lambda: {"a.ply.gz": gzip.compress(b"", mtime=0) * 100_000},
+    },
     "cameras.json": {
-        "100,000 brackets": _json("cameras.json", b"[" * 100_000),
-        "100,000 nested objects": _json("cameras.json", b'{"a":' * 100_000),
-        "a number of a million digits": _json("cameras.json", b"[" + b"9" * 1_000_000 + b"]"),
-        "a number of 10⁹ as exponent": _json("cameras.json", b"[1e1000000000]"),
-        "500,000 empty views": _json("cameras.json", b"[" + b"{}," * 500_000 + b"{}]"),
-        "a name of a million letters": _views(img_name="a" * 1_000_000),
-        "a name of a million folders": _views(img_name="a/" * 500_000 + "a.png"),
-        "a matrix of a million": _views(rotation=[[0] * 1000] * 1000),
+        "100,000 brackets": _is("cameras.json", b"[" * 100_000),
+        "a number of a million digits": _is("cameras.json", b"[" + b"9" * 1_000_000 + b"]"),
+        "500,000 empty views": _is("cameras.json", b"[" + b"{}," * 500_000 + b"{}]"),
+        "a name of a million folders": partial(_views, img_name="a/" * 500_000 + "a.png"),
+        "a matrix of a million": partial(_views, rotation=[[0] * 1000] * 1000),
+        **_nested("cameras.json", b'{"a":'),
     },
     "transforms.json": {
-        "30,000 frames of one name": lambda: _frames(30_000),
-        "100,000 nested objects": _json("transforms.json", b'{"frames":' * 100_000),
+        "30,000 frames of one name": partial(_frames, 30_000),
+        **_nested("transforms.json", b'{"frames":'),
     },
     "colmap-binary": {
-        "2⁶³ cameras claimed": lambda: _colmap(1 << 63, 3, 0),
-        "2⁶³ images claimed": lambda: _colmap(2, 1 << 63, 0),
-        "2⁶³ points claimed": lambda: _colmap(2, 3, 1 << 63),
-        "points that wrap round": lambda: _colmap(2, 3, (1 << 64) // 24 + 1),
-        "a name of a million letters": _colmap_name,
+        "2⁶³ cameras claimed": partial(_colmap, 1 << 63),
+        "2⁶³ images claimed": partial(_colmap, images=1 << 63),
+        "points that wrap round": partial(_colmap, points=(1 << 64) // 24 + 1),
+        "a name of a million letters": partial(_colmap, name=b"a" * 1_000_000 + b"\0"),
     },
     "colmap-text": {
-        "a line of a million words": lambda: _colmap_text(b"1 " * 1_000_000),
-        "a number of a million digits": lambda: _colmap_text(b"9" * 1_000_000 + b" 1 0 0 0 0 0 2 1 a.png\n\n"),
-        "500,000 empty lines": lambda: _colmap_text(b"\n" * 500_000),
+        "a line of a million words": _colmap_text(b"1 " * 1_000_000),
+        "a number of a million digits": _colmap_text(b"9" * 1_000_000 + b" 1 0 0 0 0 0 2 1 a.png\n\n"),
+        "500,000 empty lines": _colmap_text(b"\n" * 500_000),
     },
     "png": {
         "65,535² pixels, no rows": _png(65_535, 65_535),
-        "2³¹ x 1 pixels, no rows": _png((1 << 31) - 1, 1),
         "64 MB behind a pixel": _png(1, 1, rows=_LONG),
-        "64 MB as a text": lambda: _png(8, 8, _packed(b"zTXt", b"a\0\0"), rows=25 * 8)(),
-        "64 MB as an international text": lambda: _png(8, 8, _packed(b"iTXt", b"a\0\1\0\0\0"), rows=25 * 8)(),
-        "64 MB as a colour profile": lambda: _png(8, 8, _packed(b"iCCP", b"a\0\0"), rows=25 * 8)(),
-        "an animation of 10⁹ frames": _png(
-            8, 8, picture_files.chunk(b"acTL", struct.pack(">II", 10**9, 0)), rows=25 * 8
-        ),
+        "64 MB as a text": _png(8, 8, b"zTXt", b"a\0\0", 25 * 8),
+        "64 MB as an international text": _png(8, 8, b"iTXt", b"a\0\1\0\0\0", 25 * 8),
+        "64 MB as a colour profile": _png(8, 8, b"iCCP", b"a\0\0", 25 * 8),
     },
-    "jpeg": {"65,500² pixels": lambda: _jpeg(65_500)},
+    "jpeg": {"65,500² pixels": partial(_jpeg, 65_500)},
     "webp": {
-        "16,383² pixels claimed": lambda: {
-            "a.webp": b"RIFF" + struct.pack("<I", 22) + b"WEBPVP8L" + struct.pack("<I", 10)
-            + b"\x2f" + struct.pack("<I", 16382 | 16382 << 14) + bytes(5)
-        },
+        "16,383² pixels claimed": _is("a.webp", _WEBP),
         "2,000² equal pixels": lambda: {"a.webp": sog_files.one_colour(2000)},
     },
-}  # fmt: skip
+}

@@ -7,210 +7,121 @@ import math
 import struct
 from functools import cache
 from random import Random
-from typing import Any
 
-from tools.stress.hostile.changes import (
-    NUMBERS,
-    TEXTS,
-    damaged,
-    damaged_json,
-    damaged_text,
-    damaged_value,
-    interesting,
-    interesting_double,
-    json_bytes,
-    strange,
-)
+from tools.stress.hostile.changes import TEXTS, Files, Rules, changed_files
 from tools.stress.hostile.picture_files import small_png
 
-#: A file or several that belong together, by their names; the first is what is read.
-Files = dict[str, bytes]
-
 _SIMPLE_PINHOLE, _PINHOLE = 0, 1
+_SIDES = (0, 1, -1, 64.5, 65536, 65537, 2**31, True, None, "64", 1e400)
+_FOCAL = (0, -1, 1e-300, 1e300, float("nan"), float("inf"), "60", None, [60])
+_NAMES = (*TEXTS, "view_0.png", "images/view_0.png", 0, None)
+_MATRICES = ([[0.0] * 3] * 3, [[1e300] * 4] * 4, [[1.0] * 4] * 4, [[1, 0, 0]], [1, 2, 3], [0.0] * 16, None)
+_PICTURES = (small_png(), small_png()[:40], b"no picture", b"GIF89a", b"")
+_HINTS = {
+    **dict.fromkeys(("width", "height", "w", "h"), _SIDES),
+    **dict.fromkeys(("fx", "fy", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "k1", "k4"), _FOCAL),
+    **dict.fromkeys(("img_name", "file_path"), _NAMES),
+    **dict.fromkeys(("train_filenames", "val_filenames"), ([], ["a"], _NAMES, None)),
+    **dict.fromkeys(("rotation", "transform_matrix", "applied_transform", "transform"), _MATRICES),
+    "position": ([0, 0], [1e300] * 3, [None] * 3, "a"), "split": ("train", "test", "both", None, 0),
+    "camera_model": ("PINHOLE", "OPENCV_FISHEYE", "FULL_OPENCV", "", None), "is_fisheye": (True, 0),
+    "scale": (0, -1, 1e300, None),
+}  # fmt: skip
+
+
+def _turn(angle: float) -> list[list[float]]:
+    c, s = math.cos(angle), math.sin(angle)
+    return [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]
 
 
 @cache
 def cameras_json() -> bytes:
     """A good cameras.json with three views."""
-    views = []
-    for k in range(3):
-        c, s = math.cos(k), math.sin(k)
-        views.append(
-            {
-                "id": k,
-                "img_name": f"view_{k}.png",
-                "width": 64,
-                "height": 48,
-                "position": [float(k), 0.5, -2.0],
-                "rotation": [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]],
-                "fx": 60.0,
-                "fy": 61.0,
-            }
-        )
+    shared = {"width": 64, "height": 48, "fx": 60.0, "fy": 61.0}
+    views = [
+        {"id": k, "img_name": f"view_{k}.png", "position": [float(k), 0.5, -2.0], "rotation": _turn(k), **shared}
+        for k in range(3)
+    ]
     return json.dumps(views).encode()
 
 
-def good_cameras_json() -> list[Files]:
-    return [{"cameras.json": cameras_json()}]
-
-
-def changed_cameras_json(rng: Random) -> Files:
-    data = cameras_json()
-    if rng.random() < 0.6:
-        views = json.loads(data)
-        for _ in range(1 + rng.randrange(2)):
-            view = rng.choice(views)
-            key = rng.choice([*view, "split"])
-            view[key] = strange(rng) if rng.random() < 0.5 else damaged_value(view.get(key, "train"), rng)
-        data = json_bytes(views)
-    else:
-        data = damaged_json(data, rng)
-    files = {"cameras.json": data}
-    if rng.random() < 0.1:
-        files["images/view_0.png"] = rng.choice((small_png(), b"no picture", b""))
-    return files
-
-
 @cache
-def transforms_json() -> bytes:
-    """A good transforms.json of nerfstudio with three frames."""
+def transforms_json(sides: bool = True) -> bytes:
+    """A good transforms.json of nerfstudio with three frames; without sides the pictures tell these."""
     frames = []
     for k in range(3):
-        c, s = math.cos(k), math.sin(k)
-        rows = [[c, -s, 0.0, 1.0], [s, c, 0.0, 2.0], [0.0, 0.0, 1.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
-        frames.append({"file_path": f"images/view_{k}.png", "transform_matrix": rows})
+        rows = [[*row, k + 1.0] for k, row in enumerate(_turn(k))]
+        frames.append({"file_path": f"images/view_{k}.png", "transform_matrix": [*rows, [0.0, 0.0, 0.0, 1.0]]})
     content = {
-        "camera_model": "OPENCV", "fl_x": 60.0, "fl_y": 61.0, "cx": 32.0, "cy": 24.0, "w": 64, "h": 48, "k1": 0.0,
-        "p1": 0.0, "applied_transform": [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0]],
+        "camera_model": "OPENCV", "fl_x": 60.0, "fl_y": 61.0, "cx": 32.0, "cy": 24.0, **({"w": 64} if sides else {}),
+        "h": 48, "k1": 0.0, "p1": 0.0,
+        "applied_transform": [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0]],
         "train_filenames": ["images/view_0.png", "images/view_1.png"], "frames": frames,
     }  # fmt: skip
     return json.dumps(content).encode()
 
 
-_BESIDE = {"transform": [[1.0, 0.0, 0.0, 0.1], [0.0, 1.0, 0.0, 0.2], [0.0, 0.0, 1.0, 0.3]], "scale": 0.25}
+_BESIDE = json.dumps(
+    {"transform": [[1.0, 0.0, 0.0, 0.1], [0.0, 1.0, 0.0, 0.2], [0.0, 0.0, 1.0, 0.3]], "scale": 0.25}
+).encode()
 
 
-def good_transforms_json() -> list[Files]:
-    content = json.loads(transforms_json())
-    del content["w"]
-    pictures = {frame["file_path"]: small_png() for frame in content["frames"]}
+def cameras_originals() -> list[Files]:
+    return [{"cameras.json": cameras_json()}]
+
+
+def transforms_originals() -> list[Files]:
     return [
         {"transforms.json": transforms_json()},
-        {"transforms.json": transforms_json(), "dataparser_transforms.json": json.dumps(_BESIDE).encode()},
-        {"transforms.json": json_bytes(content), **pictures},
+        {"transforms.json": transforms_json(), "dataparser_transforms.json": _BESIDE},
+        {"transforms.json": transforms_json(False), **{f"images/view_{k}.png": small_png() for k in range(3)}},
     ]
 
 
-def changed_transforms_json(rng: Random) -> Files:
-    content = json.loads(transforms_json())
-    kind = rng.randrange(10)
-    for _ in range(1 + rng.randrange(2)):
-        if kind < 4:
-            key = rng.choice([*content, "camera_angle_x", "camera_angle_y", "is_fisheye", "val_filenames", "k4"])
-            content[key] = strange(rng) if rng.random() < 0.5 else damaged_value(content.get(key, 0.5), rng)
-        elif kind < 8:
-            frame = rng.choice(content["frames"])
-            key = rng.choice([*frame, "w", "fl_x", "camera_angle_x"])
-            frame[key] = strange(rng) if rng.random() < 0.5 else damaged_value(frame.get(key, 1), rng)
-    if rng.random() < 0.15:
-        del content["w"]
-    data = json_bytes(content) if kind < 8 else damaged_json(transforms_json(), rng)
-    files = {rng.choice(("transforms.json", "transforms.json", "transforms_test.json")): data}
-    if rng.random() < 0.2:
-        beside = json.dumps(_BESIDE).encode()
-        files["dataparser_transforms.json"] = damaged_json(beside, rng) if rng.random() < 0.7 else beside
-    if rng.random() < 0.1:
-        files["images/view_0.png"] = rng.choice((small_png(), damaged(small_png(), rng), b"GIF89a", b""))
-    return files
+def colmap_binary_originals() -> list[Files]:
+    """Cameras: number, lens, sides, parameters; images: number, pose, camera, name, points."""
+    lenses = struct.pack("<Q", 2)
+    for number, model, params in ((1, _PINHOLE, (60.0, 61.0, 32.0, 24.0)), (2, _SIMPLE_PINHOLE, (60.0, 32.0, 24.0))):
+        lenses += struct.pack(f"<IiQQ{len(params)}d", number, model, 64, 48, *params)
+    poses = struct.pack("<Q", 3)
+    for k in range(3):
+        poses += struct.pack("<I7dI", k + 1, 1.0, 0.0, 0.0, 0.0, float(k), 0.0, 2.0, 1 + k % 2)
+        poses += b"view_%d.png\0" % k + struct.pack("<Q", k % 2) + bytes(24 * (k % 2))
+    return [{"images.bin": poses, "cameras.bin": lenses}]
 
 
-def _model() -> tuple[list[Any], list[Any]]:
-    """Cameras and images of a model: number, lens, sides, parameters; number, pose, camera, name, points."""
-    cameras = [(1, _PINHOLE, 64, 48, [60.0, 61.0, 32.0, 24.0]), (2, _SIMPLE_PINHOLE, 64, 48, [60.0, 32.0, 24.0])]
-    images = [(k + 1, [1.0, 0.0, 0.0, 0.0], [float(k), 0.0, 2.0], 1 + k % 2, f"view_{k}.png", k % 2) for k in range(3)]
-    return cameras, images
+#: Of the counts, and of the first camera and image.
+_FIELDS = {
+    "cameras.bin": ((0, 8), (8, 4), (12, 4), (16, 8), (24, 8), *((32 + 8 * k, 8) for k in range(4))),
+    "images.bin": ((0, 8), (8, 4), *((12 + 8 * k, 8) for k in range(7)), (68, 4), (72, 8), (83, 8)),
+}
 
 
-def _binary(cameras: list[Any], images: list[Any], said: list[int], rng: Random) -> Files:
-    lenses = struct.pack("<Q", said[0])
-    for number, model, width, height, params in cameras:
-        lenses += struct.pack(f"<IiQQ{len(params)}d", number, model, width, height, *params)
-    poses = struct.pack("<Q", said[1])
-    for number, rotation, translation, camera, name, points in images:
-        poses += struct.pack("<I7dI", number, *rotation, *translation, camera)
-        poses += name.encode("utf-8", "surrogatepass") + b"\0" + struct.pack("<Q", points)
-        poses += rng.randbytes(24) * min(points, 3)
-    return {"images.bin": poses, "cameras.bin": lenses}
+def colmap_text_originals() -> list[Files]:
+    cameras = b"# cameras\n1 PINHOLE 64 48 60.0 61.0 32.0 24.0\n2 SIMPLE_PINHOLE 64 48 60.0 32.0 24.0\n"
+    poses = (b"1 1.0 0.0 0.0 0.0 0.0 0.0 2.0 1 view_0.png", b"2 0.8 0.6 0.0 0.0 1.0 0.0 2.0 2 a b.png\n1.0 2.0 -1")
+    images = b"# images\n%b\n\n%b\n3 1.0 0.0 0.0 0.0 2.0 0.0 2.0 1 view_2.png\n\n" % poses
+    return [{"images.txt": images, "cameras.txt": cameras}]
 
 
-def good_colmap_binary() -> list[Files]:
-    return [_binary(*_model(), [2, 3], Random(0))]
+_IN_JSON = Rules(_HINTS, beside={"images/view_0.png": _PICTURES})
+_BESIDE_JSON = Rules(_HINTS, beside={"images/view_0.png": _PICTURES, "dataparser_transforms.json": (_BESIDE, b"{}")})
+_IN_MODEL = Rules(fields=lambda name, data: _FIELDS.get(name, ()))
+
+
+def changed_cameras(rng: Random) -> Files:
+    return changed_files(cameras_originals()[0], rng, _IN_JSON)
+
+
+def changed_transforms(rng: Random) -> Files:
+    files = changed_files(rng.choice(transforms_originals()), rng, _BESIDE_JSON)
+    name = rng.choice(("transforms.json", "transforms.json", "transforms_test.json"))
+    return {name: files.pop("transforms.json"), **files}
 
 
 def changed_colmap_binary(rng: Random) -> Files:
-    cameras, images = _model()
-    if rng.random() < 0.6:
-        _change_model(cameras, images, rng)
-    said = [len(cameras), len(images)]
-    if rng.random() < 0.15:
-        said[rng.randrange(2)] = interesting(rng, 8)
-    files = _binary(cameras, images, said, rng)
-    for name, chance in (("cameras.bin", 0.25), ("images.bin", 0.35)):
-        if rng.random() < chance:
-            files[name] = damaged(files[name], rng)
-    return files
-
-
-def _change_model(cameras: list[Any], images: list[Any], rng: Random) -> None:
-    """Other numbers, names and references in a model."""
-    for _ in range(1 + rng.randrange(2)):
-        if rng.random() < 0.4:
-            at = rng.randrange(len(cameras))
-            camera = list(cameras[at])
-            which = rng.randrange(5)
-            if which == 4:
-                camera[4] = list(camera[4])
-                camera[4][rng.randrange(len(camera[4]))] = interesting_double(rng)
-            else:
-                camera[which] = interesting(rng, 4) >> 1 if which == 1 else interesting(rng, 4 if which == 0 else 8)
-                if which == 1:
-                    camera[1] = rng.choice((camera[1], 0, 1, 2, 5, -1))
-            cameras[at] = tuple(camera)
-        else:
-            at = rng.randrange(len(images))
-            image = list(images[at])
-            which = rng.randrange(6)
-            if which in (1, 2):
-                image[which] = list(image[which])
-                image[which][rng.randrange(len(image[which]))] = interesting_double(rng)
-            elif which == 4:
-                image[4] = rng.choice((*TEXTS, "view_0.png"))
-            elif which == 5:
-                image[5] = interesting(rng, 8)
-            else:
-                image[which] = rng.choice((interesting(rng, 4), 1, 2, 3))
-            images[at] = tuple(image)
-
-
-_TEXT_CAMERAS = b"# cameras\n1 PINHOLE 64 48 60.0 61.0 32.0 24.0\n2 SIMPLE_PINHOLE 64 48 60.0 32.0 24.0\n"
-_TEXT_IMAGES = (
-    b"# images\n1 1.0 0.0 0.0 0.0 0.0 0.0 2.0 1 view_0.png\n\n2 0.8 0.6 0.0 0.0 1.0 0.0 2.0 2 a b.png\n1.0 2.0 -1\n"
-    b"3 1.0 0.0 0.0 0.0 2.0 0.0 2.0 1 view_2.png\n\n"
-)
-
-
-def good_colmap_text() -> list[Files]:
-    return [{"images.txt": _TEXT_IMAGES, "cameras.txt": _TEXT_CAMERAS}]
+    return changed_files(colmap_binary_originals()[0], rng, _IN_MODEL)
 
 
 def changed_colmap_text(rng: Random) -> Files:
-    cameras, images = _TEXT_CAMERAS, _TEXT_IMAGES
-    for _ in range(1 + rng.randrange(2)):
-        if rng.random() < 0.4:
-            cameras = damaged_text(cameras, rng)
-        else:
-            images = damaged_text(images, rng)
-    if rng.random() < 0.05:
-        word = rng.choice(NUMBERS).encode()
-        cameras = cameras.replace(b"64", word)
-    return {"images.txt": images, "cameras.txt": cameras}
+    return changed_files(colmap_text_originals()[0], rng, _IN_MODEL)

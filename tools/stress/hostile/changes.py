@@ -1,14 +1,21 @@
-"""Changes to bytes, numbers and texts that break parsers (:func:`damaged`, :func:`damaged_text`, :func:`strange`).
+"""Changes that break parsers, of one file or several (:func:`changed_files`), of bytes, numbers, texts and JSON.
 
-All of them take a ``random.Random``, so that a seed repeats them.
+All of them take a ``random.Random``, so that a seed repeats them. A format says only what its good files are, and what
+is worth changing in them: :class:`Rules`.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import gzip
 import json
 import struct
+from collections.abc import Callable, Mapping, Sequence
 from random import Random
 from typing import Any
+
+#: A file or several that belong together, by their names; the first is what is read.
+Files = dict[str, bytes]
 
 #: Numbers as a text file may spell them.
 NUMBERS = (
@@ -124,53 +131,149 @@ def strange(rng: Random) -> Any:
     return interesting_double(rng)
 
 
-def damaged_value(value: Any, rng: Random) -> Any:
-    """A JSON value with one change somewhere inside it; ``value`` itself stays as it is."""
+Hints = Mapping[str, Sequence[Any]]
+
+
+def damaged_value(value: Any, rng: Random, hints: Hints | None = None) -> Any:
+    """A JSON value with one change somewhere inside it; ``value`` itself stays as it is.
+
+    Args:
+        hints: values for keys that mean something, and keys that could be there.
+    """
+    hints = hints or {}
+    kind = rng.randrange(8)
     if isinstance(value, dict) and value and rng.random() < 0.9:
         changed = dict(value)
         key = rng.choice(list(changed))
-        kind = rng.randrange(8)
         if kind == 0:
             del changed[key]
         elif kind == 1:
-            changed[rng.choice(TEXTS)] = strange(rng)
+            key = rng.choice([*TEXTS, *hints])
+            changed[key] = strange(rng)
         elif kind == 2:
             changed[key] = strange(rng)
         else:
-            changed[key] = damaged_value(changed[key], rng)
+            inside = isinstance(changed[key], (dict, list)) and (key not in hints or rng.random() < 0.7)
+            at_hand = key in hints and not inside
+            changed[key] = rng.choice(hints[key]) if at_hand else damaged_value(changed[key], rng, hints)
         return changed
     if isinstance(value, list) and value and rng.random() < 0.9:
         several = list(value)
         at = rng.randrange(len(several))
-        kind = rng.randrange(8)
         if kind == 0:
             del several[at]
         elif kind == 1:
             several[at:at] = several[:2]
-        elif kind == 2:
-            several[at] = strange(rng)
         else:
-            several[at] = damaged_value(several[at], rng)
+            several[at] = strange(rng) if kind == 2 else damaged_value(several[at], rng, hints)
         return several
     return strange(rng)
 
 
-def damaged_json(data: bytes, rng: Random) -> bytes:
+def damaged_json(data: bytes, rng: Random, hints: Hints | None = None) -> bytes:
     """A JSON file with changed values, or changed as a text."""
-    if rng.random() < 0.25:
+    if rng.random() < 0.2:
         return damaged_text(data, rng)
     try:
         value = json.loads(data)
     except (ValueError, RecursionError):  # an earlier change has been here
         return damaged(data, rng)
-    for _ in range(1 + rng.randrange(3)):
-        value = damaged_value(value, rng)
-    return json_bytes(value)
-
-
-def json_bytes(value: Any) -> bytes:
-    """A value as JSON, also where strict JSON has no word for it; nothing where it is nested too deeply."""
+    for _ in range(1 + rng.choice((0, 0, 1, 2))):
+        value = damaged_value(value, rng, hints)
     try:
         return json.dumps(value).encode()
     except (RecursionError, ValueError):  # too deep, or an integer of too many digits
         return b"[" * 3000
+
+
+# ---------------------------------------------------------------------------------------------------- files
+
+
+@dataclasses.dataclass(frozen=True)
+class Rules:
+    """What is worth changing in the files of a format.
+
+    Attributes:
+        hints: of JSON (:func:`damaged_value`).
+        fields: where numbers stand in a file of a name: offsets and sizes, with minus for big endian.
+        others: makes another content for a file of a name now and then.
+        beside: files that may lie beside, by name, some of which are put there now and then.
+    """
+
+    hints: Hints = dataclasses.field(default_factory=dict)
+    fields: Callable[[str, bytes], Sequence[tuple[int, int]]] = lambda name, data: ()
+    others: Callable[[str, bytes, Random], bytes | None] = lambda name, data, rng: None
+    beside: Mapping[str, Sequence[bytes]] = dataclasses.field(default_factory=dict)
+
+
+def changed_files(files: Files, rng: Random, rules: Rules) -> Files:
+    """Some files with one to three changes: of the first, mostly, of others, or of which there are."""
+    files = dict(files)
+    for _ in range(1 + rng.choice((0, 0, 1))):
+        names = list(files)
+        name = names[0] if rng.random() < 0.5 else rng.choice(names)
+        if len(names) > 1 and rng.random() < 0.08:
+            other = rng.choice(names[1:])
+            files[other], files[name] = files[name], files[other]
+        elif len(names) > 1 and rng.random() < 0.08:
+            del files[rng.choice(names[1:])]
+        elif rules.beside and rng.random() < 0.15:
+            beside = rng.choice(list(rules.beside))
+            files[beside] = rng.choice(rules.beside[beside])
+        else:
+            files[name] = _changed(name, files[name], rng, rules)
+    return files
+
+
+def _changed(name: str, data: bytes, rng: Random, rules: Rules) -> bytes:
+    other = rules.others(name, data, rng) if rng.random() < 0.4 else None
+    if other is not None:
+        return other
+    fields = rules.fields(name, data) if data and rng.random() < 0.75 else ()
+    if fields:
+        return with_number(data, rng, fields)
+    if name.endswith((".json", ".gltf")):
+        return damaged_json(data, rng, rules.hints)
+    return damaged_text(data, rng) if name.endswith(".txt") else damaged(data, rng)
+
+
+def with_number(data: bytes, rng: Random, fields: Sequence[tuple[int, int]]) -> bytes:
+    """A file in one or two of whose fields another number stands."""
+    out = bytearray(data)
+    for _ in range(1 + rng.randrange(2)):
+        at, signed_size = rng.choice(fields)
+        size, order = abs(signed_size), "<" if signed_size > 0 else ">"
+        byteorder: Any = "little" if signed_size > 0 else "big"
+        old = int.from_bytes(out[at : at + size], byteorder)
+        if size in (4, 8) and rng.random() < 0.2:
+            out[at : at + size] = packed_real(interesting_double(rng), order + "fd"[size == 8])
+        else:
+            number = rng.choice((interesting(rng, size), rng.randrange(9), old + 1, max(old - 1, 0)))
+            out[at : at + size] = (number % (1 << 8 * size)).to_bytes(size, byteorder)
+    return bytes(out)
+
+
+def packed_real(value: float, code: str) -> bytes:
+    """Of any double, also one that single precision has not."""
+    try:
+        return struct.pack(code, value)
+    except OverflowError:
+        return struct.pack(code, float("inf"))
+
+
+def gzipped(raw: bytes, rng: Random) -> bytes:
+    """Packed by gzip: as it should be, or with members, sums, names or ends that few expect."""
+    kind = rng.randrange(10)
+    packed = gzip.compress(raw, rng.choice((0, 1, 9)), mtime=0)
+    if kind == 0:
+        return raw  # not packed at all
+    if kind == 1:  # several members, one after another
+        half = rng.randrange(len(raw) + 1)
+        return gzip.compress(raw[:half], 1, mtime=0) + gzip.compress(raw[half:], 1, mtime=0)
+    if kind == 2:  # a name, a comment and more in gzip's own header
+        return b"\x1f\x8b\x08\x1c" + bytes(6) + b"\3\0abc" + b"\x1b[2Jname\0comment\0" + packed[10:]
+    if kind == 3:
+        return packed + rng.choice((b"\0" * 10, rng.randbytes(9), packed, b"\x1f\x8b"))
+    if kind == 4:  # the sizes at the end say something else
+        return packed[:-8] + struct.pack("<II", interesting(rng, 4), len(raw))
+    return damaged(packed, rng) if kind == 5 else packed

@@ -21,18 +21,14 @@ from potr_cl.report.file import file_report, format_report
 from tools.stress.hostile import (
     camera_files,
     gltf_files,
-    gzip_files,
     picture_files,
     ply_files,
     potr_files,
     sog_files,
-    sog_folder_files,
     splat_files,
     spz_files,
-)
-
-#: Files that belong together, by their names relative to one folder; the first is what is read.
-Files = dict[str, bytes]
+)  # fmt: skip
+from tools.stress.hostile.changes import Files
 
 MIB = 1 << 20
 #: Bytes that a pixel of a photograph may take while it is read.
@@ -134,55 +130,47 @@ def parts_of(result: Any) -> list[bytes]:
     return [repr(result).encode()]
 
 
-def _single(
-    name: str, good: Callable[[], list[bytes]], changed: Callable[[Random], bytes], *others: Any, **more: Any
-) -> Format:
-    """A format whose files stand alone."""
+def _scene(
+    good: Callable[[], list[Any]], changed: Callable[[Random], Any], constant: int, a_byte: int, name: str = "",
+    read: Callable[[Path], Any] = read_scene,
+) -> Format:  # fmt: skip
+    """A format of scenes; with a name: of files that stand alone."""
+    return _format(good, changed, name, read, constant * MIB, a_byte, twice=True)
+
+
+def _cameras(good: Callable[[], list[Files]], changed: Callable[[Random], Files]) -> Format:
+    return Format(good, changed, read_cameras, 32 * MIB, 128)
+
+
+def _picture(good: Callable[[], list[bytes]], changed: Callable[[Random], bytes], name: str) -> Format:
+    return _format(good, changed, name, read_picture, MIB, 64, beyond=bytes_of_pixels)
+
+
+def _format(good: Callable[[], Any], changed: Callable[[Random], Any], name: str, *others: Any, **more: Any) -> Format:
+    if not name:
+        return Format(good, changed, *others, **more)
     return Format(lambda: [{name: data} for data in good()], lambda rng: {name: changed(rng)}, *others, **more)
-
-
-def _picture(name: str, good: Callable[[], list[bytes]], changed: Callable[[Random], bytes]) -> Format:
-    return _single(name, good, changed, read_picture, MIB, 64, bytes_of_pixels)
 
 
 #: By name. docs/security.md states the costs.
 FORMATS: dict[str, Format] = {
-    "potr": _single("a.potr", potr_files.originals, potr_files.changed, read_potr, 64 * MIB, 8192, twice=True),
-    "ply": _single("a.ply", ply_files.plain_originals, ply_files.changed_plain, read_scene, 32 * MIB, 64, twice=True),
-    "compressed.ply": _single(
-        "a.compressed.ply", ply_files.compressed_originals, ply_files.changed_compressed, read_scene, 32 * MIB, 64,
-        twice=True,
-    ),
-    "spz": _single("a.spz", spz_files.originals, spz_files.changed, read_scene, 64 * MIB, 2048, twice=True),
-    "sog": _single("a.sog", sog_files.originals, sog_files.changed, read_scene, 64 * MIB, 2048, twice=True),
-    "sog-folder": Format(
-        sog_folder_files.originals, sog_folder_files.changed, read_scene, 64 * MIB, 2048, twice=True
-    ),
-    "sog-levels": Format(
-        sog_folder_files.level_originals, sog_folder_files.changed_levels, read_scene, 64 * MIB, 2048, twice=True
-    ),
-    "glb": Format(gltf_files.originals, gltf_files.changed, read_scene, 64 * MIB, 2048, twice=True),
-    "gltf": Format(gltf_files.gltf_originals, gltf_files.changed_gltf, read_scene, 64 * MIB, 2048, twice=True),
-    "splat": _single(
-        "a.splat", splat_files.splat_originals, splat_files.changed_splat, read_scene, 32 * MIB, 64, twice=True
-    ),
-    "ksplat": _single(
-        "a.ksplat", splat_files.ksplat_originals, splat_files.changed_ksplat, read_scene, 32 * MIB, 64, twice=True
-    ),
-    "ply.gz": _single("a.ply.gz", gzip_files.originals, gzip_files.changed, read_scene, 64 * MIB, 4096, twice=True),
-    "cameras.json": Format(
-        camera_files.good_cameras_json, camera_files.changed_cameras_json, read_cameras, 32 * MIB, 128
-    ),
-    "transforms.json": Format(
-        camera_files.good_transforms_json, camera_files.changed_transforms_json, read_cameras, 32 * MIB, 128
-    ),
-    "colmap-binary": Format(
-        camera_files.good_colmap_binary, camera_files.changed_colmap_binary, read_cameras, 32 * MIB, 128
-    ),
-    "colmap-text": Format(
-        camera_files.good_colmap_text, camera_files.changed_colmap_text, read_cameras, 32 * MIB, 128
-    ),
-    "png": _picture("a.png", picture_files.good_pngs, picture_files.changed_png),
-    "jpeg": _picture("a.jpg", picture_files.jpeg_originals, picture_files.changed_jpeg),
-    "webp": _picture("a.webp", picture_files.webp_originals, picture_files.changed_webp),
-}  # fmt: skip
+    "potr": _scene(potr_files.originals, potr_files.changed, 64, 8192, "a.potr", read_potr),
+    "ply": _scene(ply_files.plain_originals, ply_files.changed_plain, 32, 64, "a.ply"),
+    "compressed.ply": _scene(ply_files.compressed_originals, ply_files.changed_compressed, 32, 64, "a.compressed.ply"),
+    "spz": _scene(spz_files.originals, spz_files.changed, 64, 2048, "a.spz"),
+    "sog": _scene(sog_files.originals, sog_files.changed, 64, 2048, "a.sog"),
+    "sog-folder": _scene(sog_files.folder_originals, sog_files.changed_folder, 64, 2048),
+    "sog-levels": _scene(sog_files.level_originals, sog_files.changed_levels, 64, 2048),
+    "glb": _scene(gltf_files.originals, gltf_files.changed, 64, 2048),
+    "gltf": _scene(gltf_files.gltf_originals, gltf_files.changed_gltf, 64, 2048),
+    "splat": _scene(splat_files.splat_originals, splat_files.changed_splat, 32, 64, "a.splat"),
+    "ksplat": _scene(splat_files.ksplat_originals, splat_files.changed_ksplat, 32, 64, "a.ksplat"),
+    "ply.gz": _scene(spz_files.gzip_originals, spz_files.changed_gzip, 64, 4096, "a.ply.gz"),
+    "cameras.json": _cameras(camera_files.cameras_originals, camera_files.changed_cameras),
+    "transforms.json": _cameras(camera_files.transforms_originals, camera_files.changed_transforms),
+    "colmap-binary": _cameras(camera_files.colmap_binary_originals, camera_files.changed_colmap_binary),
+    "colmap-text": _cameras(camera_files.colmap_text_originals, camera_files.changed_colmap_text),
+    "png": _picture(picture_files.good_pngs, picture_files.changed_png, "a.png"),
+    "jpeg": _picture(picture_files.jpeg_originals, picture_files.changed_jpeg, "a.jpg"),
+    "webp": _picture(picture_files.webp_originals, picture_files.changed_webp, "a.webp"),
+}

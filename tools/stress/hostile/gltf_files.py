@@ -10,53 +10,57 @@ from random import Random
 from typing import Any
 
 from tools.stress.hostile import spz_files
-from tools.stress.hostile.changes import TEXTS, damaged, damaged_json, damaged_value, interesting, json_bytes
-
-#: A file or several that belong together, by their names; the first is what is read.
-Files = dict[str, bytes]
+from tools.stress.hostile.changes import TEXTS, Files, Rules, changed_files, damaged, damaged_json
 
 _PREFIX = "KHR_gaussian_splatting:"
 _CODES = {5120: ("b", 1), 5121: ("B", 1), 5122: ("h", 2), 5123: ("H", 2), 5126: ("f", 4)}
 _KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+_NUMBERS: tuple[Any, ...] = (0, 1, 2, 3, 4, 12, 99, 255, 10**9, -1, -4, 2**31, 2**40, 1.0, True, None, {})
+_MOTIONS = ([0] * 4, [0] * 3, [1, 1, -1], [1e30] * 3, [0.0] * 16, [1, 2, 9], "a")
+_RULES = Rules({
+    **dict.fromkeys(("count", "byteOffset", "bufferView", "buffer", "byteLength", "byteStride", "mesh"), _NUMBERS),
+    **dict.fromkeys(("rotation", "scale", "translation", "matrix"), _MOTIONS),
+    "children": ([0], [1], [1, 1], 9), "componentType": (5120, 5121, 5122, 5125, 5126, None),
+    "type": ("VEC3", "VEC4", "MAT4", None), "sparse": ({},), "normalized": (True, False, None),
+    "extensions": ({"EXT_meshopt_compression": {}},),
+    "uri": (*TEXTS, "data:;base64,AAAA", "data:,a", "http://a/b", "a.gltf", "%2e%2e/a.bin"),
+}, lambda name, data: () if name.endswith("gltf") else ((0, 4), (4, 4), (8, 4), (12, 4), (16, 4)))  # fmt: skip
 
 
 def originals() -> list[Files]:
     """Good .glb files of every SH degree, in floats, in integers and as SPZ."""
-    return [
-        *({"a.glb": glb(*asset(5, degree, degree % 2 == 1, Random(degree)))} for degree in range(4)),
-        {"a.glb": glb(*packed_asset(5, 1, Random(0)))},
+    assets = [
+        *(asset(5, degree, degree % 2 == 1, Random(degree)) for degree in range(4)),
+        packed_asset(5, 1, Random(0)),
     ]
+    return [{"a.glb": glb(json.dumps(description).encode(), content)} for description, content in assets]
 
 
 def gltf_originals() -> list[Files]:
     """Good .gltf files with a buffer in them, and with one beside them."""
     description, content = asset(5, 1, False, Random(0))
-    return [{"a.gltf": gltf(description, content, None)}, _beside(description, content)]
+    return [
+        {"a.gltf": gltf(description, content, None)},
+        {"a.gltf": gltf(description, content, "a.bin"), "a.bin": content},
+    ]
 
 
 def changed(rng: Random) -> Files:
     """A small .glb file, changed."""
-    description, content = _changed_asset(rng)
-    out = glb(description, content)
-    if rng.random() < 0.2:
-        at = rng.choice((0, 4, 8, 12, 16))
-        out = out[:at] + interesting(rng, 4).to_bytes(4, "little") + out[at + 4 :]
-    return {"a.glb": damaged(out, rng) if rng.random() < 0.15 else out}
+    description, content = _any_asset(rng)
+    text = json.dumps(description).encode()
+    for _ in range(rng.choice((0, 1, 1, 2))):
+        text = damaged_json(text, rng, _RULES.hints)
+    files = {"a.glb": glb(text, content)}
+    return changed_files(files, rng, _RULES) if rng.random() < 0.3 else files
 
 
 def changed_gltf(rng: Random) -> Files:
     """A small .gltf file with what belongs to it, changed."""
-    description, content = _changed_asset(rng)
+    description, content = _any_asset(rng)
     if rng.random() < 0.5:
-        uri = None
-        if rng.random() < 0.3:
-            uri = rng.choice((*TEXTS, "data:;base64,AAAA", "data:,a", "http://a/b", "a.gltf", "%2e%2e/a.bin"))
-        out = gltf(description, content, uri)
-        return {"a.gltf": damaged_json(out, rng) if rng.random() < 0.2 else out}
-    files = _beside(description, content)
-    if rng.random() < 0.2:
-        files["a.bin"] = damaged(files["a.bin"], rng)
-    return files
+        return changed_files({"a.gltf": gltf(description, content, None)}, rng, _RULES)
+    return changed_files({"a.gltf": gltf(description, content, "a.bin"), "a.bin": content}, rng, _RULES)
 
 
 def asset(count: int, degree: int, integers: bool, rng: Random) -> tuple[dict[str, Any], bytes]:
@@ -86,18 +90,14 @@ def asset(count: int, degree: int, integers: bool, rng: Random) -> tuple[dict[st
     kind = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
     primitive = {"mode": 0, "attributes": {name: k for k, name in enumerate(layout)}}
     return {
-        "asset": {"version": "2.0"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}],
         "nodes": [
             {"children": [1], "rotation": [0, 0, 0.6, 0.8], "scale": [2, 2, 2], "translation": [1, 2, 3]},
             {"mesh": 0, "matrix": [2, 0, 0, 0, 0, 3, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]},
         ],
         "meshes": [{"primitives": [primitive | {"extensions": {"KHR_gaussian_splatting": kind}}]}],
-        "buffers": [{"byteLength": len(content)}],
-        "bufferViews": views,
-        "accessors": accessors,
-    }, content
+        "buffers": [{"byteLength": len(content)}], "bufferViews": views, "accessors": accessors,
+    }, content  # fmt: skip
 
 
 def packed_asset(count: int, degree: int, rng: Random) -> tuple[dict[str, Any], bytes]:
@@ -112,63 +112,20 @@ def packed_asset(count: int, degree: int, rng: Random) -> tuple[dict[str, Any], 
     return description, content
 
 
-def glb(description: Any, content: bytes) -> bytes:
-    """A .glb file."""
-    text = description if isinstance(description, bytes) else json_bytes(description)
+def glb(text: bytes, content: bytes) -> bytes:
+    """A .glb file of a description and a buffer."""
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(content), b"BIN\0") + content
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
-def gltf(description: Any, content: bytes, uri: str | None) -> bytes:
-    """A .gltf file."""
+def gltf(description: dict[str, Any], content: bytes, uri: str | None) -> bytes:
+    """A .gltf file; its buffer is in it where no other place is told."""
     uri = "data:application/octet-stream;base64," + base64.b64encode(content).decode() if uri is None else uri
-    if isinstance(description, dict):
-        description = description | {"buffers": [{"byteLength": len(content), "uri": uri}]}
-    return json_bytes(description)
+    return json.dumps(description | {"buffers": [{"byteLength": len(content), "uri": uri}]}).encode()
 
 
-def _beside(description: Any, content: bytes) -> Files:
-    return {"a.gltf": gltf(description, content, "a.bin"), "a.bin": content}
-
-
-def _changed_asset(rng: Random) -> tuple[Any, bytes]:
+def _any_asset(rng: Random) -> tuple[dict[str, Any], bytes]:
     count, degree = rng.choice((1, 4, 30)), rng.choice((0, 1, 3))
-    if rng.random() < 0.2:
-        description, content = packed_asset(count, degree, rng)
-    else:
-        description, content = asset(count, degree, rng.random() < 0.4, rng)
-    value: Any = description
-    kind = rng.randrange(8)
-    if kind == 0:
-        entry = rng.choice(description["accessors"])
-        entry[rng.choice(("count", "byteOffset", "componentType", "bufferView", "type", "normalized", "sparse"))] = (
-            rng.choice((0, 1, 2, 5120, 5125, 10**9, -1, 2**31, 1.0, True, None, "VEC3", "VEC4", "MAT4", {}))
-        )
-    elif kind == 1:
-        entry = rng.choice(description["bufferViews"])
-        key = rng.choice(("buffer", "byteOffset", "byteLength", "byteStride", "extensions"))
-        entry[key] = rng.choice((0, 1, 3, 4, 12, 255, 10**9, -4, 2**40, {}, {"EXT_meshopt_compression": {}}, None))
-    elif kind == 2:
-        nodes = description["nodes"]
-        nodes[rng.randrange(2)][rng.choice(("children", "mesh", "rotation", "scale", "translation", "matrix"))] = (
-            rng.choice(
-                ([0], [1], [1, 1], 0, 9, [0, 0, 0, 0], [0, 0, 0], [1, 1, -1], [1e30] * 3, [0.0] * 16, [1, 2, 9], "a")
-            )
-        )
-    elif kind == 3:
-        attributes = description["meshes"][0]["primitives"][0]["attributes"]
-        attributes[rng.choice(list(attributes))] = rng.choice((0, 1, 2, 3, 4, 99, -1, "0", None))
-    elif kind == 4:
-        start = 4 * rng.randrange(len(content) // 4)
-        content = content[:start] + rng.choice((b"\0\0\x80\x7f", b"\0\0\xc0\x7f", b"\xff" * 4)) + content[start + 4 :]
-    elif kind == 5:
-        content = content[: rng.randrange(len(content) + 1)]
-    elif kind == 6:
-        value = damaged_value(description, rng)
-    return value, content
-
-
-def described_bomb(description: dict[str, Any], content: bytes) -> Files:
-    """A .glb that is what its description says."""
-    return {"a.glb": glb(json.dumps(description).encode(), content)}
+    made = packed_asset(count, degree, rng) if rng.random() < 0.2 else asset(count, degree, rng.random() < 0.4, rng)
+    return (made[0], damaged(made[1], rng)) if rng.random() < 0.3 else made

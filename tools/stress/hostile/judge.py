@@ -20,7 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from potr_cl.errors import PotrError
-from tools.stress.hostile.formats import Files, Format, WrongResult, parts_of
+from tools.stress.hostile.changes import Files
+from tools.stress.hostile.formats import Format, WrongResult, parts_of
 
 #: A file that takes longer hangs: seconds of processor time, and, should it wait for something, how many times as many
 #: of the clock, for other processes may keep the processor busy.
@@ -113,10 +114,8 @@ class Judge:
         self._limit(allowance)
         self._said.clear()
         self._watched.found.clear()
-        if (
-            self._freed >= _MUCH and self._trim is not None
-        ):  # what a file before has freed would hide what this one takes
-            self._trim(0)
+        if self._freed >= _MUCH and self._trim is not None:
+            self._trim(0)  # what a file before has freed would hide what this one takes
         self._memory.reset()
         began = time.process_time()
         signal.setitimer(signal.ITIMER_PROF, self._longest)
@@ -227,16 +226,8 @@ class _Watched:
         self.on = False
         self.found: list[tuple[str, str]] = []
         tmp = os.fspath(folder.parent / "tmp")
-        self._allowed = (
-            os.fspath(folder),
-            tmp,
-            sys.prefix,
-            sys.base_prefix,
-            "/proc/self/",
-            "/usr/",
-            "/sys/",
-            "/etc/ld",
-        )
+        system = "/proc/self/", "/usr/", "/sys/", "/etc/ld"
+        self._allowed = (os.fspath(folder), tmp, sys.prefix, sys.base_prefix, *system)
         sys.addaudithook(self._see)
 
     def _see(self, event: str, args: tuple[Any, ...]) -> None:

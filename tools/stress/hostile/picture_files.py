@@ -11,7 +11,7 @@ from random import Random
 import numpy as np
 from PIL import Image
 
-from tools.stress.hostile.changes import damaged, interesting
+from tools.stress.hostile.changes import Rules, changed_files, damaged, interesting, with_number
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 #: Beginnings of kinds that nobody should open because of a name that ends in .png.
@@ -27,11 +27,25 @@ _OTHER_KINDS = (
     b"\xd7\xcd\xc6\x9a" + bytes(40), b"\x89HDF\r\n\x1a\n" + bytes(40), b"\xff\x4f\xff\x51" + bytes(40),
     b"#define im_width 8\n#define im_height 8\nstatic char im_bits[] = {\n0};", b"<svg xmlns='x'/>", b"",
 )  # fmt: skip
+_CHUNKS = (b"tEXt", b"zTXt", b"iTXt", b"PLTE", b"tRNS", b"iCCP", b"eXIf", b"acTL", b"fcTL", b"fdAT", b"gAMA")
+_CONTENTS = (b"", b"a\0\0" + zlib.compress(bytes(1 << 16)), b"Description\0\x1b[2J", bytes(range(30)))
+#: Of large pictures only some: those that are let through take their time.
+_SIDES = (0, 1, 2, 7, 9, 12, 100, 65535, 1 << 30)
 
 
 def chunk(kind: bytes, content: bytes) -> bytes:
     """A chunk of a PNG file."""
     return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+
+def chunks(data: bytes) -> list[tuple[bytes, bytes]]:
+    """The chunks of a PNG file, kind and content, as far as there are whole ones."""
+    found, at = [], len(_SIGNATURE)
+    while at + 8 <= len(data):
+        size, kind = struct.unpack_from(">I4s", data, at)
+        found.append((kind, data[at + 8 : at + 8 + size]))
+        at += 12 + size
+    return found
 
 
 def png(width: int, height: int, depth: int, colour: int, pixels: bytes, *others: bytes) -> bytes:
@@ -70,136 +84,83 @@ def good_pngs() -> list[bytes]:
     return [data for data in png_originals() if data[24] <= 8]
 
 
-@cache
 def jpeg_originals() -> list[bytes]:
-    return [
-        _saved("RGB", "JPEG", ("quality", 50)),
-        _saved("L", "JPEG", ("quality", 20)),
-        _saved("CMYK", "JPEG", ("quality", 20)),
-        _saved("RGB", "JPEG", ("progressive", 1), ("quality", 30), ("comment", "a")),
-    ]
+    kinds = ("RGB", 50), ("L", 20), ("CMYK", 20)
+    plain = [_saved(mode, "JPEG", ("quality", quality)) for mode, quality in kinds]
+    return [*plain, _saved("RGB", "JPEG", ("progressive", 1), ("quality", 30), ("comment", "a"))]
 
 
-@cache
 def webp_originals() -> list[bytes]:
-    return [
-        _saved("RGB", "WEBP", ("quality", 20), ("method", 0)),
-        _saved("RGBA", "WEBP", ("quality", 20), ("method", 0)),
-        _saved("RGB", "WEBP", ("lossless", 1), ("method", 0)),
-        _saved("RGBA", "WEBP", ("lossless", 1), ("method", 0)),
-        _saved("RGB", "WEBP", ("lossless", 1), ("method", 0), ("exif", b"Exif\0\0II*\0")),
-    ]
+    more = ({"quality": 20}, {"lossless": 1})
+    plain = [_saved(mode, "WEBP", ("method", 0), *each.items()) for mode in ("RGB", "RGBA") for each in more]
+    return [*plain, _saved("RGB", "WEBP", ("lossless", 1), ("method", 0), ("exif", b"Exif\0\0II*\0"))]
+
+
+def _inside(name: str, content: bytes, rng: Random) -> bytes | None:
+    """Other sides in the header; other bytes behind the coder of the pixels."""
+    if name.endswith("IHDR") and len(content) == 13:
+        at = rng.choice((0, 4))
+        return content[:at] + rng.choice(_SIDES).to_bytes(4, "big") + content[at + 4 :]
+    try:
+        raw = damaged(zlib.decompress(content), rng) if name.endswith("IDAT") else None
+    except zlib.error:
+        return None
+    return None if raw is None else zlib.compress(raw + bytes(rng.choice((0, 0, 1 << 16))))
+
+
+_RULES = Rules(
+    fields=lambda name, data: [(8 + k, 1) for k in range(5)] if name.endswith("IHDR") and len(data) == 13 else (),
+    others=_inside,
+    beside={f"{at}{kind.decode()}": _CONTENTS for at in "05" for kind in _CHUNKS},
+)
 
 
 def changed_png(rng: Random) -> bytes:
+    """Parts are chunks, in the order of their names."""
     if rng.random() < 0.06:
         other = rng.choice(_OTHER_KINDS)
         return other if rng.random() < 0.5 else damaged(other, rng)
-    data = rng.choice(png_originals())
-    parts = chunks(data)
-    for _ in range(1 + rng.choice((0, 0, 1))):
-        at = rng.randrange(len(parts))
-        kind, content = parts[at]
-        way = rng.randrange(8)
-        if way <= 1:
-            content = _changed_head(parts[0][1], rng)
-            at, kind = 0, b"IHDR"
-        elif way == 2:
-            inside = next((i for i, each in enumerate(parts) if each[0] == b"IDAT"), at)
-            at, (kind, content) = inside, parts[inside]
-            try:
-                raw = damaged(zlib.decompress(content), rng)
-                content = zlib.compress(raw + bytes(rng.choice((0, 0, 1 << 16))))
-            except zlib.error:
-                content = damaged(content, rng)
-        elif way == 3:
-            other = rng.choice(
-                (b"tEXt", b"zTXt", b"iTXt", b"PLTE", b"tRNS", b"iCCP", b"eXIf", b"acTL", b"fcTL", b"fdAT", b"gAMA")
-            )
-            text = rng.choice(
-                (b"", b"a\0\0" + zlib.compress(bytes(1 << 16)), b"Description\0\x1b[2J", rng.randbytes(30))
-            )
-            parts.insert(rng.randrange(len(parts) + 1), (other, text))
-            continue
-        elif way == 4:
-            del parts[at]
-            if not parts:
-                return _SIGNATURE
-            continue
-        elif way == 5:
-            parts.insert(at, parts[rng.randrange(len(parts))])
-            continue
-        else:
-            content = damaged(content, rng)
-        parts[at] = kind, content
-    out = _SIGNATURE + b"".join(chunk(*each) for each in parts)
+    parts = {f"{at}{kind.decode()}": content for at, (kind, content) in enumerate(chunks(rng.choice(png_originals())))}
+    made = changed_files(parts, rng, _RULES)
+    out = _SIGNATURE + b"".join(chunk(name[1:].encode(), made[name]) for name in sorted(made))
     return damaged(out, rng) if rng.random() < 0.1 else out
 
 
-def chunks(data: bytes) -> list[tuple[bytes, bytes]]:
-    """The chunks of a PNG file, kind and content, as far as there are whole ones."""
-    found, at = [], len(_SIGNATURE)
-    while at + 8 <= len(data):
-        size, kind = struct.unpack_from(">I4s", data, at)
-        found.append((kind, data[at + 8 : at + 8 + size]))
-        at += 12 + size
-    return found
-
-
-def _changed_head(content: bytes, rng: Random) -> bytes:
-    if len(content) != 13:
-        return damaged(content, rng)
-    out = bytearray(content)
-    if rng.random() < 0.5:
-        at = rng.choice((0, 4))
-        side = rng.choice((0, 1, 2, 7, 9, 12, 100, 65535, 1 << 30)) if rng.random() < 0.95 else interesting(rng, 4)
-        out[at : at + 4] = struct.pack(">I", side)
-    else:
-        out[8 + rng.randrange(5)] = rng.choice((0, 1, 2, 3, 4, 6, 8, 16, rng.randrange(256)))
-    return bytes(out)
-
-
 def changed_jpeg(rng: Random) -> bytes:
-    data = bytearray(rng.choice(jpeg_originals()))
-    markers = [at for at in range(len(data) - 1) if data[at] == 0xFF and data[at + 1] not in (0, 0xFF)]
+    data = rng.choice(jpeg_originals())
+    markers = [at for at in range(len(data) - 4) if data[at] == 0xFF and data[at + 1] not in (0, 0xFF)]
+    frame = max(data.find(b"\xff\xc0"), data.find(b"\xff\xc2"))
     for _ in range(1 + rng.choice((0, 0, 1, 2))):
-        kind = rng.randrange(6)
-        at = rng.choice(markers)
+        at, kind, out = rng.choice(markers), rng.randrange(6), bytearray(data)
         if kind == 0:
-            data[at + 1 : at + 2] = bytes([rng.choice((0xC0, 0xC2, 0xC3, 0xC9, 0xD8, 0xD9, 0xDA, 0xE1, 0xEE, 0xFE))])
+            out[at + 1] = rng.choice((0xC0, 0xC2, 0xC3, 0xC9, 0xD8, 0xD9, 0xDA, 0xE1, 0xEE, 0xFE))
         elif kind == 1:
-            data[at + 2 : at + 4] = interesting(rng, 2).to_bytes(2, "big")
+            out[at + 2 : at + 4] = interesting(rng, 2).to_bytes(2, "big")
         elif kind == 2:  # the size that the frame says
-            frame = max(data.find(b"\xff\xc0"), data.find(b"\xff\xc2"))
-            if frame >= 0:
-                field = frame + rng.choice((5, 7))
-                side = rng.choice((0, 1, 7, 9, 100, 3000)) if rng.random() < 0.95 else interesting(rng, 2)
-                data[field : field + 2] = side.to_bytes(2, "big")
-        elif kind == 3:
-            data[at + 2 + rng.randrange(12) : at + 2 + rng.randrange(14)] = rng.randbytes(rng.randrange(4))
+            place = frame + rng.choice((5, 7))
+            side = rng.choice((0, 1, 7, 9, 100, 3000)) if rng.random() < 0.95 else interesting(rng, 2)
+            out[place : place + 2] = side.to_bytes(2, "big")
         else:
-            data = bytearray(damaged(bytes(data), rng))
+            out = bytearray(damaged(data, rng))
+        data = bytes(out)
         markers = [at for at in markers if at + 4 < len(data)] or [0]
-    return bytes(data)
+        if len(data) < 8:
+            break
+    return data
 
 
 def changed_webp(rng: Random) -> bytes:
-    data = bytearray(rng.choice(webp_originals()))
-    for _ in range(1 + rng.choice((0, 0, 1))):
-        kind = rng.randrange(6)
-        if kind == 0:
-            extended = b"VP8X" + struct.pack("<IB3x", 10, rng.randrange(64))
-            extended += interesting(rng, 3).to_bytes(3, "little") + interesting(rng, 3).to_bytes(3, "little")
-            data[12:12] = extended
-        elif kind == 1:
-            data[12:12] = rng.choice((b"ANIM", b"ICCP", b"EXIF", b"XMP ", b"ALPH")) + b"\6\0\0\0" + rng.randbytes(6)
-        elif kind == 2 and len(data) > 30:  # the frame's own header
-            at = 20 + rng.randrange(10)
-            data[at] = rng.randrange(256)
-        elif kind == 3:
-            data[16:20] = struct.pack("<I", interesting(rng, 4))
-        else:
-            data = bytearray(damaged(bytes(data), rng))
-    if len(data) > 8 and rng.random() < 0.8:
-        data[4:8] = struct.pack("<I", len(data) - 8)
-    return bytes(data)
+    data = rng.choice(webp_originals())
+    kind = rng.randrange(5)
+    if kind == 0:
+        sizes = b"".join(interesting(rng, 3).to_bytes(3, "little") for _ in range(2))
+        data = data[:12] + b"VP8X" + struct.pack("<IB3x", 10, rng.randrange(64)) + sizes + data[12:]
+    elif kind == 1:
+        name = rng.choice((b"ANIM", b"ICCP", b"EXIF", b"XMP ", b"ALPH"))
+        data = data[:12] + name + b"\6\0\0\0" + rng.randbytes(6) + data[12:]
+    elif kind == 2:  # the frame's size, and its own header
+        data = with_number(data, rng, ((16, 4), *((20 + k, 1) for k in range(10))))
+    if kind > 2 or rng.random() < 0.3:
+        data = damaged(data, rng)
+    sealed = len(data) > 8 and rng.random() < 0.8
+    return data[:4] + struct.pack("<I", len(data) - 8) + data[8:] if sealed else data

@@ -9,7 +9,15 @@ from random import Random
 import numpy as np
 
 from potr_cl.model.scene import SH_COEFFICIENTS
-from tools.stress.hostile.changes import NUMBERS, TEXTS, damaged, damaged_text, interesting, interesting_double
+from tools.stress.hostile.changes import (
+    NUMBERS,
+    TEXTS,
+    damaged,
+    damaged_text,
+    interesting,
+    interesting_double,
+    packed_real,
+)  # fmt: skip
 
 _TYPES = ("float", "double", "char", "uchar", "short", "ushort", "int", "uint", "float32", "float64", "uint8", "int64")
 _FORMATS = ("ascii", "binary_little_endian", "binary_big_endian")
@@ -113,46 +121,45 @@ def _changed(data: bytes, rng: Random) -> bytes:
 
 def _header_line(lines: list[str], rng: Random) -> None:
     """Change, add, move or drop a line of a header."""
-    at = rng.randrange(len(lines)) if lines else 0
-    kind = rng.randrange(14)
+    if not lines:
+        return
+    at, kind = rng.randrange(len(lines)), rng.randrange(12)
     elements = [i for i, line in enumerate(lines) if line.startswith("element")]
     if kind <= 3 and elements:
         at = rng.choice(elements)
         words = [*lines[at].split(), "", "", ""][:3]
         if rng.random() < 0.75:
-            words[2] = rng.choice(NUMBERS) if rng.random() < 0.5 else str(rng.choice((0, 1, 2, 4, interesting(rng, 4))))
+            words[2] = rng.choice((*NUMBERS, *"0124" * 8, str(interesting(rng, 4))))
         else:
             words[1] = rng.choice(("vertex", "chunk", "sh", "face", "Vertex", *TEXTS))
-        gaps = [rng.choice((" ", " ", "  ", "\t", " \x0b", "\xa0")) for _ in range(2)]
-        lines[at] = f"{words[0]}{gaps[0]}{words[1]}{gaps[1]}{words[2]}{rng.choice(('', '', ' ', chr(9)))}"
-    elif kind == 4 and lines:
+        lines[at] = _spaced(words, rng) + rng.choice(("", "", " ", "\t"))
+    elif kind <= 5 and elements:  # an element said twice, the second time in spacing that only some parsers take
+        start = rng.choice(elements)
+        end = min((i for i in elements if i > start), default=len(lines))
+        again = [_spaced(line.split(" "), rng) for line in lines[start:end]]
+        again[0] = _spaced([*lines[start].split(" ")[:2], str(rng.choice((1, 4, 300, 600, 1000)))], rng)
+        place = rng.choice((start, end))
+        lines[place:place] = again
+    elif kind == 6:
         del lines[at]
-    elif kind == 5 and lines:
-        lines.insert(rng.randrange(len(lines)), lines[at])
-    elif kind == 6 and lines:
-        other = rng.randrange(len(lines))
-        lines[at], lines[other] = lines[other], lines[at]
     elif kind == 7:
-        lines.insert(at, f"{rng.choice(('comment', 'obj_info', 'property float', 'element'))} {rng.choice(TEXTS)}")
-    elif kind == 8 and lines:
+        other = rng.randrange(len(lines))
+        lines[at], lines[other] = lines[other], rng.choice((lines[at], lines[other]))
+    elif kind == 8:
+        lines.insert(at, f"{rng.choice(('comment', 'obj_info', 'property float', 'element a'))} {rng.choice(TEXTS)}")
+    elif kind == 9:
         words = lines[at].split(" ")
         words[rng.randrange(len(words))] = rng.choice((*_TYPES, *_FORMATS, *NUMBERS, "list", "uint uint"))
         lines[at] = " ".join(words)
-    elif kind == 9:
+    elif kind == 10:
         count = rng.choice((1, 10, 300))
         lines[at:at] = [f"property {rng.choice(_TYPES)} p{i}_{rng.randrange(3)}" for i in range(count)]
-    elif kind >= 12 and elements:  # an element said twice, the second time in spacing that only some parsers take
-        start = rng.choice(elements)
-        end = min((i for i in elements if i > start), default=len(lines))
-        gap = rng.choice(("  ", "\t", " ", "\xa0", " \x0b"))
-        again = [gap.join(line.split(" ")) for line in lines[start:end]]
-        again[0] = gap.join([*lines[start].split(" ")[:2], str(rng.choice((1, 4, 300, 600, 1000)))])
-        place = rng.choice((start, end))
-        lines[place:place] = again
-    elif kind == 10:
-        lines[at:at] = [f"element {rng.choice(('vertex', 'chunk', 'a'))} {rng.choice(NUMBERS)}"]
-    elif lines:
+    else:
         lines[at] = damaged(lines[at].encode("utf-8", "surrogatepass"), rng).decode("latin-1")
+
+
+def _spaced(words: list[str], rng: Random) -> str:
+    return rng.choice((" ", " ", "  ", "\t", "\xa0", " \x0b")).join(words)
 
 
 def _values(body: bytes, rng: Random) -> bytes:
@@ -162,10 +169,6 @@ def _values(body: bytes, rng: Random) -> bytes:
     out = bytearray(body)
     for _ in range(1 + rng.randrange(4)):
         at = 4 * rng.randrange(len(out) // 4)
-        value = interesting_double(rng)
-        code = rng.choice(("<f", ">f", "<d", ">d"))
-        if code[1] == "f" and abs(value) > 3.4e38:  # too large, or not a number
-            value = float("nan") if value != value else float("inf")
-        packed = struct.pack(code, value)
+        packed = packed_real(interesting_double(rng), rng.choice(("<f", ">f", "<d", ">d")))
         out[at : at + len(packed)] = packed
     return bytes(out)

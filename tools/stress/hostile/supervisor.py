@@ -11,11 +11,13 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from tools.results import ROOT
-from tools.stress.hostile.formats import Files
+from tools.stress.hostile.changes import Files
 from tools.stress.hostile.judge import LONGEST, Verdict
 from tools.stress.hostile.worker import Job, Tally, keep
 
@@ -25,58 +27,35 @@ _A_PROCESS = 20_000
 _MOST_CRASHES = 20
 
 
-@dataclasses.dataclass
-class Outcome:
-    """What came of many files of one format.
-
-    Attributes:
-        files: that were read or refused, or are findings.
-        kinds: findings, how many of each kind.
-        kept: folders with some of them.
-        memory: bytes that a single file took at most. slowest: seconds that one took at most.
-        seconds: all together, starts of processes left out.
-    """
-
-    files: int = 0
-    read: int = 0
-    refused: int = 0
-    findings: int = 0
-    bytes: int = 0
-    memory: int = 0
-    slowest: float = 0.0
-    seconds: float = 0.0
-    kept: list[str] = dataclasses.field(default_factory=list)
-
-
-def attack(form: str, seed: int, first: int, count: int, seconds: float, findings: Path) -> Outcome:
+def attack(form: str, seed: int, first: int, count: int, seconds: float, findings: Path) -> Tally:
     """Have changed files of a format read.
 
     Args:
         seed, first, count: which: number ``first`` and so on of a seed.
         seconds: to end after, though not all were read.
         findings: folder for those of which something is wrong.
+
+    Returns:
+        What came of them; ``number`` is of the next one.
     """
-    total = Outcome()
-    number, stop, end, crashes = first, first + count, time.monotonic() + seconds, 0
-    while number < stop and time.monotonic() < end and crashes < _MOST_CRASHES:
-        with place() as folder:
-            job = Job(
-                form, str(folder), str(findings), seed, number, min(_A_PROCESS, stop - number), end - time.monotonic()
-            )
-            began = time.monotonic()
-            code, said = run(job)
-            tally = Tally.of(folder / "tally")
-            total.seconds += time.monotonic() - began
+    total, stop, end, crashes = Tally(first), first + count, time.monotonic() + seconds, 0
+    while total.number < stop and time.monotonic() < end and crashes < _MOST_CRASHES:
+        with _place() as folder:
+            most = min(_A_PROCESS, stop - total.number)
+            job = Job(form, str(folder), str(findings), seed, total.number, most, end - time.monotonic())
+            code, said = _run(job)
+            tally = Tally(**json.loads((folder / "tally").read_text()))
             if code != 0:
                 crashes += 1
-                verdict = _ending(code, said)
-                tally.findings += 1
-                if not (verdict.kind == "hang" and _in_time(job, _files(folder), tally.number)):
-                    keep(findings, job, tally.number, _files(folder), verdict)
-                tally.number += 1
-        _add(total, tally, tally.number - number)
-        number = tally.number
-    total.kept = sorted(str(each.parent) for each in findings.glob(f"{form}-{seed}-*/finding.json"))
+                number, files, verdict = tally.number, _files(folder), _ending(code, said)
+                kind = _alone(job, files, number) if verdict.kind == "hang" else verdict.kind
+                tally.add(kind)
+                if kind not in ("read", "refused"):
+                    keep(findings, job, number, files, verdict)
+        for name in ("read", "refused", "findings"):
+            setattr(total, name, getattr(total, name) + getattr(tally, name))
+        total.number = tally.number
+        total.memory, total.slowest = max(total.memory, tally.memory), max(total.slowest, tally.slowest)
     return total
 
 
@@ -110,64 +89,58 @@ def _about(folder: Path) -> dict[str, Any]:
 
 def _read_given(form: str, sources: list[Path], findings: Path, longest: float) -> tuple[int, str, Files]:
     """A worker's exit code, what it said, and the files that it was at."""
-    with place() as folder:
+    with _place() as folder:
         job = Job(form, str(folder), str(findings), given=[str(source) for source in sources], longest=longest)
-        code, said = run(job)
+        code, said = _run(job)
         return code, said, _files(folder, _about(sources[0])["names"] if sources[1:] == [] else None)
 
 
-def run(job: Job) -> tuple[int, str]:
-    """Start a worker and wait; its exit code (below 0: minus a signal's number) and the end of what it said."""
+def _run(job: Job) -> tuple[int, str]:
+    """Start a worker and wait; its exit code (below 0: minus a signal's number) and the end of what it said.
+
+    It has one thread, memory from the system's allocator, and temporary files in its folder.
+    """
+    settings = {
+        **os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1",
+        "PYTHONMALLOC": "malloc", "MALLOC_ARENA_MAX": "2", "MALLOC_MMAP_THRESHOLD_": "131072",
+        "MALLOC_TRIM_THRESHOLD_": "131072", "TMPDIR": f"{job.folder}/tmp", "PYTHONPATH": str(ROOT),
+        "PYTHONFAULTHANDLER": "1",
+    }  # fmt: skip
     done = subprocess.run(
-        [sys.executable, "-m", "tools.stress.hostile.worker"],
-        input=json.dumps(dataclasses.asdict(job)), env=settings(Path(job.folder)), cwd=f"{job.folder}/cwd",
-        capture_output=True, text=True, errors="replace", check=False,
+        [sys.executable, "-m", "tools.stress.hostile.worker"], input=json.dumps(dataclasses.asdict(job)), env=settings,
+        cwd=f"{job.folder}/cwd", capture_output=True, text=True, errors="replace", check=False,
     )  # fmt: skip
     errors = Path(job.folder, "stderr")
-    told = errors.read_text(errors="replace") if errors.exists() else ""
-    said = (done.stderr + told)[-4000:]
+    said = (done.stderr + (errors.read_text(errors="replace") if errors.exists() else ""))[-4000:]
     if done.returncode > 0:  # whatever a reader raises is a verdict
         raise RuntimeError(f"the worker itself failed:\n{said}")
     return done.returncode, said
 
 
-def settings(folder: Path) -> dict[str, str]:
-    """The environment of a worker: one thread, memory from the system's allocator, temporary files in its folder."""
-    return {
-        **os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1",
-        "PYTHONMALLOC": "malloc", "MALLOC_ARENA_MAX": "2", "MALLOC_MMAP_THRESHOLD_": "131072",
-        "MALLOC_TRIM_THRESHOLD_": "131072", "TMPDIR": f"{folder}/tmp", "PYTHONPATH": str(ROOT),
-        "PYTHONFAULTHANDLER": "1",
-    }  # fmt: skip
-
-
-class place:
+@contextmanager
+def _place() -> Iterator[Path]:
     """A folder in memory for a worker, which goes when the block ends."""
-
-    def __enter__(self) -> Path:
-        parent = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
-        self._folder = Path(tempfile.mkdtemp(prefix="hostile-", dir=parent))
-        for name in ("input", "tmp", "cwd"):
-            (self._folder / name).mkdir()
-        return self._folder
-
-    def __exit__(self, *_: object) -> None:
-        shutil.rmtree(self._folder, ignore_errors=True)
+    folder = Path(tempfile.mkdtemp(prefix="hostile-", dir="/dev/shm" if os.access("/dev/shm", os.W_OK) else None))
+    for name in ("input", "tmp", "cwd"):
+        (folder / name).mkdir()
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _ending(code: int, said: str) -> Verdict:
     """What a worker's end says of the file that it was at."""
     if code in (-signal.SIGALRM, -signal.SIGPROF):
         return Verdict("hang", said, LONGEST, 0)
-    name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
-    return Verdict("crash", f"{name}\n{said}", 0.0, 0)
+    return Verdict("crash", f"{signal.Signals(-code).name}\n{said}", 0.0, 0)
 
 
-def _in_time(job: Job, files: Files, number: int) -> bool:
-    """Whether a file that seemed to hang is read in time when it is tried alone: then the machine was busy."""
-    with tempfile.TemporaryDirectory() as scratch, place() as folder:
+def _alone(job: Job, files: Files, number: int) -> str:
+    """What becomes of a file that seemed to hang when it is tried alone: the machine may have been busy."""
+    with tempfile.TemporaryDirectory() as scratch:
         source = keep(Path(scratch), job, number, files, Verdict("hang", "", 0.0, 0))
-        return run(Job(job.form, str(folder), str(Path(scratch, "again")), given=[str(source)]))[0] == 0
+        return str(read_again([source], Path(scratch, "again"))[0]["kind"])
 
 
 def _files(folder: Path, names: list[str] | None = None) -> Files:
@@ -175,13 +148,3 @@ def _files(folder: Path, names: list[str] | None = None) -> Files:
     place = folder / "input"
     names = names or [str(path.relative_to(place)) for path in sorted(place.rglob("*")) if path.is_file()]
     return {name: (place / name).read_bytes() for name in names if (place / name).is_file()}
-
-
-def _add(total: Outcome, tally: Tally, files: int) -> None:
-    total.files += files
-    total.read += tally.read
-    total.refused += tally.refused
-    total.findings += tally.findings
-    total.bytes += tally.bytes
-    total.memory = max(total.memory, tally.memory)
-    total.slowest = max(total.slowest, tally.slowest)

@@ -8,20 +8,19 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import mmap
-import struct
+import os
 import sys
 import time
 from collections import Counter
 from pathlib import Path
 from random import Random
 
-from tools.stress.hostile.formats import FORMATS, Files
+from tools.stress.hostile.changes import Files
+from tools.stress.hostile.formats import FORMATS
 from tools.stress.hostile.judge import LONGEST, Judge, Verdict
 
 #: Findings of one sort that are kept.
 _KEPT = 3
-_FIELDS = struct.Struct("<6QdQ")
 
 
 @dataclasses.dataclass
@@ -51,27 +50,22 @@ class Job:
 
 @dataclasses.dataclass
 class Tally:
-    """How far a worker came. ``number`` is that of the file at work."""
+    """How far a worker came: the number of the file at work, what became of those before, and the worst of them."""
 
     number: int = 0
     read: int = 0
     refused: int = 0
     findings: int = 0
-    bytes: int = 0
     memory: int = 0
     slowest: float = 0.0
-    done: int = 0
 
-    @staticmethod
-    def of(path: Path) -> Tally:
-        data = path.read_bytes() if path.exists() else b""
-        return Tally(*_FIELDS.unpack(data)) if len(data) == _FIELDS.size else Tally()
-
-    def pack_into(self, buffer: mmap.mmap) -> None:
-        _FIELDS.pack_into(
-            buffer, 0, self.number, self.read, self.refused, self.findings, self.bytes, self.memory, self.slowest,
-            self.done,
-        )  # fmt: skip
+    def add(self, kind: str, seconds: float = 0.0, memory: int = 0) -> None:
+        """Count a file."""
+        self.number += 1
+        self.read += kind == "read"
+        self.refused += kind == "refused"
+        self.findings += kind not in ("read", "refused")
+        self.slowest, self.memory = max(self.slowest, seconds), max(self.memory, memory)
 
 
 def main() -> None:
@@ -81,8 +75,7 @@ def main() -> None:
 def work(job: Job) -> None:
     """Read file after file."""
     form, folder = FORMATS[job.form], Path(job.folder)
-    path = folder / "tally"
-    path.write_bytes(bytes(_FIELDS.size))
+    shared = os.open(folder / "tally", os.O_WRONLY | os.O_CREAT, 0o600)
     tally = Tally(number=job.first)
     judge = Judge(form, folder, job.longest)
     for again in (False, True):  # what is loaded on first use counts for no file
@@ -91,33 +84,23 @@ def work(job: Job) -> None:
             if again and verdict.kind != "read":
                 raise RuntimeError(f"a good file is not read: {verdict}")
     kept: Counter[str] = Counter()
-    end = time.monotonic() + job.seconds
-    with path.open("r+b") as file, mmap.mmap(file.fileno(), 0) as shared:
-        cases = given(job.given) if job.given else None
-        while tally.number < job.first + (len(job.given) or job.count) and time.monotonic() < end:
-            if cases is not None:
-                files = cases[tally.number - job.first]
-            else:
-                files = changed_files(job.form, job.seed, tally.number)
-            size = sum(map(len, files.values()))
-            place = judge.put(files)
-            tally.bytes += size
-            tally.pack_into(shared)
-            verdict = judge.judge(place, size)
-            tally.memory = max(tally.memory, verdict.memory)
-            tally.slowest = max(tally.slowest, verdict.seconds)
-            tally.read += verdict.kind == "read"
-            tally.refused += verdict.kind == "refused"
-            if not verdict.fine or job.given:
-                tally.findings += not verdict.fine
-                sort = f"{verdict.kind} {verdict.text.strip().splitlines()[-1][:60] if verdict.text.strip() else ''}"
-                kept[sort] += 1
-                if kept[sort] <= _KEPT or job.given:
-                    keep(Path(job.findings), job, tally.number, files, verdict)
-            tally.number += 1
-            tally.pack_into(shared)
-        tally.done = 1
-        tally.pack_into(shared)
+    end, stop = time.monotonic() + job.seconds, job.first + (len(job.given) or job.count)
+    while tally.number < stop and time.monotonic() < end:
+        number = tally.number
+        files = given(job.given[number - job.first]) if job.given else changed_files(job.form, job.seed, number)
+        place = judge.put(files)
+        _tell(shared, tally)
+        verdict = judge.judge(place, sum(map(len, files.values())))
+        tally.add(verdict.kind, verdict.seconds, verdict.memory)
+        sort = f"{verdict.kind} {verdict.text.strip().splitlines()[-1][:60] if verdict.text.strip() else ''}"
+        kept[sort] += not verdict.fine
+        if job.given or (not verdict.fine and kept[sort] <= _KEPT):
+            keep(Path(job.findings), job, number, files, verdict)
+    _tell(shared, tally)
+
+
+def _tell(shared: int, tally: Tally) -> None:
+    os.pwrite(shared, json.dumps(dataclasses.asdict(tally)).ljust(200).encode(), 0)
 
 
 def changed_files(form: str, seed: int, number: int) -> Files:
@@ -132,18 +115,15 @@ def keep(findings: Path, job: Job, number: int, files: Files, verdict: Verdict) 
     for inner, content in files.items():
         (folder / inner).parent.mkdir(parents=True, exist_ok=True)
         (folder / inner).write_bytes(content)
-    about = {"format": job.form, "seed": job.seed, "number": number, "first": next(iter(files)), "names": list(files)}
+    about = {"format": job.form, "seed": job.seed, "number": number, "names": list(files)}
     (folder / "finding.json").write_text(json.dumps({**about, **dataclasses.asdict(verdict)}, indent=1))
     return folder
 
 
-def given(folders: list[str]) -> list[Files]:
-    """The files of folders as :func:`keep` leaves them."""
-    found = []
-    for folder in map(Path, folders):
-        names = json.loads((folder / "finding.json").read_text())["names"]
-        found.append({name: (folder / name).read_bytes() for name in names})
-    return found
+def given(folder: str) -> Files:
+    """The files of a folder as :func:`keep` leaves it."""
+    names = json.loads(Path(folder, "finding.json").read_text())["names"]
+    return {name: Path(folder, name).read_bytes() for name in names}
 
 
 if __name__ == "__main__":
