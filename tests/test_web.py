@@ -97,7 +97,8 @@ _IN_BROWSER = """async ([data, workers, simd]) => {
   const { decode } = await import('/dist/potr.js');
   const bytes = Uint8Array.from(atob(data), (c) => c.charCodeAt(0)), wasm = simd ? {} : { simd: null };
   const blocks = [], scene = await decode(bytes, { workers, wasm, onBlock: ({ block }) => blocks.push(block) });
-  const all = await new Blob(['positions', 'scales', 'rotations', 'opacities', 'sh'].map((name) => scene[name])).arrayBuffer();
+  const names = ['positions', 'scales', 'rotations', 'opacities', 'sh'];
+  const all = await new Blob(names.map((name) => scene[name])).arrayBuffer();
   const digest = new Uint8Array(await crypto.subtle.digest('SHA-256', all));
   return [Array.from(digest, (byte) => byte.toString(16).padStart(2, '0')).join(''), blocks.length];
 }"""
