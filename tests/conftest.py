@@ -6,7 +6,7 @@ import hashlib
 import os
 import pickle
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model import agreement
 from potr_cl.opencl.loader import register_runtimes
 from potr_cl.opencl.verdict import TRUST_VARIABLE
+from potr_cl.placement.space import Space
 
 # Tests take devices as they are; tests/opencl/test_verdict.py tries them.
 os.environ.setdefault(TRUST_VARIABLE, "1")
@@ -54,24 +55,30 @@ def runtimes_are_registered() -> None:
     register_runtimes()
 
 
-@pytest.fixture(scope="session", autouse=True)
-def judged_once() -> Iterator[None]:
-    """Each encode asks whether its cameras belong to its scene; of the same scene and cameras, they are told once.
+def once(function: Callable[..., Any], most: int) -> Callable[..., Any]:
+    """A function that is not called again with equal arguments; the results of the last ones are kept."""
+    known: dict[bytes, Any] = {}
 
-    That is a quarter of what an encode of the excerpt takes. The tests of the judgement call the function itself.
-    """
-    judge, known = agreement.judge_cameras, {}
-
-    def judged(
-        scene: Scene, cameras: Sequence[Camera], evidence: agreement.Evidence | None = None
-    ) -> agreement.Judgement:
-        key = hashlib.sha256(pickle.dumps((scene, list(cameras), evidence))).digest()
-        if key not in known:
-            known[key] = judge(scene, cameras, evidence)
+    def known_or_made(*arguments: Any) -> Any:
+        key = hashlib.sha256(pickle.dumps(arguments)).digest()
+        known[key] = known.pop(key) if key in known else function(*arguments)
+        while len(known) > most:
+            del known[next(iter(known))]
         return known[key]
 
+    return known_or_made
+
+
+@pytest.fixture(scope="session", autouse=True)
+def computed_once() -> Iterator[None]:
+    """What each encode asks of its scene, the same for the same scene and cameras, and a good part of what it takes.
+
+    Whether the cameras belong to the scene, and if there are none, where matter is. The tests of the judgement call the
+    function itself.
+    """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(agreement, "judge_cameras", judged)
+        patch.setattr(agreement, "judge_cameras", once(agreement.judge_cameras, 1000))
+        patch.setattr(Space, "of", staticmethod(once(Space.of, 8)))
         yield
 
 

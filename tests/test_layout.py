@@ -26,23 +26,27 @@ FOLDERS: dict[str, set[str]] = {
     "ondevice": {"errors", "host", "model", "opencl", "raster", "codec"},
     "clustering": {"errors", "host", "model", "opencl"},
     "formats": {"plain_text", "errors", "host", "model", "opencl", "codec", "clustering"},
-    "quality": {"errors", "host", "model", "opencl", "placement", "raster", "workers", "formats"},
+    "views": {"errors", "host", "model", "opencl", "raster", "workers"},
+    "quality": {"errors", "host", "model", "opencl", "placement", "raster", "views", "workers", "formats"},
     "outputs": {"errors", "host", "model", "opencl", "raster", "codec", "ondevice", "formats", "clustering"},
-    "stages": {"errors", "host", "model", "opencl", "placement", "raster", "workers", "codec", "quality", "outputs"},
+    "stages": {
+        "errors", "host", "model", "opencl", "placement",
+        "raster", "views", "workers", "codec", "quality", "outputs",
+    },
     "pipeline": {
         "errors", "host", "model", "opencl", "placement",
-        "raster", "workers", "codec", "formats", "stages", "quality", "outputs",
+        "raster", "views", "workers", "codec", "formats", "stages", "quality", "outputs",
     },
     "report": {"plain_text", "errors", "host", "model", "opencl", "codec", "formats", "quality", "pipeline"},
     "viewer": {"plain_text", "errors", "host", "model", "opencl", "raster", "formats", "quality", "report"},
     "api": {
         "plain_text", "errors", "host", "model", "opencl", "placement",
-        "raster", "codec", "ondevice", "formats", "stages",
+        "raster", "views", "codec", "ondevice", "formats", "stages",
         "quality", "pipeline", "report", "outputs", "viewer", "workers",
     },
     "cli": {
         "plain_text", "errors", "host", "model", "opencl", "placement",
-        "raster", "codec", "ondevice", "formats", "stages",
+        "raster", "views", "codec", "ondevice", "formats", "stages",
         "quality", "pipeline", "report", "viewer", "api", "outputs", "workers",
     },
 }  # fmt: skip

@@ -15,6 +15,7 @@ bench.decode           how fast does a file decode, by compiled code, NumPy or O
 bench.codec            speed, memory and size of the codec alone
 bench.virtual_cameras  what does encoding without cameras cost, and what is left of places?
 bench.paired           are whole encodes faster or slower than those of another checkout?
+bench.recoded          are the same splats smaller, and faster to decode, than with another checkout's coder?
 bench.scaling          time and memory against splats, views and workers: with which exponents?
 bench.web              how fast is the browser's decoder against native C, and in how much memory?
 =====================  =================================================================================================

@@ -22,10 +22,12 @@ import sys
 from collections.abc import Callable
 from datetime import date
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from potr_cl.host.atomic_write import replacing
-from potr_cl.opencl.discovery import DeviceInfo
+
+if TYPE_CHECKING:
+    from potr_cl.opencl.discovery import DeviceInfo
 
 ROOT = Path(__file__).parents[1]
 

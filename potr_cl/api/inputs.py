@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -13,7 +13,7 @@ from potr_cl.codec.decoder import PotrFile, decode, open_file
 from potr_cl.errors import DataError, UsageError
 from potr_cl.host.unchanged import unchanged
 from potr_cl.model.camera import Camera, test_views, train_views
-from potr_cl.model.scene import Scene, joined
+from potr_cl.model.scene import Scene
 
 # What reads files, colours and devices is imported where it is needed: to decode takes less time than to import it.
 if TYPE_CHECKING:
@@ -121,21 +121,11 @@ def drawable_to_judge(
         yield scene, scene
         return
     from potr_cl.model.sightings import looked_at
+    from potr_cl.raster.scene_buffers import SceneBuffers
 
-    samples: list[Scene] = []
-
-    def sampled(file: PotrFile) -> None:
-        rows, first = looked_at(file.header.splats), 0
-        for part in file.parts():
-            samples.append(part.subset(rows[(rows >= first) & (rows < first + len(part))] - first))
-            first += len(part)
-
-    read = None if coded is None else coded.data
-    with on_device(
-        source,  # type: ignore[arg-type]
-        device, trust, antialiased=antialiased, beside=sampled, read=read,
-    ) as buffers:  # fmt: skip
-        yield buffers, joined(samples)
+    with drawable_of(source, device, trust, antialiased, coded) as buffers:
+        assert isinstance(buffers, SceneBuffers)
+        yield buffers, buffers.read_back(looked_at(len(buffers)))
 
 
 def coded_scene(source: SceneSource, trust: bool = False) -> CodedScene | None:
@@ -174,13 +164,11 @@ def on_device(
     sh_degree: int | None = None,
     antialiased: bool | None = None,
     threads: int = 0,
-    beside: Callable[[PotrFile], None] | None = None,
     read: bytes | None = None,
 ) -> SceneBuffers:
     """The .potr file that a path, bytes or the result of an encode stand for, decoded into a device's memory.
 
     Args:
-        beside: is given the opened file, too.
         read: the content of the path, where it has been read already.
         source, device, trust, sh_degree, antialiased, threads: as of :func:`potr_cl.decode_to_device`.
 
@@ -190,8 +178,6 @@ def on_device(
     from potr_cl.ondevice.decode import decode_to_device
 
     def decoded(file: PotrFile) -> SceneBuffers:
-        if beside is not None:
-            beside(file)
         return decode_to_device(file, device, sh_degree, antialiased, threads)
 
     data = encoded_bytes(source)

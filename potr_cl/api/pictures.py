@@ -35,8 +35,8 @@ from potr_cl.model.scene import FloatArray
 from potr_cl.quality.pictures import Renderer
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import RasterRules
-from potr_cl.raster.seen_rasterizer import rasterizer_for
 from potr_cl.report.labels import U8, contact_sheet
+from potr_cl.views.pictures import rasterizer_for
 
 #: Pixels along a side of each of a preview's pictures.
 _PREVIEW = 200

@@ -44,7 +44,7 @@ from potr_cl.placement.viewpoints import AXES, SIZE, VIEWS
 from potr_cl.quality.compare import format_sizes, size_report
 from potr_cl.raster.rules import RULES
 from potr_cl.raster.scene_buffers import Drawable
-from potr_cl.raster.seen_rasterizer import rasterizer_for
+from potr_cl.views.pictures import rasterizer_for
 from potr_cl.workers.opening import Workers, open_workers
 
 

@@ -14,14 +14,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec import container, dequantizer
+from potr_cl.codec import container, dequantizer, quantize
 from potr_cl.codec.bundles.decoder import Reader, Wanted, check_said
 from potr_cl.codec.bundles.layout import BUNDLE
 from potr_cl.codec.bundles.sections import MAIN
 from potr_cl.codec.bundles.tokens import largest_integer
 from potr_cl.codec.container import Block
 from potr_cl.codec.native.bundles import BEYOND_TABLE
-from potr_cl.codec.native.library import native
+from potr_cl.codec.native.functions import Functions
+from potr_cl.codec.native.share import BundleShare
+from potr_cl.codec.native.table import definition
 from potr_cl.codec.native.values import Tables, ValueArrays
 from potr_cl.codec.sections import Property
 from potr_cl.codec.steps import prediction
@@ -98,7 +100,7 @@ class BlockValues:
                         scene._by_numpy(range(bundle, bundle + 1), wanted, arrays)
             helpers.finish()
 
-        self._helped(helpers, wanted, beside, work)
+        self._helped(bundle_share(number), helpers, wanted, beside, work)
 
     def pack(
         self, destination: BundleTaker, sh_count: int, threads: int, means: Callable[[], NDArray[np.float32]]
@@ -141,26 +143,27 @@ class BlockValues:
             if not taken:
                 destination.take_means(helpers.finish())
 
-        with destination.rooms(0 if native() is None else min(number, threads + _ROOMS_BESIDE)) as rooms:
-            self._helped(threads, wanted, means, work)
+        share = bundle_share(number)
+        with destination.rooms(0 if share is None else min(number, threads + _ROOMS_BESIDE)) as rooms:
+            self._helped(share, threads, wanted, means, work)
 
     def _helped(
         self,
+        share: BundleShare | None,
         threads: int,
         wanted: Wanted,
         beside: Callable[[], Any] | None,
         work: Callable[[BlockValues, _Helpers], None],
     ) -> None:
         """Do a work with the help of threads, of which some look after the checksums of large files meanwhile."""
-        bundles = -(-self.block.splats // BUNDLE)
-        if threads < 2 or len(self.data) < _LARGE or native() is None:
-            with _Helpers(bundles, threads, beside) as helpers:
+        if threads < 2 or len(self.data) < _LARGE or share is None:
+            with _Helpers(share, threads, beside) as helpers:
                 work(self, helpers)
             return
         found = [section for key in wanted.keys if (section := self.block.find(key)) is not None]
         checks = [partial(container.is_sound, self.data, section) for section in found]
         try:
-            with _Helpers(bundles, threads, beside, checks) as helpers:
+            with _Helpers(share, threads, beside, checks) as helpers:
                 work(replace(self, checked=False), helpers)
                 sound = helpers.all_true()
         except DataError:
@@ -181,7 +184,7 @@ class BlockValues:
         block, activation = self.block, self.activation
         levels = np.arange(self._largest_level(MAIN[1]) + 1)
         classes = np.arange(-CLASSES, CLASSES).astype(np.int8)
-        scales = block.rules.dequantize_scales(levels, block.sf_scale)
+        scales = quantize.dequantize_scales(levels, block.sf_scale)
         opacities = block.rules.dequantize_opacities(np.arange(self._largest_level(MAIN[0]) + 1), block.sf_opacity)
         return Tables(
             scales if activation is None else activation.scales(scales),
@@ -236,6 +239,16 @@ class BlockValues:
         return Wanted(len(MAIN) if degree == self.block.sh_degree else 3 + degree, rotations)
 
 
+@definition
+def bundle_share(bundles: int) -> BundleShare | None:
+    """So many bundles for threads to share out while they leave the interpreter free; None: one thread does all."""
+    return None
+
+
+def _bundle_share_of_c(functions: Functions, bundles: int) -> BundleShare:
+    return functions.bundle_share(bundles)
+
+
 class _Helpers:
     """Threads that take part in decoding, and in what is to be done beside it.
 
@@ -244,7 +257,7 @@ class _Helpers:
     take memory meanwhile.
 
     Args:
-        bundles: of the file.
+        share: the bundles; None where NumPy is to be taken.
         threads: so many.
         beside: what else is to be done, by one of them, or by this one where there are none.
         checks: what others ask before they decode.
@@ -255,10 +268,13 @@ class _Helpers:
     """
 
     def __init__(
-        self, bundles: int, threads: int, beside: Callable[[], Any] | None, checks: Sequence[Callable[[], bool]] = ()
+        self,
+        share: BundleShare | None,
+        threads: int,
+        beside: Callable[[], Any] | None,
+        checks: Sequence[Callable[[], bool]] = (),
     ) -> None:
-        functions = native()
-        self.share = None if functions is None else functions.bundle_share(bundles)
+        self.share = share
         self._number = 0 if self.share is None else threads
         self._do_beside = beside or (lambda: None)
         self._checks = checks

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import quantize
-from potr_cl.codec.native.library import native
+from potr_cl.codec.native.functions import Functions
+from potr_cl.codec.native.table import definition
 from potr_cl.codec.steps.rule import factors
 from potr_cl.host.threads import Run
 from potr_cl.model.scene import FloatArray
@@ -39,48 +42,68 @@ def colour_levels(
     """
     count = sh.shape[1]
     columns = sh.transpose(1, 2, 0)
-    # Coefficients that are contiguous each, as a re-fit leaves them, are picked from each.
-    contiguous = columns.strides[2] == columns.itemsize
     levels: NDArray[np.signedinteger] = np.empty((count, 3, len(sh)), np.int16)
-    wide: list[tuple[tuple[int, int, slice], quantize.Integers]] = []
 
-    functions = native()
-    whole = columns if columns.flags.c_contiguous else sh if sh.flags.c_contiguous else None
-
-    def take(start: int) -> None:
+    def take(start: int) -> list[_Wide]:
         rows = order[start : start + _BLOCK]
-        block = slice(start, start + len(rows))
-        if functions is not None and whole is not None and whole.dtype == np.float32:
-            dc, ac = (
-                np.full(len(rows), scale_factor, np.float64)
-                if not part.any()
-                else factors(scale_factor, part[block]).astype(float)
-                for scale_factor, part in zip((parameters.sf_dc, parameters.sf_sh), classes, strict=True)
-            )
-            if functions.quantising.colour_levels(whole, whole is columns, rows, dc, ac, start, levels):
-                return
-        planar = (
-            np.array([[column.take(rows) for column in rgb] for rgb in columns])
-            if contiguous
-            else np.ascontiguousarray(sh[rows].transpose(1, 2, 0))
-        )
         of_dc, of_ac = (
             # A factor that is the same for all is not rounded: so it is for files without steps.
-            factors(scale_factor, part[block]) if part.any() else scale_factor
+            factors(scale_factor, part[start : start + len(rows)]) if part.any() else scale_factor
             for scale_factor, part in zip((parameters.sf_dc, parameters.sf_sh), classes, strict=True)
         )
-        for m, rgb in enumerate(planar):
-            factor = of_ac if m else of_dc
-            for c, values in enumerate(quantize.to_ycocg(rgb.astype(np.float64).T)):
-                made = quantize.quantize_sh(values, factor)
-                if made.dtype == levels.dtype:
-                    levels[m, c, block] = made
-                else:
-                    wide.append(((m, c, block), made))
+        return quantised(columns, rows, of_dc, of_ac, start, levels)
 
-    list(run(take, range(0, len(sh), _BLOCK)))
+    wide = [each for some in run(take, range(0, len(sh), _BLOCK)) for each in some]
     if wide:
         levels = levels.astype(np.result_type(*{made.dtype for _, made in wide}))
         for where, made in wide:
             levels[where] = made
     return levels
+
+
+_Wide = tuple[tuple[int, int, slice], quantize.Integers]
+_Factor = float | NDArray[np.float32]
+
+
+@definition
+def quantised(
+    columns: FloatArray, rows: NDArray[np.int64], dc: _Factor, ac: _Factor, start: int, levels: NDArray[Any]
+) -> list[_Wide]:
+    """Levels of some splats' colours.
+
+    Args:
+        columns: (M, 3, N) R, G, B.
+        rows: (n,) of them.
+        dc, ac: scale factors, (n,) or one for all.
+        start: where they go in ``levels`` (M, 3, …).
+
+    Returns:
+        What does not fit there: where it belongs, and what it is.
+    """
+    block, wide = slice(start, start + len(rows)), []
+    planar = (
+        # Coefficients that are contiguous each, as a re-fit leaves them, are picked from each.
+        np.array([[column.take(rows) for column in rgb] for rgb in columns])
+        if columns.strides[2] == columns.itemsize
+        else np.ascontiguousarray(columns.transpose(2, 0, 1)[rows].transpose(1, 2, 0))
+    )
+    for m, rgb in enumerate(planar):
+        for c, values in enumerate(quantize.to_ycocg(rgb.astype(np.float64).T)):
+            made = quantize.quantize_sh(values, ac if m else dc)
+            if made.dtype == levels.dtype:
+                levels[m, c, block] = made
+            else:
+                wide.append(((m, c, block), made))
+    return wide
+
+
+def _quantised_by_c(
+    functions: Functions, columns: FloatArray, rows: NDArray[np.int64], dc: _Factor, ac: _Factor, start: int,
+    levels: NDArray[Any],
+) -> Any:  # fmt: skip
+    planar, sh = columns.flags.c_contiguous, columns.transpose(2, 0, 1)
+    if columns.dtype != np.float32 or not (planar or sh.flags.c_contiguous):
+        return NotImplemented
+    of_dc, of_ac = (np.broadcast_to(np.asarray(each, np.float64), rows.shape).copy() for each in (dc, ac))
+    fit = functions.quantising.colour_levels(columns if planar else sh, planar, rows, of_dc, of_ac, start, levels)
+    return [] if fit else NotImplemented

@@ -16,6 +16,7 @@ from potr_cl.codec.bundles.layout import BUNDLE
 from potr_cl.codec.bundles.levels import Levels
 from potr_cl.codec.container import Block
 from potr_cl.codec.native.values import PackedValues, ValueArrays
+from potr_cl.codec.steps.classes import colour_classes
 from potr_cl.codec.steps.prediction import from_residuals
 from potr_cl.codec.steps.rule import ColourSteps, factors
 
@@ -83,7 +84,7 @@ def _fill(arrays: ValueArrays, block: Block, levels: Levels, steps: ColourSteps 
         own.logits[...] = rules.dequantize_opacities(levels.opacities, block.sf_opacity)
     if own.log_scales is not None:
         for axis, level in enumerate(scales):
-            own.log_scales[:, axis] = rules.dequantize_scales(level, block.sf_scale)
+            own.log_scales[:, axis] = quantize.dequantize_scales(level, block.sf_scale)
     if own.quaternions is not None and levels.rotations is not None:
         quantize.dequantize_rotations(
             levels.rotations, rules.rotation_factors(scales, block.sf_rotation), own.quaternions
@@ -94,7 +95,7 @@ def _fill(arrays: ValueArrays, block: Block, levels: Levels, steps: ColourSteps 
     if levels.classes is not None:
         dc, ac = levels.classes
     elif steps is not None:
-        dc, ac = steps.classes(scales, levels.opacities, levels.start)
+        dc, ac = colour_classes(steps, scales, levels.opacities, levels.start)
     of_dc: Any = levels.dc
     if levels.predicted:
         nothing = np.zeros(levels.stop - levels.start, np.int8)

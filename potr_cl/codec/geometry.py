@@ -14,10 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import octree, quantize
-from potr_cl.codec.native.library import native
+from potr_cl.codec.native.functions import Functions
+from potr_cl.codec.native.table import definition
 from potr_cl.codec.outliers import check_positions, may_be_coarse
 from potr_cl.codec.quantisers import QUANTISERS
 from potr_cl.codec.splat_levels import BLOCK, SplatLevels, splat_levels
+from potr_cl.codec.steps.classes import colour_classes
 from potr_cl.codec.steps.fitting import fit_steps
 from potr_cl.codec.steps.rule import ColourSteps
 from potr_cl.host.threads import Run, in_background
@@ -79,7 +81,7 @@ class Geometry:
             part = slice(start, min(start + BLOCK, n))
             rows, scales = order[part], [axis[part] for axis in self.scales]
             scene.means[rows] = found[part]
-            log_scales = [rules.dequantize_scales(levels, parameters.sf_scale) for levels in scales]
+            log_scales = [quantize.dequantize_scales(levels, parameters.sf_scale) for levels in scales]
             scene.log_scales[rows] = np.stack(log_scales, axis=1)
             turned = np.empty((len(rows), 4), np.float32)
             factors = rules.rotation_factors(scales, parameters.sf_rotation)
@@ -94,11 +96,7 @@ class Geometry:
         if self.steps is None:
             none = np.zeros(len(self.order), np.int8)
             return none, none
-        functions = native()
-        if functions is not None and all(levels.dtype == np.int16 for levels in (*self.scales, self.opacities)):
-            scales = np.stack(self.scales, dtype=np.int32)
-            return functions.step_classes(self.steps, scales, self.opacities.astype(np.int32))
-        return self.steps.classes(self.scales, self.opacities)
+        return colour_classes(self.steps, self.scales, self.opacities)
 
     def with_steps(self, effects: NDArray[np.floating]) -> Geometry:
         """The same with steps of colours by what each splat shows.
@@ -250,31 +248,34 @@ def _itself(streams: octree.OctreeStreams) -> octree.OctreeStreams:
 
 def distances_to_views(means: NDArray[np.float32], views: Sequence[Camera], run: Run) -> NDArray[np.float64]:
     """(N,) distance to the nearest view; without views 0, which leaves the tolerance to γ."""
-    nearest = np.zeros(len(means))
     if not views:
-        return nearest
+        return np.zeros(len(means))
     centres = camera_centres(views)
+    starts = range(0, len(means), BLOCK)
+    return np.concatenate(list(run(lambda start: nearest(means[start : start + BLOCK], centres), starts)))
 
-    functions = native()
 
-    def find(start: int) -> None:
-        if functions is not None:
-            some = np.ascontiguousarray(means[start : start + BLOCK], np.float32)
-            functions.quantising.nearest(some, centres, nearest[start : start + BLOCK])
-            return
-        axes = means[start : start + BLOCK].T.astype(np.float64)
-        least = nearest[start : start + BLOCK]
-        squared, part = np.empty_like(least), np.empty_like(least)
-        least[:] = np.inf
-        for camera_centre in centres:
-            for axis, (coordinates, at) in enumerate(zip(axes, camera_centre, strict=True)):
-                to = part if axis else squared
-                np.subtract(coordinates, at, out=to)
-                np.square(to, out=to)
-                if axis:
-                    np.add(squared, part, out=squared)
-            np.minimum(least, squared, out=least)
-        np.sqrt(least, out=least)
+@definition
+def nearest(points: NDArray[np.float32], others: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n,) the least distance of (n, 3) points to (v, 3) others."""
+    axes = points.T.astype(np.float64)
+    least = np.full(len(points), np.inf)
+    squared, part = np.empty_like(least), np.empty_like(least)
+    for other in others:
+        for axis, (coordinates, at) in enumerate(zip(axes, other, strict=True)):
+            to = part if axis else squared
+            np.subtract(coordinates, at, out=to)
+            np.square(to, out=to)
+            if axis:
+                np.add(squared, part, out=squared)
+        np.minimum(least, squared, out=least)
+    distances: NDArray[np.float64] = np.sqrt(least, out=least)
+    return distances
 
-    list(run(find, range(0, len(means), BLOCK)))
-    return nearest
+
+def _nearest_by_c(
+    functions: Functions, points: NDArray[np.float32], others: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    least = np.empty(len(points))
+    functions.quantising.nearest(np.ascontiguousarray(points, np.float32), others, least)
+    return least

@@ -13,7 +13,7 @@ _BITS = 63
 
 
 def parse(raw: bytes) -> dict[str, Any]:
-    """The object of a metadata section; empty bytes are an empty one.
+    """The object of a metadata section.
 
     Strict, where Python's own reader is lenient: UTF-8 only, no NaN or Infinity, no number beyond float64 or 64 bits,
     no half of a surrogate pair. So what comes out can be written as JSON again.
@@ -22,7 +22,7 @@ def parse(raw: bytes) -> dict[str, Any]:
         DataError: it is something else.
     """
     try:
-        facts = json.loads(raw.decode("utf-8") or "{}", parse_constant=_refuse, parse_float=_real, parse_int=_whole)
+        facts = json.loads(raw.decode("utf-8"), parse_constant=_refuse, parse_float=_real, parse_int=_whole)
         json.dumps(facts, ensure_ascii=False).encode("utf-8")  # fails on half a surrogate pair
     except (ValueError, RecursionError):
         facts = None

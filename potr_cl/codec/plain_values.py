@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from potr_cl.codec.destination import Activation, BundleTaker
 
 #: Bundles that a thread works on at a time, and threads that do: integers may be wide, and take memory.
-_AT_A_TIME, _MOST_THREADS = 2, 2
+_AT_A_TIME, _MOST_THREADS = 3, 2
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
 """The quantisers that a file can have been made with, one class each: :data:`QUANTISERS`.
 
 A quantiser says what integers are made of a scene's values and what values are made of the integers again: widths of
-steps, rotations, opacities, the octree's leaf levels. Everything else that reads or writes files asks it and never
-compares its number. docs/format.md is the normative description. Which one is taken follows from the hyper-parameters
-(:class:`potr_cl.codec.quantize.HyperParameters`).
+steps, rotations, opacities, the octree's leaf levels; scales are quantised alike by all. Everything else that reads or
+writes files asks it and never compares its number. docs/format.md is the normative description. Which one is taken
+follows from the hyper-parameters (:class:`potr_cl.codec.quantize.HyperParameters`).
 """
 
 from __future__ import annotations
@@ -56,22 +56,15 @@ class Quantiser(abc.ABC):
             run: in place of :func:`map`, to work with several threads.
         """
 
-    def quantize_scales(self, log_scales: F64, sf_scale: float) -> Integers:
-        """(N,) natural logarithms of standard deviations along one axis to levels, >= 0."""
-        return quantize.quantize_scales(log_scales, sf_scale)
-
-    def dequantize_scales(self, levels: Levels, sf_scale: float) -> F32:
-        """(N,) levels of one axis to natural logarithms of standard deviations."""
-        return quantize.dequantize_scales(levels, sf_scale)
-
     @abc.abstractmethod
     def quantize_rotations(
         self, imaginary: F64, scales: Sequence[Levels], sf_rotation: float, run: Run
     ) -> Iterable[Integers]:
         """(N, 3) imaginary parts of unit quaternions to levels of x, y and z, (N,) each; ``scales`` as quantised."""
 
+    @staticmethod
     @abc.abstractmethod
-    def rotation_factors(self, scales: Sequence[Levels], sf_rotation: float) -> F32:
+    def rotation_factors(scales: Sequence[Levels], sf_rotation: float) -> F32:
         """Scale factors of the rotations of some splats, for :func:`potr_cl.codec.quantize.dequantize_rotations`.
 
         Args:
@@ -82,12 +75,14 @@ class Quantiser(abc.ABC):
             float32: (N,), or (1,) if all are the same.
         """
 
+    @staticmethod
     @abc.abstractmethod
-    def quantize_opacities(self, logits: F64, sf_opacity: float) -> Integers:
+    def quantize_opacities(logits: F64, sf_opacity: float) -> Integers:
         """(N,) logits of opacities to levels, >= 0."""
 
+    @staticmethod
     @abc.abstractmethod
-    def dequantize_opacities(self, levels: Levels, sf_opacity: float) -> F32:
+    def dequantize_opacities(levels: Levels, sf_opacity: float) -> F32:
         """(N,) levels to logits of opacities."""
 
 
@@ -108,14 +103,12 @@ class Paper(Quantiser):
     ) -> Iterable[Integers]:
         return run(lambda part: quantize.quantize_rotations(part, sf_rotation), imaginary.T)
 
-    def rotation_factors(self, scales: Sequence[Levels], sf_rotation: float) -> F32:
+    @staticmethod
+    def rotation_factors(scales: Sequence[Levels], sf_rotation: float) -> F32:
         return np.full(1, sf_rotation, np.float32)
 
-    def quantize_opacities(self, logits: F64, sf_opacity: float) -> Integers:
-        return quantize.quantize_opacities(logits, sf_opacity)
-
-    def dequantize_opacities(self, levels: Levels, sf_opacity: float) -> F32:
-        return quantize.dequantize_opacities(levels, sf_opacity)
+    quantize_opacities = staticmethod(quantize.quantize_opacities)
+    dequantize_opacities = staticmethod(quantize.dequantize_opacities)
 
 
 class Balanced(Quantiser):
@@ -159,19 +152,14 @@ class Balanced(Quantiser):
     def quantize_rotations(
         self, imaginary: F64, scales: Sequence[Levels], sf_rotation: float, run: Run
     ) -> Iterable[Integers]:
-        factors = quantize.rotation_factors(scales, sf_rotation)
+        factors = self.rotation_factors(scales, sf_rotation)
         # A splat that is decoded as a ball has no direction.
         ball = (scales[0] == scales[1]) & (scales[1] == scales[2])
         return run(lambda part: np.where(ball, 0, quantize.quantize_rotations(part, factors)), imaginary.T)
 
-    def rotation_factors(self, scales: Sequence[Levels], sf_rotation: float) -> F32:
-        return quantize.rotation_factors(scales, sf_rotation)
-
-    def quantize_opacities(self, logits: F64, sf_opacity: float) -> Integers:
-        return quantize.quantize_logits(logits, sf_opacity)
-
-    def dequantize_opacities(self, levels: Levels, sf_opacity: float) -> F32:
-        return quantize.dequantize_logits(levels, sf_opacity)
+    rotation_factors = staticmethod(quantize.rotation_factors)
+    quantize_opacities = staticmethod(quantize.quantize_logits)
+    dequantize_opacities = staticmethod(quantize.dequantize_logits)
 
 
 #: Splats worked on at a time.

@@ -12,13 +12,14 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.logarithm import natural_logarithm
-from potr_cl.codec.native.library import native
+from potr_cl.codec.native.functions import Functions
+from potr_cl.codec.native.table import definition
 from potr_cl.errors import DataError, UsageError
 
 Integers = NDArray[np.signedinteger]
@@ -299,6 +300,7 @@ _CONJUGATES = np.ascontiguousarray((_GROUP * (1, -1, -1, -1)).T)
 AXIS_ROTATIONS = _CONJUGATES, _PERMUTATIONS.astype(np.uint8)
 
 
+@definition
 def canonical_rotations(quaternions: F32, log_scales: F32, order: NDArray[np.int64] | None = None) -> tuple[F64, F32]:
     """The equivalent form of each splat whose unit quaternion has the largest real part.
 
@@ -314,19 +316,7 @@ def canonical_rotations(quaternions: F32, log_scales: F32, order: NDArray[np.int
     Returns:
         (n, 3) float64 imaginary parts of unit quaternions with a real part >= 0, and the log scales in matching order.
     """
-    functions = native()
     order = np.arange(len(quaternions)) if order is None else order
-    if functions is not None:
-        imaginary, turned = np.empty((len(order), 3)), np.empty((len(order), 3), np.float32)
-        functions.quantising.canonical(
-            np.ascontiguousarray(quaternions, np.float32),
-            np.ascontiguousarray(log_scales, np.float32),
-            np.ascontiguousarray(order, np.int64),
-            *AXIS_ROTATIONS,
-            imaginary,
-            turned,
-        )
-        return imaginary, turned
     log_scales = log_scales[order]
     q = quaternions[order].astype(np.float64)
     q /= np.linalg.norm(q, axis=1, keepdims=True)
@@ -349,6 +339,22 @@ def canonical_rotations(quaternions: F32, log_scales: F32, order: NDArray[np.int
     )
     product[np.take_along_axis(real, best[:, None], axis=1)[:, 0] < 0] *= -1
     return product, np.take_along_axis(log_scales, _PERMUTATIONS[best], axis=1)
+
+
+def _canonical_rotations_by_c(
+    functions: Functions, quaternions: F32, log_scales: F32, order: NDArray[np.int64] | None = None
+) -> tuple[F64, F32]:
+    order = np.arange(len(quaternions)) if order is None else order
+    imaginary, turned = np.empty((len(order), 3)), np.empty((len(order), 3), np.float32)
+    functions.quantising.canonical(
+        np.ascontiguousarray(quaternions, np.float32),
+        np.ascontiguousarray(log_scales, np.float32),
+        np.ascontiguousarray(order, np.int64),
+        *AXIS_ROTATIONS,
+        imaginary,
+        turned,
+    )
+    return imaginary, turned
 
 
 def rotation_factors(scales: Sequence[NDArray[np.integer]], sf_rotation: float) -> F32:
@@ -412,6 +418,7 @@ def quantize_sh(values: F64, sf_sh: float | F32) -> Integers:
     return _to_levels(values, sf_sh, "SH coefficient")
 
 
+@definition
 def nonzero_levels(sh: F32, sf_sh: float) -> NDArray[np.bool_]:
     """Which SH coefficients the quantiser does not round to 0.
 
@@ -422,16 +429,18 @@ def nonzero_levels(sh: F32, sf_sh: float) -> NDArray[np.bool_]:
     Returns:
         (N, M, 3) in Y, Co, Cg, the flags of each coefficient contiguous in memory.
     """
-    functions = native()
-    if functions is not None and sh.flags.c_contiguous and sh.dtype == np.float32:
-        found = functions.quantising.nonzero_levels(sh, sf_sh, _LARGEST)
-        if found is not None:
-            return found.transpose(2, 0, 1)
     planar = np.empty((*sh.shape[1:], len(sh)), bool)
     for m, flags in enumerate(planar):
         for c, channel in enumerate(to_ycocg(sh[:, m].astype(np.float64))):
             np.not_equal(quantize_sh(channel, sf_sh), 0, out=flags[c])
     return planar.transpose(2, 0, 1)
+
+
+def _nonzero_levels_by_c(functions: Functions, sh: F32, sf_sh: float) -> Any:
+    if not (sh.flags.c_contiguous and sh.dtype == np.float32):
+        return NotImplemented
+    found = functions.quantising.nonzero_levels(sh, sf_sh, _LARGEST)
+    return NotImplemented if found is None else found.transpose(2, 0, 1)
 
 
 def ac_sparsity(sh: F32, sf_sh: float) -> float:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import quantize
 from potr_cl.codec.native.functions import Functions
-from potr_cl.codec.native.library import native
+from potr_cl.codec.native.table import definition
 from potr_cl.codec.quantisers import QUANTISERS, Balanced
 from potr_cl.host.threads import Run
 from potr_cl.model.scene import Scene
@@ -38,6 +39,7 @@ class SplatLevels:
     opacities: quantize.Integers
 
 
+@definition
 def splat_levels(scene: Scene, order: I64, world: quantize.HyperParameters, run: Run = map) -> SplatLevels:
     """Quantise all of some splats but centres and colours, each in its canonical form.
 
@@ -50,23 +52,21 @@ def splat_levels(scene: Scene, order: I64, world: quantize.HyperParameters, run:
     Raises:
         DataError: a value too large to quantise.
     """
-    rules, functions = QUANTISERS[world.quantiser], native()
-    if functions is not None and isinstance(rules, Balanced):
-        found = _natively(functions, scene, order, world, run)
-        if found is not None:
-            return found
+    rules = QUANTISERS[world.quantiser]
     imaginary, log_scales = _canonical(scene, order, run)
-    scales = list(run(lambda part: rules.quantize_scales(part.astype(np.float64), world.sf_scale), log_scales.T))
+    scales = list(run(lambda part: quantize.quantize_scales(part.astype(np.float64), world.sf_scale), log_scales.T))
     logits = scene.opacity_logits[order].astype(np.float64)
     rotations = rules.quantize_rotations(imaginary, scales, world.sf_rotation, run)
     opacities = rules.quantize_opacities(logits, world.sf_opacity)
     return SplatLevels(scales, list(rotations), opacities)
 
 
-def _natively(
-    functions: Functions, scene: Scene, order: I64, world: quantize.HyperParameters, run: Run
-) -> SplatLevels | None:
-    """The same; None where a level has more than 32 bits, which NumPy has to say or to hold."""
+def _splat_levels_by_c(
+    functions: Functions, scene: Scene, order: I64, world: quantize.HyperParameters, run: Run = map
+) -> Any:
+    """Not where a level has more than 32 bits, which NumPy has to say or to hold."""
+    if not isinstance(QUANTISERS[world.quantiser], Balanced):
+        return NotImplemented
     quaternions, logits = (np.ascontiguousarray(each, np.float32) for each in (scene.quaternions, scene.opacity_logits))
     factors = (world.sf_scale, world.sf_rotation, world.sf_opacity)
     levels, sizes = np.empty((7, len(order)), np.int32), np.empty((len(order), 3))
@@ -88,7 +88,7 @@ def _natively(
     found = list(run(quantise, range(0, len(order), BLOCK)))
     largest = [each for each in found if each is not None]
     if len(largest) < len(found):
-        return None
+        return NotImplemented
     types = [quantize.level_type(float(most)) for most in np.max(largest, axis=0)]
     columns = [levels[k].astype(dtype) for k, dtype in enumerate(types)]
     return SplatLevels(columns[:3], columns[3:6], columns[6])

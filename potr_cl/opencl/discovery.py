@@ -58,6 +58,11 @@ class DeviceInfo:
     family: Family
     handle: cl.Device
 
+    @property
+    def shares_host_memory(self) -> bool:
+        """Whether the device's memory is the host's: a CPU, or a GPU beside one."""
+        return self.kind == "cpu" or self.integrated
+
     def __str__(self) -> str:
         return f"'{self.name}' ({self.platform})"
 

@@ -54,7 +54,7 @@ class Ferry(Owner):
 
     def __init__(self, device: Device) -> None:
         self._device = device
-        self._direct = device.info.kind == "cpu" or device.info.integrated
+        self._direct = device.info.shares_host_memory
         self._places = max(min(os.cpu_count() or 1, _AT_A_TIME), 2)
         #: By so many pieces the threads are ahead of the device, or behind it.
         self._lag = self._places // 2

@@ -201,7 +201,7 @@ class Staging(Owner):
 
     def _taken(self, nbytes: int) -> np.ndarray[Any, Any]:
         device = self._device
-        if device.info.kind == "cpu" or device.info.integrated:
+        if device.info.shares_host_memory:
             return np.empty(nbytes, np.uint8)
         try:
             flags = cl.mem_flags.READ_WRITE | cl.mem_flags.ALLOC_HOST_PTR

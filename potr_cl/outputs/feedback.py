@@ -15,7 +15,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from potr_cl.codec.native.library import native
+from potr_cl.codec.native.functions import Functions
+from potr_cl.codec.native.table import definition
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray
 
@@ -66,6 +67,7 @@ def rounded_in_turn(sh: FloatArray, packed: FloatArray, quantise: Quantise, thre
     return found
 
 
+@definition
 def unit_factors(packed: FloatArray, splats: slice) -> FloatArray:
     """(M (M − 1) / 2, n): above their diagonals, column by column, the unit upper triangles U with Uᵀ D U = block.
 
@@ -79,10 +81,6 @@ def unit_factors(packed: FloatArray, splats: slice) -> FloatArray:
     count = math.isqrt(2 * len(packed))
     some = packed[:, splats]
     columns = np.empty((count * (count - 1) // 2, some.shape[1]), np.float32)
-    functions = native()
-    if functions is not None:
-        functions.quantising.unit_factors(packed, splats.start, DAMPING, columns)
-        return columns
     factor = np.empty((count, count, some.shape[1]), np.float32)
     factor[np.triu_indices(count)] = some
     size = factor[0, 0].copy()
@@ -99,4 +97,11 @@ def unit_factors(packed: FloatArray, splats: slice) -> FloatArray:
             np.multiply(factor[m, k:], row[k - m - 1], out=product[k:])
             factor[k, k:] -= product[k:]
             columns[k * (k - 1) // 2 + m] = row[k - m - 1]
+    return columns
+
+
+def _unit_factors_by_c(functions: Functions, packed: FloatArray, splats: slice) -> FloatArray:
+    count = math.isqrt(2 * len(packed))
+    columns = np.empty((count * (count - 1) // 2, packed[:, splats].shape[1]), np.float32)
+    functions.quantising.unit_factors(packed, splats.start, DAMPING, columns)
     return columns

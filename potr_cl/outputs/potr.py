@@ -92,7 +92,7 @@ class Potr(Output):
         file = open_file(data, trust)
         with ExitStack() as stack:
             scene: Drawable | None = None
-            of_host = device.info.kind == "cpu" or device.info.integrated
+            of_host = device.info.shares_host_memory
             if memory is None or not (of_host and large_for(device, _decoded_bytes(file), memory)):
                 with suppress(DeviceError):
                     scene = stack.enter_context(decode_to_device(file, device))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from potr_cl.clustering.codebook import codebook, nearest
 from potr_cl.clustering.curve import along_curve
 from potr_cl.codec.quantisers import QUANTISERS
-from potr_cl.codec.quantize import HyperParameters, canonical_rotations
+from potr_cl.codec.quantize import HyperParameters, canonical_rotations, dequantize_scales, quantize_scales
 from potr_cl.formats.scenes.sog_images import CODEBOOK, FIRST_TAG, U8
 from potr_cl.formats.scenes.sog_steps import (
     STEPS,
@@ -78,15 +78,15 @@ def rounded_geometry(scene: Scene, parameters: HyperParameters, distances: NDArr
     Raises:
         DataError: a value too large to quantise.
     """
-    version = QUANTISERS[parameters.quantiser]
-    world = version.in_world_units(parameters, scene, distances)
+    rules = QUANTISERS[parameters.quantiser]
+    world = rules.in_world_units(parameters, scene, distances)
     least, most, steps = _positions(scene, np.maximum(world.gamma, world.beta * distances))
     order = along_curve(steps)
     imaginary, log_scales = canonical_rotations(
         scene.quaternions.take(order, axis=0), scene.log_scales.take(order, axis=0)
     )
-    levels = [version.quantize_scales(axis.astype(np.float64), world.sf_scale) for axis in log_scales.T]
-    factors = version.rotation_factors(levels, world.sf_rotation)
+    levels = [quantize_scales(axis.astype(np.float64), world.sf_scale) for axis in log_scales.T]
+    factors = rules.rotation_factors(levels, world.sf_rotation)
     scale_levels = np.stack(levels, axis=1)
     least_level = int(scale_levels.min())
     counts = np.bincount((scale_levels - least_level).reshape(-1))
@@ -95,15 +95,15 @@ def rounded_geometry(scene: Scene, parameters: HyperParameters, distances: NDArr
     book = np.unique(np.rint(codebook(values, counts[there].astype(np.float64), CODEBOOK)).astype(np.int64))
     entries = np.zeros(len(counts), np.uint8)
     entries[there] = nearest(values, book.astype(np.float32))
-    logits = version.quantize_opacities(scene.opacity_logits.take(order).astype(np.float64), world.sf_opacity)
-    decoded = version.dequantize_opacities(logits, world.sf_opacity).astype(np.float64)
+    logits = rules.quantize_opacities(scene.opacity_logits.take(order).astype(np.float64), world.sf_opacity)
+    decoded = rules.dequantize_opacities(logits, world.sf_opacity).astype(np.float64)
     return SogGeometry(
         order,
         least,
         most,
         steps.take(order, axis=0),
         _rotations(imaginary, factors, (scale_levels == scale_levels[:, :1]).all(axis=1)),
-        version.dequantize_scales(book, world.sf_scale),
+        dequantize_scales(book, world.sf_scale),
         entries.take(scale_levels - least_level),
         np.rint(255 / (1 + np.exp(-decoded))).astype(np.uint8),
     )

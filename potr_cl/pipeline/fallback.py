@@ -9,7 +9,7 @@ from typing import TypeVar
 from potr_cl.errors import DeviceError, DeviceMemoryError
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import choose_device
-from potr_cl.stages.pruning.sweep_options import default_memory
+from potr_cl.views.budget import default_memory
 
 logger = logging.getLogger("potr_cl")
 

@@ -19,9 +19,9 @@ from potr_cl.stages.between.amount import most_needed
 from potr_cl.stages.fit import Fit
 from potr_cl.stages.fitting.fit import FitOptions
 from potr_cl.stages.fitting.memory import fit_bytes
-from potr_cl.stages.pruning.sweep_options import default_memory
-from potr_cl.stages.pruning.visible_parts import LEAST_SPLATS
 from potr_cl.stages.views_between import Between
+from potr_cl.views.budget import default_memory
+from potr_cl.views.visibility import LEAST_SPLATS
 
 #: Bytes of the process with its libraries; a splat, on the host and on the device; and what is kept of views and
 #: besides, as a multiple of what a view's own buffers take.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from potr_cl.opencl.device import Device
-from potr_cl.stages.pruning.visible_parts import LEAST_SPLATS
+from potr_cl.views.visibility import LEAST_SPLATS
 
 #: Bytes of the host's memory for each splat: what is not mapped of the scene (44), and what pruning knows of the splats
 #: while it chooses among them, as measured with 2.5 and 10 million. And what the interpreter and compilers take.
@@ -20,7 +20,7 @@ def for_views(device: Device, memory: int | None, splats: int) -> int | None:
         memory: bytes that are allowed; None: nothing was said.
         splats: of the scene. Of small ones the views take nearly all.
     """
-    of_host = device.info.kind == "cpu" or device.info.integrated
+    of_host = device.info.shares_host_memory
     if memory is None or not of_host or splats < LEAST_SPLATS:
         return memory
     return max(memory - _PROCESS - _SPLAT * splats, int(_LEAST * memory))

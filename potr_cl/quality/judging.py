@@ -29,7 +29,7 @@ from potr_cl.raster.kept_scene import KeptScene, lying_on
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.raster.scene_buffers import Drawable
-from potr_cl.raster.seen_rasterizer import SeenRasterizer, rasterizer_of
+from potr_cl.views.pictures import SeenRasterizer, rasterizer_of
 from potr_cl.workers.pool import Part
 
 #: Bytes of the uncompressed scene's pictures that are kept from one candidate to the next; others are rendered again.

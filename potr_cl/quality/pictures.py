@@ -18,7 +18,7 @@ from potr_cl.opencl.memory import Memory
 
 class Renderer(Protocol):
     """What renders a scene: a :class:`~potr_cl.raster.rasterizer.Rasterizer`, or a
-    :class:`~potr_cl.raster.seen_rasterizer.SeenRasterizer`, whose attributes and methods these are.
+    :class:`~potr_cl.views.pictures.SeenRasterizer`, whose attributes and methods these are.
     """
 
     @property

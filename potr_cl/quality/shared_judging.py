@@ -22,7 +22,7 @@ from potr_cl.quality.metrics_device import in_batches
 from potr_cl.raster.carried import Carried, HostScene, LentScene
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
-from potr_cl.raster.seen_rasterizer import groups_worth_it
+from potr_cl.views.pictures import groups_worth_it
 from potr_cl.workers.dealing import shares
 from potr_cl.workers.parts import Each, Parts
 from potr_cl.workers.pool import Pool
@@ -127,7 +127,7 @@ class SharedJudging(Owner):
         if not isinstance(candidate, Scene) or not isinstance(reference, KeptScene) or self._groups is None:
             return None
         info = self._device.info
-        if not (info.kind == "cpu" or info.integrated) or not reference.is_large_for(self._device, candidate):
+        if not info.shares_host_memory or not reference.is_large_for(self._device, candidate):
             return None
         return groups_worth_it(self._device, candidate, self._views, self._looks.rules.near, large=True)
 

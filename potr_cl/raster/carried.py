@@ -1,14 +1,15 @@
-"""Scenes on their way to other devices: :class:`Carried`, and :class:`LentScene`, from one device of this process to
-another."""
+"""Scenes on their way to other devices: :class:`Carried`, :class:`LentScene`, from one device of this process to
+another, and :class:`Excerpt`, some splats on their way to another process."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 
 from potr_cl.model.scene import Scene
+from potr_cl.model.splat_groups import Indices
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.relay import Lent, Relay
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
@@ -78,3 +79,32 @@ class LentScene(Carried):
             for name, buffer in own.parameters.items():
                 relay.fetch(buffer, self._lent[name])
             yield own
+
+
+@dataclass(frozen=True)
+class Excerpt:
+    """Some splats of a scene. They are gathered on their way to another process, where they arrive as a scene.
+
+    Attributes:
+        scene: the scene.
+        splats: (n,) int64, their numbers there, ascending.
+    """
+
+    scene: Scene
+    splats: Indices
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of these splats."""
+        return self.scene.nbytes * len(self.splats) // max(len(self.scene), 1)
+
+    def gathered(self) -> Scene:
+        """A scene of them."""
+        return self.scene.subset(self.splats)
+
+    def __reduce__(self) -> tuple[Callable[[Scene], Scene], tuple[Scene]]:
+        return _as_it_is, (self.gathered(),)
+
+
+def _as_it_is(scene: Scene) -> Scene:
+    return scene

@@ -18,9 +18,8 @@ from potr_cl.model.scene import Scene
 from potr_cl.model.splat_groups import SplatGroups
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
-from potr_cl.raster.carried import Carried
+from potr_cl.raster.carried import Carried, Excerpt
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers, copied, gathered, uploaded
-from potr_cl.raster.view_shares import Excerpt
 
 #: A scene that takes more than this part of the device's memory is not kept: others may need the room.
 _PART = 10
@@ -121,7 +120,7 @@ def large_for(device: Device, nbytes: int, memory: int | None) -> bool:
 
 def _allowed(device: Device, memory: int | None) -> int:
     """Bytes of a device's memory that there are, or that the user would have taken where it is the host's."""
-    if memory is not None and (device.info.kind == "cpu" or device.info.integrated):
+    if memory is not None and device.info.shares_host_memory:
         return min(device.info.memory, memory)
     return device.info.memory
 
@@ -174,7 +173,7 @@ def fits_whole(device: Device, scene: Drawable) -> bool:
     """Whether a whole scene is to lie on a device: on a GPU with memory of its own that it fits, or it does already."""
     if isinstance(scene, SceneBuffers):
         return True
-    if device.info.kind == "cpu" or device.info.integrated:
+    if device.info.shares_host_memory:
         return False
     return _WHOLE * scene.nbytes <= device.info.memory - device.allocated
 

@@ -126,6 +126,26 @@ class SceneBuffers(Owner):
         """The projection's arguments that say which they are, by their names."""
         return {"whole_stride": self.stride, "numbers": self.means, "picked": self.splats, "apart": 0}
 
+    def read_back(self, rows: NDArray[np.int64]) -> Scene:
+        """Some splats as a scene on the host again: (n,) numbers. Logarithms and logits are rounded once more."""
+
+        def read(parameter: cl.Buffer, columns: int) -> NDArray[np.float32]:
+            starts = range(0, 4 * self.stride * columns, 4 * self.stride)
+            found = [self.device.download(parameter, (self.splats,), np.float32, start)[rows] for start in starts]
+            return np.stack(found, axis=1)
+
+        logarithms = np.maximum(read(self.log2_opacities, 1)[:, 0].astype(np.float64), -100) * np.log(2)
+        below_one = np.maximum(-np.expm1(logarithms), 2.0**-30)
+        return Scene(
+            read(self.means, 3),
+            np.log(np.maximum(read(self.scales, 3), np.finfo(np.float32).tiny)),
+            read(self.quaternions, 4),
+            (logarithms - np.log(below_one)).astype(np.float32),
+            read(self.sh, 3 * self.sh_count).reshape(len(rows), self.sh_count, 3),
+            self.antialiased,
+            self.low_pass,
+        )
+
     def write_rows(
         self,
         parameter: cl.Buffer,
@@ -153,11 +173,7 @@ class SceneBuffers(Owner):
         turn = device.shared_kernel("raster/columns.cl", "columns")
         if start + len(rows) > self.splats:
             raise ValueError(f"{len(rows)} rows from splat {start} on do not fit {self.splats} splats")
-        if (
-            pending is None
-            and rows.nbytes >= sending.LEAST
-            and not (device.info.kind == "cpu" or device.info.integrated)
-        ):
+        if pending is None and rows.nbytes >= sending.LEAST and not device.info.shares_host_memory:
             height = max(sending.PIECE // (4 * width), 1)
             firsts = range(0, len(rows), height)
             with sending.Sending(device, what) as sender:

@@ -12,17 +12,14 @@ from numpy.typing import NDArray
 from potr_cl.errors import UsageError
 from potr_cl.host.threads import in_background, thread_pool
 from potr_cl.model.scene import FloatArray
-from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import lying_on
 from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.raster.surely_seen import surely_seen
-from potr_cl.raster.view_shares import ViewShares
 from potr_cl.stages.guarded import UNRESOLVED
 from potr_cl.stages.pruning.measured import Measured, Removal, measurement
 from potr_cl.stages.pruning.on_device import prune_scene
-from potr_cl.stages.pruning.removal import RemovalSweep
+from potr_cl.stages.pruning.removal import LARGEST_LIMIT, RemovalSweep
 from potr_cl.stages.pruning.schedule import Course, Pruned, PruningOptions
-from potr_cl.stages.pruning.shared_removal import SharedRemoval
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.pruning.unseen import (
     CHOICES,
@@ -31,8 +28,9 @@ from potr_cl.stages.pruning.unseen import (
     find_unseen,
     without_directions,
 )
-from potr_cl.stages.pruning.visible_parts import LARGEST_LIMIT, LIKELY, groups_of_large, seen_part, sights_worth_it
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
+from potr_cl.views.shares import ViewShares
+from potr_cl.views.visibility import MOST_SEEN, Visibility, groups_of_large, seen_part, visibility_of_large
 from potr_cl.workers.pool import Pool
 
 #: Of the time of all iterations, what the first measurement takes, which looks at all of every view; the others look at
@@ -157,7 +155,7 @@ class Prune(Stage):
 
         And as "unseen" a :class:`potr_cl.stages.pruning.unseen.Unseen`; and as "price", where the number of splats is
         not given, the ΔMSE below which a splat has gone; and as "shares" the
-        :class:`potr_cl.raster.view_shares.ViewShares`, where workers elsewhere get what their views see.
+        :class:`potr_cl.views.shares.ViewShares`, where workers elsewhere get what their views see.
         """
         if UNRESOLVED in state.learnt:
             return self._guarded(state, bench)
@@ -165,11 +163,10 @@ class Prune(Stage):
             quick = partial(surely_seen, placed) if isinstance(placed, SceneBuffers) else None
             part = in_background(seen_part, state.scene, state.views)  # while a device finds the unseen ones
             unseen = find_unseen(state, None, pool.map, quick) if quick else None
-            likely = part.result() <= LIKELY
+            likely = part.result() <= MOST_SEEN
             groups = groups_of_large(state.scene, pool.map) if likely or not unseen else None
             hidden, area = unseen or find_unseen(state, groups, pool.map)
-            options = self._sweep_options(bench.memory)
-            sights = sights_worth_it(state.scene, state.views, options, groups, pool.map) if likely else None
+            sights = visibility_of_large(state.scene, state.views, groups, pool.map) if likely else None
             groups = None
             if sights is not None and (bench.pool is None or bench.pool.in_process):
                 sights = sights.lasting()
@@ -194,7 +191,7 @@ class Prune(Stage):
                 self.name, Pruned(splats, np.full(splats, -1, np.int32), 0, lambda: Course(everything))
             )
         if sights is not None:
-            sights = sights_worth_it(state.scene.uncoloured().subset(seen), state.views, options)
+            sights = visibility_of_large(state.scene.uncoloured().subset(seen), state.views)
         return self._pruned(told, bench, sights, seen, hidden)
 
     def _guarded(self, state: State, bench: Workbench) -> State:
@@ -211,15 +208,15 @@ class Prune(Stage):
                 "give --unseen keep instead of protect"
             )
         with thread_pool(bench.threads) as pool:
-            likely = seen_part(state.scene, state.views) <= LIKELY
+            likely = seen_part(state.scene, state.views) <= MOST_SEEN
             groups = groups_of_large(state.scene, pool.map) if likely else None
-            sights = sights_worth_it(state.scene, state.views, self._sweep_options(bench.memory), groups, pool.map)
+            sights = visibility_of_large(state.scene, state.views, groups, pool.map)
             if sights is not None and (bench.pool is None or bench.pool.in_process):
                 sights = sights.lasting()
         told = self._told(state, bench, sights).having_learnt("unseen", state.learnt[UNRESOLVED])
         return self._pruned(told, bench, sights)
 
-    def _told(self, state: State, bench: Workbench, sights: Sights | None) -> State:
+    def _told(self, state: State, bench: Workbench, sights: Visibility | None) -> State:
         """The state that knows what the views see, and what a splat may cost."""
         if state.scene is state.source:
             state = replace(state, sights=sights)
@@ -233,7 +230,7 @@ class Prune(Stage):
         self,
         state: State,
         bench: Workbench,
-        sights: Sights | None = None,
+        sights: Visibility | None = None,
         seen: NDArray[np.int64] | None = None,
         hidden: NDArray[np.bool_] | None = None,
     ) -> State:
@@ -309,12 +306,10 @@ def part_of_time(iterations: float, stays: bool) -> float:
 
 
 def _views_that_stay(removal: Removal) -> float:
-    if isinstance(removal, SharedRemoval):
-        return math.inf  # others have them
-    return removal.cached_views if isinstance(removal, RemovalSweep) else removal.kept_views
+    return removal.resident_views if isinstance(removal, RemovalSweep) else math.inf  # others have them
 
 
-def _dealt(state: State, seen: NDArray[np.int64] | None, pool: Pool, sights: Sights) -> ViewShares:
+def _dealt(state: State, seen: NDArray[np.int64] | None, pool: Pool, sights: Visibility) -> ViewShares:
     """The views for a pool's workers, and which of the source's splats each gets, for this stage and others."""
     workers = pool.workers()
     source, numbers = (state.source, state.survivors) if state.is_cut else (state.scene, np.arange(len(state.scene)))

@@ -27,10 +27,10 @@ from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import Output, Request, Rounded
 from potr_cl.outputs.potr import Potr
-from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import KeptScene, PartOfKept
 from potr_cl.raster.scene_buffers import Drawable
-from potr_cl.raster.view_shares import ViewShares
+from potr_cl.views.shares import ViewShares
+from potr_cl.views.visibility import Visibility
 from potr_cl.workers.pool import Pool, Shared
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ class State:
     added: int = 0
     cut: Scene | None = None
     truth: Scene | None = None
-    sights: Sights | None = None
+    sights: Visibility | None = None
 
     @property
     def goal(self) -> Scene:

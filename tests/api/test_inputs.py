@@ -10,7 +10,7 @@ import pytest
 
 import potr_cl
 from potr_cl import Camera, DataError, EncodeOptions, Scene, UsageError
-from potr_cl.raster import seen_rasterizer
+from potr_cl.views import pictures, visibility
 
 QUICK = {"preset": "fast", "iterations": 1, "refit": False, "compact": False}
 
@@ -154,8 +154,8 @@ def test_a_tensor_is_taken_as_an_array(plush_excerpt):
 def test_no_view_at_all(size, plush_excerpt, plush_excerpt_cameras, monkeypatch):
     """An empty list, as a filter of names leaves it; whatever a scene's size has decided by then."""
     if size == "large":
-        monkeypatch.setattr(seen_rasterizer, "_LEAST_SPLATS", 1)
-        monkeypatch.setattr(seen_rasterizer, "_PART", 0.0)
+        monkeypatch.setattr(visibility, "LEAST_SPLATS", 1)
+        monkeypatch.setattr(pictures, "_PART", 0.0)
     for call in (potr_cl.render, lambda scene, *given, **views: potr_cl.compare(scene, scene, *given, **views)):
         for none in ([], (), np.array([], str)):
             with pytest.raises(UsageError, match="the list of views is empty: name at least one, or leave it out"):

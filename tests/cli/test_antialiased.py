@@ -90,6 +90,7 @@ def test_info_shows_it(tmp_path, paths, capsys):
         assert said in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_encode_is_judged_as_the_scene_is_rendered(tmp_path, paths, capsys):
     plain, _, cameras = paths
     few = ["--preset", "fast", "--iterations", 4]

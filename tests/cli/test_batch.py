@@ -81,6 +81,7 @@ def test_a_mistake_of_the_program_does_not_lose_the_others(
     assert len(load_scene("small/b.spz")) == 61
 
 
+@pytest.mark.slow
 def test_one_device_is_opened_once(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

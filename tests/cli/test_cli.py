@@ -67,30 +67,6 @@ def test_damaged_file_keeps_the_old_output(tmp_path, potr_path, capsys):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["damaged.potr", "out.ply", "scene.ply", "scene.potr"]
 
 
-@pytest.mark.parametrize(
-    ("options", "word"),
-    [
-        (["-q", "1.5"], "quality"),
-        (["-q", "nan"], "quality"),
-        (["--sf-sh", "0"], "sf_sh"),
-        (["--gamma", "-1"], "gamma"),
-        (["--zstd-level", "40"], "level 40"),
-        (["--threads", "-2"], "--threads"),
-    ],
-)
-def test_wrong_options(tmp_path, scene_path, capsys, options, word):
-    fails(capsys, ["encode", scene_path, "-o", tmp_path / "a.potr", *options], 2, word)
-    assert not (tmp_path / "a.potr").exists()
-
-
-def test_wrong_arguments_exit_with_2(capsys):
-    for arguments in (["encode"], ["fly"], [], ["encode", "a.ply", "-o", "b", "-q", "good"]):
-        with pytest.raises(SystemExit) as caught:
-            cli.main(arguments)
-        assert caught.value.code == 2
-    capsys.readouterr()
-
-
 def test_bad_cameras(tmp_path, scene_path, capsys):
     path = tmp_path / "cameras.json"
     path.write_text('{"neither": "nor"}')
@@ -99,6 +75,7 @@ def test_bad_cameras(tmp_path, scene_path, capsys):
     assert not (tmp_path / "a.potr").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="needs resource limits")
 def test_disk_full(tmp_path, scene_path, potr_path):
     """A file size limit stands for a full disk: the write fails in the middle."""
@@ -119,6 +96,7 @@ def test_disk_full(tmp_path, scene_path, potr_path):
         assert sorted(p.name for p in tmp_path.iterdir()) == ["scene.ply", "scene.potr"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="needs POSIX permissions")
 def test_no_permission(scene_path):
     with tempfile.TemporaryDirectory() as folder:  # not tmp_path, which nobody else may even enter

@@ -44,26 +44,6 @@ def test_prune(tmp_path, scene_path, capsys):
     capsys.readouterr()
 
 
-@pytest.mark.parametrize(
-    ("options", "word"),
-    [
-        (["--keep", "0"], "--keep"),
-        (["--keep", "1.5"], "--keep"),
-        (["--count", "0"], "at least 1"),
-        (["--iterations", "0"], "iterations"),
-        (["--delta-mse-max", "-1"], "delta_mse_max"),
-        (["--tolerance", "nan"], "tolerance"),
-        (["--memory", "-2"], "memory"),
-        (["--background", "octarine"], "octarine"),
-    ],
-)
-def test_wrong_pruning_options(tmp_path, scene_path, capsys, options, word):
-    cameras = cameras_json(tmp_path / "cameras.json")
-    for command, out in (("prune", tmp_path / "out.ply"), ("encode", tmp_path / "out.potr")):
-        fails(capsys, [command, scene_path, "--cameras", cameras, "-o", out, *options], 2, word)
-        assert not out.exists()
-
-
 def test_interrupted_pruning_leaves_nothing(tmp_path, scene_path, capsys, monkeypatch):
     def interrupted(*_args, **_kwargs):
         raise KeyboardInterrupt
@@ -85,6 +65,7 @@ def test_compact(tmp_path, scene_path, capsys):
     assert np.abs(compacted.sh[:, 1:]).sum() < np.abs(scene.sh[:, 1:]).sum()
 
 
+@pytest.mark.slow
 def test_each_part_of_compaction_can_be_left_out(tmp_path, scene_path):
     cameras = cameras_json(tmp_path / "cameras.json")
     choices = ([], ["--colour-model", "rgb"], ["--weighting", "visibility"], ["--one-pass"], ["--alpha", "1"])
@@ -96,44 +77,6 @@ def test_each_part_of_compaction_can_be_left_out(tmp_path, scene_path):
             assert cli.main(arguments) == 0
             files.add(out.read_bytes())
         assert len(files) == len(choices)
-
-
-@pytest.mark.parametrize(
-    ("options", "word"),
-    [
-        (["--lambda", "-1"], "lam"),
-        (["--alpha", "0"], "alpha"),
-        (["--alpha", "1.5"], "alpha"),
-        (["--sf-sh", "0"], "sf_sh"),
-        (["-q", "2"], "quality"),
-        (["--memory", "-1"], "memory"),
-        (["--background", "octarine"], "octarine"),
-        (["--device", "abacus"], "abacus"),
-    ],
-)
-def test_wrong_compaction_options(tmp_path, scene_path, capsys, options, word):
-    cameras, out = cameras_json(tmp_path / "cameras.json"), tmp_path / "out.ply"
-    code = 1 if "--device" in options else 2
-    fails(capsys, ["compact", scene_path, "--cameras", cameras, "-o", out, *options], code, word)
-    assert not out.exists()
-
-
-def test_compaction_of_bad_files(tmp_path, scene_path, capsys):
-    cameras, out = cameras_json(tmp_path / "cameras.json"), tmp_path / "out.ply"
-    fails(capsys, ["compact", tmp_path / "none.ply", "--cameras", cameras, "-o", out], 2, "none.ply")
-    fails(capsys, ["compact", scene_path, "--cameras", tmp_path / "none.json", "-o", out], 2, "none.json")
-    fails(capsys, ["compact", scene_path, "--cameras", scene_path, "-o", out], 2, "scene.ply")
-    for option in ("compact", "refit"):
-        late = [f"--{option}-at", "2"]
-        fails(capsys, ["encode", scene_path, "--cameras", cameras, "-o", out, *late], 2, f"--{option}-at is 2")
-    assert not out.exists()
-
-
-def test_order_and_output_must_differ(tmp_path, scene_path, capsys):
-    cameras = cameras_json(tmp_path / "cameras.json")
-    arguments = ["prune", scene_path, "--cameras", cameras, "-o", tmp_path / "x.ply"]
-    arguments += ["--order", tmp_path / "x.ply"]
-    fails(capsys, arguments, 2, "same file")
 
 
 def test_refit(tmp_path, scene_path, dimmed_path, cameras_path, capsys):
@@ -158,6 +101,7 @@ def test_refit(tmp_path, scene_path, dimmed_path, cameras_path, capsys):
     assert not load_scene(out).sh[:, 1:].any()
 
 
+@pytest.mark.slow
 def test_refit_to_ground_truth(tmp_path, scene_path, dimmed_path, cameras_path, capsys):
     photos, out = tmp_path / "photos", tmp_path / "out.ply"
     run(capsys, "render", scene_path, "--cameras", cameras_path, "-o", photos, "--background", "white")
@@ -196,12 +140,3 @@ def test_refit_to_ground_truth_without_held_out_views(tmp_path, scene_path, dimm
     captured = capsys.readouterr()
     assert "8 training views" in captured.out
     assert "no view is held out" in captured.err
-
-
-def test_refit_bad_calls(tmp_path, scene_path, cameras_path, capsys):
-    out = tmp_path / "out.ply"
-    refit = ["refit", scene_path, "--reference", scene_path, "--cameras", cameras_path, "-o", out]
-    for option, value in (("--steps", -1), ("--prior", -1), ("--lambda", "nan"), ("--drop", "inf"), ("--memory", -1)):
-        fails(capsys, [*refit, f"{option}={value}"], 2)
-    fails(capsys, ["refit", scene_path, "--reference", tmp_path / "none.ply", *refit[4:]], 2, "none.ply")
-    assert not out.exists()

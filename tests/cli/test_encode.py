@@ -73,6 +73,7 @@ def test_encode_tells_what_it_did(tmp_path, scene_path, capsys):
     assert "evaluate" not in json.loads(run(capsys, *encode, "--no-quality", "--json"))["seconds"]
 
 
+@pytest.mark.slow
 def test_encode_to_a_size(tmp_path, excerpt, capsys):
     potr, fast = tmp_path / "a.potr", [*excerpt, "--preset", "fast", "--iterations", "6"]
     report = json.loads(run(capsys, *fast, "-o", potr, "--max-size", "20 kB", "--json"))
@@ -84,12 +85,14 @@ def test_encode_to_a_size(tmp_path, excerpt, capsys):
     assert "target     at most 20,480 bytes: " in run(capsys, *fast, "-o", potr, "--max-size", "20KiB")
 
 
+@pytest.mark.slow
 def test_encode_to_a_psnr(tmp_path, excerpt, capsys):
     fast = [*excerpt, "--preset", "fast", "--iterations", "6"]
     report = json.loads(run(capsys, *fast, "-o", tmp_path / "a.potr", "--min-psnr", "43", "--json"))
     assert 43 <= report["quality"]["psnr"] <= 43.1
 
 
+@pytest.mark.slow
 def test_encode_to_the_impossible(tmp_path, excerpt, capsys):
     potr, excerpt = tmp_path / "a.potr", [*excerpt, "--preset", "fast", "--iterations", "2"]
     fails(
@@ -130,6 +133,7 @@ def test_a_size_without_its_unit(text):
         size_in_bytes(text)
 
 
+@pytest.mark.slow
 def test_encode_report_page(tmp_path, excerpt, capsys):
     page = tmp_path / "page.html"
     encode = [*excerpt, "--iterations", "4", "-o", tmp_path / "a.potr"]
@@ -199,17 +203,7 @@ def test_both_entropy_stages(tmp_path, scene_path, capsys):
     capsys.readouterr()
 
 
-def test_encode_prunes(tmp_path, scene_path, capsys):
-    cameras = cameras_json(tmp_path / "cameras.json")
-    potr = tmp_path / "a.potr"
-    arguments = ["encode", scene_path, "-o", potr, "--cameras", cameras, "--iterations", "3", "--memory", "0.00001"]
-    assert cli.main([str(a) for a in [*arguments, "--count", "60"]]) == 0
-    assert "60 of 200, " in capsys.readouterr().out
-    assert cli.main(["info", str(potr), "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
-    assert (report["splats"], report["source_splats"]) == (60, 200)
-
-
+@pytest.mark.slow
 def test_without_cameras_virtual_ones_are_placed(tmp_path, scene_path, capsys):
     potr = tmp_path / "a.potr"
     few = ["--iterations", "2", "--virtual-views", "8", "--count", "90"]
@@ -243,6 +237,7 @@ def test_a_scene_too_large_to_quantise(tmp_path, capsys):
     assert not (tmp_path / "a.potr").exists()
 
 
+@pytest.mark.slow
 def test_encode_to_ground_truth(tmp_path, scene_path, capsys):
     """Photographs that are darker than the scene: the file comes nearer to them than the scene is."""
     cameras_path, photos, out = cameras_json(tmp_path / "cameras.json"), tmp_path / "photos", tmp_path / "out.potr"
@@ -301,6 +296,7 @@ def test_virtual_views_beside_cameras_are_refused_from_python(tmp_path, name):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_few_cameras_are_told_where_held_out_views_suffer(tmp_path, data, capsys):
     """Not where training views show what held-out ones show."""
     scene, every = data / "plush_excerpt.ply", json.loads((data / "plush_excerpt_cameras.json").read_text())
@@ -322,6 +318,7 @@ def test_few_cameras_are_told_where_held_out_views_suffer(tmp_path, data, capsys
     assert gap[0] > 6 > gap[1]
 
 
+@pytest.mark.slow
 def test_training_views_that_judge_themselves_are_said_to_be_few(tmp_path, data, capsys):
     training = [
         camera for camera in json.loads((data / "plush_excerpt_cameras.json").read_text()) if camera["split"] == "train"

@@ -16,8 +16,6 @@ from tests.reference.scenes import random_scene
 ASKED = {
     "nothing": [],
     "photos": ["--photos", "{photos}"],
-    "size": ["--max-size", "40kB"],
-    "psnr": ["--min-psnr", "20"],
     "no pruning": ["--no-prune"],
     "no re-fit": ["--refit", "off"],
     "compaction": ["--refit", "off", "--compact"],
@@ -27,8 +25,6 @@ ASKED = {
     "re-fits on the way": ["--refit-at", "0.5"],
     "unseen": ["--unseen", "drop"],
     "antialiased": ["--antialiased", "yes"],
-    "background": ["--background", "white"],
-    "zstd": ["--entropy", "zstd"],
 }
 #: And how it is told.
 TOLD = {

@@ -136,6 +136,7 @@ def interrupted(words, times):
     return process.returncode, output, rounds
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals")
 @pytest.mark.parametrize("command", ["encode", pytest.param("fit", marks=pytest.mark.slow)])
 def test_an_interrupted_fit_keeps_its_last_whole_round(paths, command):
@@ -154,6 +155,7 @@ def test_an_interrupted_fit_keeps_its_last_whole_round(paths, command):
     assert len(load_scene(paths / "out.ply")) == 60
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals")
 def test_a_second_interrupt_ends_the_command(paths):
     code, _, _ = interrupted(command_of(paths, "--steps", "6000"), 2)

@@ -127,16 +127,6 @@ def test_devices_that_there_are_not(
     assert "no OpenCL device fits" in err
 
 
-def test_a_forgotten_option_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    assert outcome(capsys, ["encode", "i.ply"]) == (
-        2,
-        "",
-        "potr-cl encode: -o OUT.potr (.potr, .spz, .sog, .compressed.ply, .glb or .ply, a folder, "
-        'or "-" for standard output) is missing '
-        "(see potr-cl encode --help)\n",
-    )
-
-
 def calls(name: str, good: str) -> list[list[str]]:
     """A name in every place of every command that takes one, beside good ones."""
     cameras = str(ROOT / "tests" / "data" / "plush_excerpt_cameras.json")
@@ -188,6 +178,7 @@ def test_names_that_cannot_be(
     assert sorted(path.name for path in tmp_path.iterdir() if path.name != "new") == ["loop.ply", "scene.ply"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform in ("darwin", "win32"), reason="names are Unicode there")
 def test_a_name_that_is_not_utf_8(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -454,6 +445,7 @@ def test_standard_output_is_full(potr_path: Path, arguments: list[str]) -> None:
     assert result.stderr == "potr-cl: cannot write to the standard output: No space left on device\n"
 
 
+@pytest.mark.slow
 @needs_posix
 @pytest.mark.parametrize("closed", ["2> /dev/full", "2>&-", "2>&- <&-"])
 def test_standard_error_is_not_needed(tmp_path: Path, scene_path: Path, closed: str) -> None:

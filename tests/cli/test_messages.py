@@ -43,6 +43,16 @@ def encode(data, tmp_path):
     return ["encode", excerpt, "--cameras", cameras, "-o", tmp_path / "a.potr", "--iterations", "2", "--refit", "1"]
 
 
+@pytest.fixture(scope="module")
+def told(data, tmp_path_factory):
+    """What such an encode writes to standard error."""
+    path = tmp_path_factory.mktemp("told") / "a.potr"
+    words = ["encode", data / "plush_excerpt.ply", "--cameras", data / "plush_excerpt_cameras.json", "-o", path]
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()) as said:
+        assert cli.main([str(word) for word in [*words, "--iterations", "2", "--refit", "1"]]) == 0
+    return said.getvalue()
+
+
 def called(capsys, *arguments):
     code = cli.main([str(argument) for argument in arguments])
     captured = capsys.readouterr()
@@ -94,6 +104,7 @@ def test_every_argument_has_help_and_every_command_can_be_quiet(name):
 # How much is said
 
 
+@pytest.mark.slow
 def test_quiet_says_nothing_but_what_was_asked_for(encode, capsys):
     assert called(capsys, *encode, "--quiet") == (0, "", "")
     code, out, err = called(capsys, "info", encode[5], "--quiet")
@@ -106,16 +117,15 @@ def test_quiet_says_nothing_but_what_was_asked_for(encode, capsys):
     assert (code, out, err.count("\n")) == (2, "", 1)
 
 
-def test_verbose_says_more(encode, capsys):
-    _, _, normal = called(capsys, *encode)
+@pytest.mark.slow
+def test_verbose_says_more(encode, told, capsys):
     _, _, verbose = called(capsys, *encode, "--verbose")
-    assert "driver: " not in normal
+    assert "driver: " not in told
     assert "driver: " in verbose
 
 
-def test_the_device_is_named_first(encode, capsys):
-    _, _, err = called(capsys, *encode)
-    cameras, device = err.splitlines()[:2]
+def test_the_device_is_named_first(told):
+    cameras, device = told.splitlines()[:2]
     assert cameras.endswith("the cameras were taken as they are")
     assert re.fullmatch(r"on '.+' \(.+\), kernels for [CG]PUs: 1,500 splats, 9 views of 240 x 180", device)
 
@@ -142,9 +152,9 @@ def test_a_long_stage_says_how_long_it_will_go_on(capsys, monkeypatch):
     assert capsys.readouterr().err.splitlines() == ["a …", "a: about 36 s left", "b …"]
 
 
-def test_what_takes_long_to_read_is_named(encode, capsys, monkeypatch):
-    _, _, err = called(capsys, *encode)
-    assert "reading" not in err
+@pytest.mark.slow
+def test_what_takes_long_to_read_is_named(encode, told, capsys, monkeypatch):
+    assert "reading" not in told
     monkeypatch.setattr(scenes, "_LONG_TO_READ", 100_000)
     _, _, err = called(capsys, *encode)
     assert re.fullmatch(r"reading .*plush_excerpt\.ply, 0\.0 GB …", err.splitlines()[0])
@@ -153,6 +163,7 @@ def test_what_takes_long_to_read_is_named(encode, capsys, monkeypatch):
 # Progress
 
 
+@pytest.mark.slow
 def test_a_stage_is_told_once_in_a_log(encode, capsys):
     _, _, err = called(capsys, *encode, "--max-size", "20k")
     lines = err.splitlines()
@@ -266,6 +277,7 @@ def test_help_has_no_escapes_in_any_version_of_python(monkeypatch, capsys):
     assert "x1b" not in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_terminal_gets_a_bar(encode):
     written = on_a_terminal(*encode)
     assert "elapsed" in written
@@ -284,6 +296,7 @@ def test_a_warning_has_its_colour_and_is_said_even_if_quiet(capsys):
 # The end
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals")
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_an_encode_that_is_told_to_end_leaves_nothing(encode, tmp_path, number, code):

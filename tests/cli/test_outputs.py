@@ -25,6 +25,26 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
     return tmp_path
 
 
+#: Values of options that are out of range, and what is said of them.
+WRONG = {
+    "encode": [
+        *(("-q 1.5", "quality"), ("-q nan", "quality"), ("--sf-sh 0", "sf_sh"), ("--gamma -1", "gamma")),
+        *(("--zstd-level 40", "level 40"), ("--threads -2", "--threads")),
+        *(("--compact-at 2", "--compact-at is 2"), ("--refit-at 2", "--refit-at is 2")),
+    ],
+    "prune": [
+        *(("--keep 0", "--keep"), ("--keep 1.5", "--keep"), ("--count 0", "at least 1")),
+        *(("--iterations 0", "iterations"), ("--delta-mse-max -1", "delta_mse_max")),
+        *(("--tolerance nan", "tolerance"), ("--memory -2", "memory"), ("--background octarine", "octarine")),
+    ],
+    "compact": [
+        *(("--lambda -1", "lam"), ("--alpha 0", "alpha"), ("--alpha 1.5", "alpha"), ("--sf-sh 0", "sf_sh")),
+        *(("-q 2", "quality"), ("--memory -1", "memory"), ("--background octarine", "octarine")),
+    ],
+    "refit": [("--steps=-1", "steps"), ("--prior -1", "prior"), ("--lambda nan", "lam"), ("--drop inf", "drop")],
+}
+
+
 @pytest.mark.parametrize(
     ("call", "said"),
     [
@@ -72,6 +92,10 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
         ("compact a.ply -o sub", "is a directory"),
         ("refit a.ply --reference a.ply -o sub", "is a directory"),
         ("compare a.ply a.potr --cameras none -o sub", "is a directory"),
+        *((f"encode a.ply -o b.potr {wrong}", said) for wrong, said in [*WRONG["encode"], *WRONG["prune"]]),
+        *((f"prune a.ply -o b.ply {wrong}", said) for wrong, said in WRONG["prune"]),
+        *((f"compact a.ply -o b.ply {wrong}", said) for wrong, said in WRONG["compact"]),
+        *((f"refit a.ply --reference a.ply -o b.ply {wrong}", said) for wrong, said in WRONG["refit"]),
     ],
 )
 def test_refused_in_one_line_before_any_work(
@@ -89,15 +113,15 @@ def test_refused_in_one_line_before_any_work(
     assert sorted(folder.rglob("*")) == before
 
 
-@pytest.mark.parametrize("suffix", [".spz", ".PLY", ".compressed.ply"])
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "command",
+    ("command", "suffix"),
     [
-        "decode a.potr -o",
-        "convert a.ply",
-        pytest.param("prune a.ply --iterations 2 --virtual-views 8 -o", marks=pytest.mark.slow),
-        "compact a.ply --virtual-views 8 -o",
-        pytest.param("refit a.ply --reference a.ply --steps 1 --virtual-views 8 -o", marks=pytest.mark.slow),
+        *(("convert a.ply", suffix) for suffix in (".spz", ".PLY", ".compressed.ply")),
+        ("decode a.potr -o", ".spz"),
+        ("prune a.ply --iterations 2 --virtual-views 8 -o", ".PLY"),
+        ("compact a.ply --virtual-views 8 -o", ".compressed.ply"),
+        ("refit a.ply --reference a.ply --steps 1 --virtual-views 8 -o", ".spz"),
     ],
 )
 def test_a_scene_is_written_as_its_name_says(folder: Path, command: str, suffix: str) -> None:

@@ -118,6 +118,7 @@ def test_compare_with_itself_is_valid_json(scene_path, cameras_path, capsys):
     assert "identical" in run(capsys, "compare", scene_path, scene_path, "--cameras", cameras_path)
 
 
+@pytest.mark.slow
 def test_compare_without_cameras(scene_path, potr_path, capsys):
     assert cli.main(["compare", str(scene_path), str(potr_path)]) == 0
     captured = capsys.readouterr()
@@ -148,6 +149,7 @@ def test_compare_tells_sizes_where_there_is_no_device(scene_path, potr_path, cap
     assert set(json.loads(run(capsys, "compare", scene_path, potr_path, "--json"))) == {"a", "b", "size_ratio"}
 
 
+@pytest.mark.slow
 def test_render_without_cameras_places_views(tmp_path, scene_path, capsys):
     assert cli.main(["render", str(scene_path), "-o", str(tmp_path / "around"), "--size", "40"]) == 0
     placed = [line for line in capsys.readouterr().err.splitlines() if "no --cameras" in line]
@@ -209,6 +211,7 @@ def test_compare_picture(tmp_path, scene_path, potr_path, cameras_path, capsys):
         )
 
 
+@pytest.mark.slow
 def test_compare_with_ground_truth(tmp_path, scene_path, potr_path, cameras_path, capsys):
     """The uncompressed scene's own pictures as photographs: 8 bits are all that A loses."""
     photos = tmp_path / "photos"

@@ -78,6 +78,7 @@ def test_a_report_that_cannot_be_written_takes_nothing_from_the_file(tmp_path, s
     assert len(potr_cl.decode(tmp_path / "a.potr")) > 0
 
 
+@pytest.mark.slow
 def test_a_folder_where_a_file_of_a_ladder_belongs_is_told_before_the_work(tmp_path, scene_path):
     (tmp_path / "ladder.json").mkdir()
     with pytest.raises(potr_cl.UsageError, match=r"ladder\.json': it is a directory"):

@@ -69,6 +69,7 @@ def test_centres_become_weighted_means(device):
     assert np.array_equal(centres[4], before[4])
 
 
+@pytest.mark.slow
 def test_clusters_are_about_as_good_as_those_of_all_comparisons(device):
     points, weights = some(6000, 3)
     found = cluster(device, points, weights, 700)

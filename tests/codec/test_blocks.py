@@ -330,6 +330,7 @@ def test_a_box_that_its_centres_are_not_in(data):
         decode_independently(file.bytes())
 
 
+@pytest.mark.slow
 def test_single_bytes_changed(data):
     """Every byte is covered by a checksum: none can be changed unseen."""
     rng = np.random.default_rng(1)

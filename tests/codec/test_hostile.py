@@ -199,6 +199,7 @@ def test_names_that_no_file_can_have(tmp_path):
 @pytest.mark.parametrize(
     "metadata",
     [
+        b"",
         b'{"q": NaN}',
         b'{"q": -Infinity}',
         b'{"q": 1e400}',
@@ -224,6 +225,11 @@ def test_metadata_that_is_no_json(metadata):
         decode(data)
     with pytest.raises(ValueError, match=r"JSON|finite|64 bits"):
         decode_independently(data)
+
+
+def test_absent_metadata_says_nothing():
+    data = made_of([LONE])
+    assert open_file(data).metadata == decode_independently(data)["metadata"] == {}
 
 
 def test_metadata_that_is_json():

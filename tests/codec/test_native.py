@@ -114,6 +114,7 @@ def test_any_scene(splats, degree, seed, preset, entropy, q, spread, copies, cho
     assert assert_alike(coded(scene, preset, q, entropy), choose, 2)
 
 
+@pytest.mark.slow
 def test_more_lanes_than_a_group_and_lanes_of_many_steps(choose):
     """Steps in which only some lanes have a splat; groups of lanes that are cut short."""
     for splats in (256 * 130 + 1, 8192 * 257 + 3):
@@ -139,8 +140,7 @@ def test_properties_one_by_one(plush_excerpt, name, choose):
     assert np.array_equal(found["native"].view(np.uint32), found["numpy"].view(np.uint32))
 
 
-@pytest.mark.parametrize("splats", [1, 255, 257, 1000, 33_000])
-@pytest.mark.parametrize("q", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize(("splats", "q"), [(1, 0.5), (255, 0.0), (257, 1.0), (1000, 0.5), (33_000, 0.0), (33_000, 1.0)])
 def test_the_encoder_writes_the_same_bytes(splats, q, choose):
     scene = random_scene(min(splats, 700), 2, seed=splats).subset(np.arange(splats) % 700)
     scene.sh[...] *= np.float32(10)
@@ -210,16 +210,17 @@ def test_changed_files(choose):
     rng = random.Random(7)
     originals = files_to_change()
     read = 0
-    for number in range(1000):
+    for number in range(400):
         data = bytearray(originals[number % len(originals)])
         for _ in range(rng.choice([1, 1, 1, 2, 8])):
             data[rng.randrange(int.from_bytes(data[12:16], "little"), len(data))] = rng.choice(
                 [0, 1, 127, 128, 255, rng.getrandbits(8)]
             )
         read += assert_alike(sealed(bytes(data)), choose)
-    assert 100 < read < 900  # both must occur for this to mean anything
+    assert 40 < read < 360  # both must occur for this to mean anything
 
 
+@pytest.mark.slow
 def test_changed_octrees(choose):
     rng = np.random.default_rng(3)
     means = rng.normal(size=(200, 3)).astype(np.float32)

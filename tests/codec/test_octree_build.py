@@ -1,4 +1,4 @@
-"""Octrees that the compiled library builds: the same bits as NumPy's, and nothing beyond their arrays."""
+"""Octrees that the compiled library builds: levels at a turn, and nothing beyond their arrays."""
 
 from __future__ import annotations
 
@@ -6,58 +6,15 @@ import numpy as np
 import pytest
 
 from potr_cl.codec import octree
+from potr_cl.codec.native import octree_build
 from potr_cl.codec.native.library import VARIABLE, native
+from potr_cl.errors import DataError
+from potr_cl.host.threads import thread_pool
+from potr_cl.model import order
 
 pytestmark = pytest.mark.skipif(
     native() is None, reason="the compiled library is not there: python -m tools.make.native, or pip install -e ."
 )
-
-
-def clusters(rng: np.random.Generator, n: int) -> np.ndarray:
-    means = np.concatenate([rng.normal(size=(n, 3)), rng.normal(size=(n // 3, 3)) / 50]).astype(np.float32)
-    return rng.permutation(np.concatenate([means, means[: n // 10], means[: n // 20]]))
-
-
-def line(rng: np.random.Generator, n: int) -> np.ndarray:
-    means = np.zeros((n, 3), np.float32)
-    means[:, 1] = rng.integers(0, 50, n)
-    return means
-
-
-SCENES = {
-    "clusters": lambda rng: clusters(rng, 3000),
-    "many in one place": lambda rng: rng.integers(0, 4, (500, 3)).astype(np.float32),
-    "a line": lambda rng: line(rng, 300),
-    "one place": lambda rng: np.full((7, 3), 3.5, np.float32),
-    "one splat": lambda rng: np.ones((1, 3), np.float32),
-    "far apart": lambda rng: np.concatenate([clusters(rng, 100) * 1e-6, [[1e6, 0, -1e6]]]).astype(np.float32),
-}
-
-
-@pytest.mark.parametrize("scene", SCENES)
-@pytest.mark.parametrize("finest", [3.0, 1e-2, 1e-5, 1e-9, 1e-13])
-@pytest.mark.parametrize("alike", [True, False])
-def test_same_streams(scene, finest, alike, monkeypatch):
-    """Trees of no level, and of so many that a splat's octants take one, two or three words; powers of two as well."""
-    rng = np.random.default_rng(len(scene))
-    means = SCENES[scene](rng)
-    tolerance = finest if alike else finest * np.exp2(rng.integers(0, 12, len(means)) / 2)
-    found = []
-    for value in ("0", "1"):
-        monkeypatch.setenv(VARIABLE, value)
-        found.append((*octree.build(means, tolerance, absolute=True), octree.leaf_order(means, tolerance)))
-    (ours, our_order, our_leaves), (theirs, their_order, their_leaves) = found
-    assert np.array_equal(our_order, their_order)
-    assert np.array_equal(our_leaves, their_leaves)
-    assert np.array_equal(our_order, our_leaves)
-    assert our_order.dtype == their_order.dtype
-    assert (ours.origin, ours.side, ours.depth) == (theirs.origin, theirs.side, theirs.depth)
-    for name in ("occupancy", "several", "multiplicities", "leaf_levels", "tails"):
-        a, b = getattr(ours, name), getattr(theirs, name)
-        assert a.dtype == b.dtype
-        assert np.array_equal(a, b), name
-    decoded = octree.parse(theirs, len(means))
-    assert np.abs(decoded - means[their_order]).max() <= np.max(tolerance) + 2**-22 * np.abs(means).max()
 
 
 def test_levels_at_a_turn_are_numpys(monkeypatch):
@@ -93,3 +50,29 @@ def test_what_does_not_fit_is_refused_before_c_sees_it():
             building.streams(*arguments)
     with pytest.raises(TypeError):
         building.bounds(np.zeros((3, 3), np.float32), np.ones(2))
+
+
+@pytest.mark.parametrize("tolerance", [1e-1, 1e-3, 1e-7], ids=["some share leaves", "one word", "two words"])
+def test_the_same_octree(monkeypatch, tolerance):
+    rng = np.random.default_rng(5)
+    means = (rng.normal(size=(40_000, 3)) ** 3).astype(np.float32)
+    means[:300] = means[300]
+    wanted, wanted_order = octree.build(means, tolerance, absolute=True)
+    monkeypatch.setattr(order, "_LARGE", 1000)
+    monkeypatch.setattr(order, "_RANGE", 1024)
+    monkeypatch.setattr(octree_build, "_AT_A_TIME", 3000)
+    with thread_pool(3) as pool:
+        tree, its_order = octree.build(means, tolerance, absolute=True, run=pool.map)
+    assert np.array_equal(wanted_order, its_order)
+    assert (tree.origin, tree.side, tree.depth) == (wanted.origin, wanted.side, wanted.depth)
+    for name in ("occupancy", "several", "multiplicities", "leaf_levels", "tails"):
+        assert np.array_equal(getattr(tree, name), getattr(wanted, name)), name
+
+
+def test_centres_beyond_single_precision_are_refused_as_a_decoder_does():
+    means = np.float32([[3.4e38, 3.3e38, 0], [-3.4e38, 3.3e38, 0], [0, 3.3e38, 0]])
+    begun = octree.begin(means, 1e39, absolute=True)
+    with pytest.raises(DataError, match="single precision"):
+        octree.parse(begun.streams(), 3)
+    with pytest.raises(DataError, match="single precision"):
+        begun.decoded(map)

@@ -93,20 +93,6 @@ def test_the_independent_decoder_agrees(degree, splats, entropy, path):
     assert np.array_equal(file.body(0).sh(0), got.sh[:, :1])
 
 
-@pytest.mark.parametrize("entropy", ["bundles", "zstd"])
-def test_both_paths_give_the_same_bits(entropy, monkeypatch):
-    skip_without_library(monkeypatch)
-    scene = random_scene(3000, 2, seed=5)
-    data = []
-    scenes = []
-    for choice in ("0", "1"):
-        monkeypatch.setenv(VARIABLE, choice)
-        data.append(file_of(scene, adapted(scene), entropy))
-        scenes.append(decode(data[0]))
-    assert data[0] == data[1]
-    assert scenes[0].sh.tobytes() == scenes[1].sh.tobytes()
-
-
 def test_colours_are_within_half_of_each_splats_own_step():
     scene = random_scene(2000, 1, seed=3)
     geometry = adapted(scene)

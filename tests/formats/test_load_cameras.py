@@ -157,10 +157,11 @@ def replace_somewhere(draw: st.DataObject, value: Any) -> Any:
     return copy
 
 
+@pytest.mark.slow
 @warnings_are_errors
 @pytest.mark.parametrize("content", [[view(), view(img_name="b", split="test")], nerfstudio(["a.png", "b.png"])])
 @given(draw=st.data())
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 def test_json_with_replaced_parts(content: Any, draw: st.DataObject, tmp_path_factory: pytest.TempPathFactory) -> None:
     for _ in range(draw.draw(st.integers(1, 3))):
         content = replace_somewhere(draw, content)

@@ -82,6 +82,7 @@ def test_a_scene_that_is_read_and_what_is_taken_of_it(tmp_path):
         assert np.array_equal(getattr(part, name), getattr(scene, name)[::-1])
 
 
+@pytest.mark.slow
 def test_a_file_is_the_same_wherever_arrays_lie(plush_excerpt, plush_excerpt_cameras, tmp_path, monkeypatch):
     plush_excerpt.save(tmp_path / "scene.ply")
     files = []

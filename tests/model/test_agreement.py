@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +48,7 @@ def test_wrong_frames_of_the_excerpt_without_directions_are_found(plush_excerpt,
         assert judge_cameras(other, cameras).suspicious, what
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degree", [3, 0])
 def test_no_right_cameras_of_the_excerpt_are_refused(plush_excerpt, plush_excerpt_cameras, degree):
     scene = plush_excerpt if degree else without_directions(plush_excerpt)
@@ -69,7 +71,7 @@ def test_an_excerpt_belongs_to_the_cameras_of_the_whole_scene(plush_excerpt, plu
 def test_parts_that_are_cut_out_of_a_scene_belong_to_its_cameras(name, request):
     scene, views = whole(request, name)
     rng = np.random.default_rng(0)
-    for splats in 3 * (1500, 10_000, 50_000):
+    for splats in 2 * (1500, 10_000, 50_000):
         distance = np.linalg.norm(scene.means - scene.means[rng.integers(len(scene))], axis=1)
         part = scene.subset(np.sort(np.argsort(distance, kind="stable")[:splats]))
         judged = judge_cameras(part, views)
@@ -84,6 +86,8 @@ def test_every_wrong_frame_of_a_whole_scene_is_found(name, request):
     others = whole(request, "plush" if name == "lego" else "lego")[1]
     found = {}
     for what, other, cameras in wrong(scene, views, others):
+        if what in ("turned by 180 degrees about y", "turned by 90 degrees about x", "shifted by 8 along y"):
+            continue  # the excerpt tells these, too
         judged = judge_cameras(other, cameras, evidence_of(other, cameras))
         # Of views that show next to nothing no photograph can tell.
         assert judged.suspicious or ("shifted" in what and judged.doubt), what
@@ -158,12 +162,12 @@ def test_no_right_cameras_of_a_whole_scene_are_refused(name, degree, request):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", CAPTURES)
-def test_no_right_cameras_of_other_kinds_of_scenes_are_refused(name):
-    whole_scene, cameras = CAPTURES[name]()
-    for scene in (whole_scene, without_directions(whole_scene)):
-        for what, views in right(scene, cameras, others=False):
-            assert not judge_cameras(scene, views).suspicious, (what, scene.sh_degree)
+@pytest.mark.parametrize(("number", "name"), enumerate(CAPTURES))
+def test_no_right_cameras_of_other_kinds_of_scenes_are_refused(number, name):
+    scene, cameras = CAPTURES[name]()
+    scene = without_directions(scene) if number % 2 else scene
+    for what, views in right(scene, cameras, others=False):
+        assert not judge_cameras(scene, views).suspicious, (what, scene.sh_degree)
 
 
 def test_the_same_is_judged_the_same(plush_excerpt, plush_excerpt_cameras):
@@ -226,5 +230,9 @@ def test_a_moved_scene_looks_the_same_from_moved_cameras(plush_excerpt):
 
 
 def whole(request: pytest.FixtureRequest, name: str) -> tuple[Scene, list[Camera]]:
-    folder = request.getfixturevalue(name)
+    return loaded(request.getfixturevalue(name))
+
+
+@functools.cache
+def loaded(folder: Path) -> tuple[Scene, list[Camera]]:
     return load_scene(folder / "point_cloud.ply"), train_views(load_cameras(folder / "cameras.json"))

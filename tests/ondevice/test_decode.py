@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 
 import potr_cl
+from potr_cl.api.inputs import drawable_to_judge
 from potr_cl.codec import block_values
+from potr_cl.codec.body import Body
 from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import PotrFile, open_file
 from potr_cl.codec.encoder import code_scene
@@ -20,6 +22,7 @@ from potr_cl.codec.native.library import native
 from potr_cl.codec.native.share import BundleShare
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import DataError, DeviceError, DeviceMemoryError, UsageError
+from potr_cl.model.sightings import looked_at
 from potr_cl.ondevice import dequantiser
 from potr_cl.ondevice.decode import decode_to_device
 from potr_cl.ondevice.staged_bundles import StagedBundles
@@ -258,6 +261,7 @@ def test_threads_that_get_no_memory_are_told_of(device, monkeypatch, compiled):
         decode_to_device(open_file(of_bundles(3 * 8192, 0)), device, threads=2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("native", ["0", ""])
 def test_bundles_beyond_all_tables_have_the_bits_of_the_host(native, device, monkeypatch):
     monkeypatch.setenv("POTR_CL_NATIVE", native)
@@ -277,3 +281,20 @@ def test_a_damaged_bundle_among_good_ones_leaves_nothing(device, compiled):
         decode_to_device(open_file(data), device, threads=3)
     assert str(of_device.value) == str(of_host.value)
     assert device.allocated == before
+
+
+@pytest.mark.parametrize("antialiased", [None, True])
+def test_cameras_are_judged_by_what_is_on_the_device_already(device, antialiased, monkeypatch):
+    """The file is decoded once, and what is read back is the scene."""
+    data, decoded = coded(130_000, "best", degree=1), []
+    decode_into = Body.decode_into
+    monkeypatch.setattr(Body, "decode_into", lambda *args, **kwargs: decoded.append(decode_into(*args, **kwargs)))
+    with drawable_to_judge(data, device, antialiased=antialiased) as (buffers, judged):
+        assert len(decoded) == 1
+        assert len(buffers) == 130_000
+    whole = open_file(data).scene().rendered(antialiased)
+    wanted = whole.subset(looked_at(len(whole)))
+    assert 0 < len(judged) == len(wanted) < 130_000
+    assert (judged.antialiased, judged.low_pass) == (wanted.antialiased, wanted.low_pass)
+    for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
+        assert np.allclose(getattr(judged, name), getattr(wanted, name), rtol=1e-5, atol=1e-5), name

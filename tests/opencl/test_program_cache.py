@@ -130,6 +130,7 @@ def test_a_device_opens_where_there_is_no_cache(tmp_path):
     opened(tmp_path / "file" / "folder")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="the cache lies elsewhere")
 def test_a_device_opens_whatever_lies_in_pyopencls_caches(tmp_path):
     """A database that was cut short, and one that is another process's."""

@@ -100,7 +100,7 @@ def decode(data: bytes, level: int = 0) -> dict[str, Any]:
     check(start == len(data), "the sections do not fill the file")
     return {
         **{name: np.concatenate([part[name] for part in parts]) for name in ARRAYS},
-        "metadata": metadata_object(contents.get("meta", b"")),
+        "metadata": metadata_object(contents.get("meta", b"{}")),
         "antialiased": flags > 0,
         "low_pass": 0.1 if flags == 3 else 0.3,
     }
@@ -217,8 +217,6 @@ def undo_zstandard(stored: bytes, size: int, name: str) -> bytes:
 
 def metadata_object(raw: bytes) -> dict[str, Any]:
     """Parse the bytes of metadata."""
-    if not raw:
-        return {}
     try:
         metadata = json.loads(raw.decode("utf-8"), parse_constant=reject, parse_float=finite, parse_int=of_64_bits)
         # Python takes half of a surrogate pair for a character, but cannot write it as UTF-8.

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
-from potr_cl.codec.native.library import native
-from potr_cl.outputs.feedback import DAMPING, rounded_in_turn, unit_factors
+from potr_cl.outputs.feedback import DAMPING, rounded_in_turn
 
 
 def test_the_nearest_plane_of_each_splat():
@@ -39,20 +37,3 @@ def test_the_nearest_plane_of_each_splat():
         else:
             assert np.allclose(found[n, 0], sh[n, 0] + upper[0, 1:] @ error[1:] / upper[0, 0], atol=1e-4)
     assert np.array_equal(found[::50, 1:], np.rint(sh[::50, 1:] * 8) / 8)
-
-
-@pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
-def test_compiled_factors_have_the_bits_of_numpy(coefficients, monkeypatch):
-    if native() is None:
-        pytest.skip("the compiled library is not there: python -m tools.make.native, or pip install -e .")
-    rng = np.random.default_rng(coefficients)
-    seen = rng.normal(size=(1003, 6, coefficients)) * rng.lognormal(0, 9, (1003, 1, 1))
-    seen[::9] = 0
-    blocks = np.einsum("nva,nvb->abn", seen, seen).astype(np.float32)[np.triu_indices(coefficients)]
-    found = []
-    for asked in "01":
-        monkeypatch.setenv("POTR_CL_NATIVE", asked)
-        found.append(unit_factors(np.ascontiguousarray(blocks), slice(5, 1000)))
-    assert found[0].shape == (coefficients * (coefficients - 1) // 2, 995)
-    assert np.array_equal(found[0].view(np.uint32), found[1].view(np.uint32))
-    assert np.isfinite(found[0]).all()

@@ -36,6 +36,7 @@ def nearest_levels(sh: np.ndarray, steps: np.ndarray) -> np.ndarray:
     return rounded
 
 
+@pytest.mark.slow
 def test_less_error_at_no_more_bytes_than_with_the_nearest_levels(
     encoded, plush_excerpt, plush_excerpt_cameras, device, monkeypatch
 ):

@@ -84,6 +84,7 @@ def test_far_splats_are_rounded_more(plush_excerpt):
     assert errors[::2].mean() > 10 * errors[1::2].mean()
 
 
+@pytest.mark.slow
 def test_a_higher_quality_is_larger_and_better(tmp_path, plush_excerpt, plush_excerpt_cameras, usual):
     sizes, psnrs = [], []
     with Evaluator(usual, plush_excerpt, EvaluationViews.of(plush_excerpt_cameras), (0, 0, 0)) as evaluator:
@@ -104,6 +105,7 @@ def test_it_is_smaller_than_the_whole_scene_as_sog(tmp_path, plush_excerpt, plus
     assert 2.5 * encoded.nbytes < (tmp_path / "whole.sog").stat().st_size
 
 
+@pytest.mark.slow
 def test_the_same_bytes_every_time(tmp_path, plush_excerpt, plush_excerpt_cameras, usual):
     first, second = (
         encode(plush_excerpt, plush_excerpt_cameras, q=0.5, output=tmp_path / name, device=usual).data

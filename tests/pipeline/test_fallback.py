@@ -14,7 +14,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.stages.pruning.sweep_options import default_memory
+from potr_cl.views.budget import default_memory
 from tests.devices import skip_without_cpu
 from tests.reference.scenes import random_scene, ring_of_cameras
 

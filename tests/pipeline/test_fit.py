@@ -38,7 +38,8 @@ def views_of(kind, cameras, scene):
     return train_views(cameras)[: int(kind)]
 
 
-@pytest.mark.parametrize("kind", ["8", pytest.param("2", marks=pytest.mark.slow), "1", "virtual"])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["8", "1", "virtual"])
 def test_a_fit_that_is_left_out_says_why_and_changes_nothing(device, plush_excerpt, plush_excerpt_cameras, kind):
     """As that of an excerpt is, whose splats are few and worth much."""
     views = views_of(kind, plush_excerpt_cameras, plush_excerpt)
@@ -69,6 +70,7 @@ def test_a_fit_pays(device, plush_excerpt, plush_excerpt_cameras):
     assert better > before + 0.5
 
 
+@pytest.mark.slow
 def test_time_is_told_only_of_a_fit_that_was_asked_for(device, plush_excerpt, plush_excerpt_cameras, monkeypatch):
     # By a clock that stands still while others have the processors, as far as the processors do the work.
     clock = time.process_time if device.info.kind == "cpu" else time.perf_counter
@@ -80,6 +82,7 @@ def test_time_is_told_only_of_a_fit_that_was_asked_for(device, plush_excerpt, pl
     assert fitted.seconds["fit"] > 0.3 * fitted.seconds["refit"], "that of the files that were made to see is the fit's"
 
 
+@pytest.mark.slow
 def test_what_makes_up_for_splats_rounds_finer(device, plush_excerpt, plush_excerpt_cameras):
     options = EncodeOptions(q=0.3).changed(
         prune={"delta_mse_max": 1e-7}, fit={"steps": 80, "further": 0.2, "cycles": 1}
@@ -94,6 +97,7 @@ def test_what_makes_up_for_splats_rounds_finer(device, plush_excerpt, plush_exce
         assert options.changed(q=q).parameters == options.changed(q=q, fit=False).parameters
 
 
+@pytest.mark.slow
 def test_what_only_fits_rounds_as_q_says(device, plush_excerpt, plush_excerpt_cameras):
     encoded = encode(plush_excerpt, plush_excerpt_cameras, HALF, device=device)
     assert encoded.fitted.spared == 0
@@ -147,6 +151,7 @@ def test_a_search_whose_fit_is_left_out_finds_what_it_finds_without(device, plus
     assert encode(plush_excerpt, plush_excerpt_cameras, found.options, device=device).data == found.encoded.data
 
 
+@pytest.mark.slow
 def test_a_search_fits_no_more_after_an_interrupt(device, plush_excerpt, plush_excerpt_cameras, monkeypatch):
     """Its first fit is the scout's."""
     monkeypatch.setattr("potr_cl.stages.fit.first_interrupt_asks", _Interrupted)

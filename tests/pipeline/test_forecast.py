@@ -48,6 +48,7 @@ def test_memory_of_a_large_scene_is_what_is_allowed(memory, device, plush_excerp
     assert large < memory(views)
 
 
+@pytest.mark.slow
 def test_views_take_about_what_is_said(memory, device, plush_excerpt, plush_excerpt_cameras, monkeypatch):
     views, most = train_views(plush_excerpt_cameras) * 5, 0
 

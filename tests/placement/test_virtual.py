@@ -131,6 +131,7 @@ def test_large_scenes_get_more_views_and_cpus_fewer_and_smaller_ones():
         assert plan(splats, slow=True).pixels < plan(splats).pixels
 
 
+@pytest.mark.slow
 def test_judges_stand_elsewhere_and_fewer_are_the_first_of_more(around_ball):
     tests = test_views(around_ball)
     apart = np.linalg.norm(camera_centres(tests)[:, None] - camera_centres(train_views(around_ball)), axis=2)
@@ -158,6 +159,7 @@ def test_standpoints(around_ball):
     assert 0.1 < np.median(ratio) < 0.5
 
 
+@pytest.mark.slow
 def test_the_same_every_time(around_ball):
     again = placed(BALL)
     assert all(np.array_equal(a.rotation, b.rotation) for a, b in zip(again, around_ball, strict=True))
@@ -181,6 +183,7 @@ def test_clutter_does_not_draw_the_views_away(clutter):
     assert np.mean(np.linalg.norm(camera_centres(outside), axis=1) < 12) > 0.4
 
 
+@pytest.mark.slow
 def test_no_camera_stands_in_matter():
     scene = together(BALL, floaters(4000, 2))
     centres = camera_centres(placed(scene))
@@ -207,6 +210,7 @@ def test_an_object_in_a_room():
     assert seen.min() >= 1
 
 
+@pytest.mark.slow
 def test_a_scene_that_is_only_looked_at_from_inside_has_all_its_judges():
     rng = np.random.default_rng(4)
     from_inside = trained(ROOM, -WALLS, rng.uniform(-0.6, 0.6, (60, 3)) * INSIDE_ROOM)
@@ -220,7 +224,8 @@ def upper_centres(count: int, distance: float) -> np.ndarray:
     return distance * centres / np.linalg.norm(centres, axis=1, keepdims=True)
 
 
-@pytest.mark.parametrize("degree", [pytest.param(2, marks=pytest.mark.slow), 3])
+@pytest.mark.slow
+@pytest.mark.parametrize("degree", [2, 3])
 def test_colours_tell_the_side_that_was_photographed(around_ball, degree):
     centres = camera_centres(placed(trained(BALL, BALL.means, upper_centres(60, 3), degree)))
     elevation = np.degrees(np.arcsin(centres[:, 2] / np.linalg.norm(centres, axis=1)))
@@ -254,14 +259,11 @@ UP = np.tile([0.0, 0, 1], (300, 1))
 PLANE = np.random.default_rng(6).uniform(-1, 1, (300, 3)) * [1, 1, 0]
 DEGENERATE = {
     "one splat": BALL.subset(np.arange(1)),
-    "two splats": BALL.subset(np.arange(2)),
     "all coincident": BALL.subset(np.zeros(50, int)),
     "coincident points": flat_splats(np.zeros((300, 3)), UP, 1e-30),
     "line": flat_splats(LINE, UP, 0.01),
     "plane": flat_splats(PLANE, UP, 0.05),
     "tiny units": scaled(BALL, 1e-6),
-    "small units": scaled(BALL, 0.02),
-    "minute units": scaled(BALL, 1e-4),
     "huge units": scaled(BALL, 1e9),
     "far from the origin": dataclasses.replace(BALL, means=BALL.means + np.float32(1e5)),
     "transparent": dataclasses.replace(BALL, opacity_logits=BALL.opacity_logits - 60),
@@ -297,6 +299,7 @@ def test_the_basis_is_that_of_the_rasterizer():
     assert np.allclose(ac_basis(directions), sh_basis(directions, 3)[:, 1:], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_encode_places_them_itself(monkeypatch):
     monkeypatch.setattr("potr_cl.pipeline.encode.place_cameras", lambda scene, device: place_cameras(scene, 6, 64))
     scene, options = random_scene(150, 2), EncodeOptions.for_preset("paper", prune={"iterations": 2})
@@ -305,6 +308,7 @@ def test_encode_places_them_itself(monkeypatch):
     assert given.pruned is not None
 
 
+@pytest.mark.slow
 def test_lego_is_looked_at_from_above(lego):
     scene = load_scene(lego / "point_cloud.ply")
     centres = camera_centres(placed(scene))

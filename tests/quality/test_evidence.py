@@ -23,6 +23,11 @@ from tests.reference.captures import CAPTURES
 from tests.reference.frames import ORDINARY, PHOTOGRAPHS, changed, moved, parts
 
 PHOTOGRAPHED = (0, 11, 23, 35)
+#: Of each kind of motion the smallest ones, which are the hardest to find.
+LEAST = [
+    *("scaled by 0.7", "scaled by 1.5", "shifted by 1 along x", "shifted by 1 along y"),
+    *("turned by 10 degrees about z", "turned by 10 degrees about x", "turned by 20 degrees about y"),
+]
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +45,7 @@ def building(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scene, list[Came
     return scene, views
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "motion", ["scaled by 0.7", "scaled by 2", "shifted by 3 along x", "turned by 20 degrees about y"]
 )
@@ -115,9 +121,12 @@ def test_every_ordinary_motion_of_a_whole_scene_is_found(name, request, caplog):
     scene, views = load_scene(folder / "point_cloud.ply"), train_views(load_cameras(folder))
     pointed = train_views(load_cameras(folder / "sparse" / "0")) if name == "plush" else []
     pointed = [dataclasses.replace(view, image_path=None) for view in pointed]
-    for cameras in filter(None, (views, pointed)):
+    known = list(filter(None, (views, pointed)))
+    for cameras in known:
         check_frame(scene, cameras, anyway=False)
-        for what, motion in ORDINARY.items():
-            found = judge_cameras(moved(scene, *motion), cameras, evidence_of(moved(scene, *motion), cameras))
+    for what in LEAST:
+        other = moved(scene, *ORDINARY[what])
+        for cameras in known:
+            found = judge_cameras(other, cameras, evidence_of(other, cameras))
             assert found.suspicious or found.doubt, what
     assert not caplog.records

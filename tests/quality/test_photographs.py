@@ -136,6 +136,7 @@ def test_views_with_a_lens_are_told_once(captured: Path, caplog: pytest.LogCaptu
     assert all(camera.width > 120 and camera.height > 90 for camera in cameras)
 
 
+@pytest.mark.slow
 def test_encode_and_refit_to_bent_photographs(captured: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene, cameras, photos = str(captured / "a.ply"), str(captured / "transforms.json"), str(captured / "images")
     encode = ["encode", scene, "-o", str(captured / "a.potr"), "--cameras", cameras, "--iterations", "3"]

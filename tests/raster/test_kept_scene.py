@@ -80,6 +80,7 @@ def test_other_colours_leave_the_kept_ones_alone(device):
             assert np.array_equal(rasterizer.render(camera)[0], before)
 
 
+@pytest.mark.slow
 @pytest.mark.one_family
 def test_an_encode_uploads_its_scene_once_and_makes_the_same_bytes(
     device, plush_excerpt, plush_excerpt_cameras, monkeypatch

@@ -76,6 +76,7 @@ def test_square_extent_cuts_whole_tiles(device: Device) -> None:
     assert len(changed) > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene_name", "view_names"),
     [("lego", ("test_r_0", "test_r_66", "test_r_133")), ("plush", ("20240212_004037",))],

@@ -135,6 +135,7 @@ def test_a_file_keeps_how_its_scene_is_rendered(device, preset, low_pass):
     assert errors[0] < 0.2 * errors[1]
 
 
+@pytest.mark.slow
 @pytest.mark.one_family
 def test_encoded_as_antialiased_it_looks_better_than_encoded_as_classic(device, plush_excerpt, plush_excerpt_cameras):
     """The same scene at about the same bytes, judged by antialiased pictures of views that no encoder has seen."""

@@ -97,6 +97,7 @@ def test_views_that_show_nothing_tell_nothing(plush_excerpt, plush_excerpt_camer
     assert GivenViews(plush_excerpt, [away, away]).part_of_views() is None
 
 
+@pytest.mark.slow
 def test_copies_keep_about_as_many_splats_as_one(device, plush_excerpt, plush_excerpt_cameras, twelve, weighed):
     alone = len(encoded(device, plush_excerpt, train_views(plush_excerpt_cameras)).order)
     scene, cameras = twelve
@@ -116,6 +117,7 @@ def test_the_thresholds_follow_the_part_of_the_views_that_show_a_splat(weighed):
     assert dataclasses.replace(taken, delta_mse_max=asked.delta_mse_max, drop=asked.drop) == asked
 
 
+@pytest.mark.slow
 def test_scenes_that_are_seen_whole_and_the_papers_preset_stay_as_they_are(
     device, plush_excerpt, plush_excerpt_cameras, twelve
 ):

@@ -9,15 +9,13 @@ from potr_cl.codec.quantize import HyperParameters
 from potr_cl.model import splat_groups
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
-from potr_cl.raster import culling
-from potr_cl.raster.culling import parts_of_views
 from potr_cl.raster.kept_scene import KeptScene
-from potr_cl.raster.rules import INRIA
 from potr_cl.stages.between.room import room_for
-from potr_cl.stages.pruning import visible_parts
-from potr_cl.stages.pruning.drawn_removal import DrawnRemoval
+from potr_cl.stages.pruning.planned import planned_sweep
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.stage import State, Workbench
+from potr_cl.views import visibility
+from potr_cl.views.visibility import Visibility
 from tests.cases.streets import street
 from tests.devices import open_device
 
@@ -26,8 +24,8 @@ from tests.devices import open_device
 def _large(monkeypatch):
     """The street counts as a large scene."""
     monkeypatch.setattr(splat_groups, "LARGEST", 32)
-    monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1)
-    monkeypatch.setattr(culling, "_SAMPLED", 2)
+    monkeypatch.setattr(visibility, "LEAST_SPLATS", 1)
+    monkeypatch.setattr(visibility, "_SAMPLED", 2)
 
 
 def houses() -> tuple[Scene, list[Camera]]:
@@ -70,10 +68,11 @@ def test_elsewhere_as_many_as_fit_with_what_each_may_draw(monkeypatch):
     assert by_parts == sorted(by_parts)
     assert by_parts[0] == 0
     # More than if each view needed room for the whole scene.
-    monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1 << 30)
+    monkeypatch.setattr(visibility, "LEAST_SPLATS", 1 << 30)
     assert sum(by_parts) > sum(rooms(device, memories)) + 5
 
 
+@pytest.mark.slow
 def test_what_is_added_is_kept():
     """No view is made again for each measurement, with the memory that the estimate was made for."""
     device = open_device("cpu")
@@ -83,6 +82,6 @@ def test_what_is_added_is_kept():
     found = rooms(device, memories)
     some = int(np.flatnonzero((np.array(found) > 0) & (np.array(found) < len(more)))[0])
     views = [*own, *more[: found[some]]]
-    parts, options = parts_of_views(scene, views, INRIA.near), SweepOptions(memory=memories[some])
-    with DrawnRemoval(device, scene, scene, views, parts, options) as removal:
-        assert removal.kept_views == len(views)
+    options = SweepOptions(memory=memories[some])
+    with planned_sweep(device, scene, views, options, visibility=Visibility.of(scene, views)) as removal:
+        assert removal.resident_views == len(views)

@@ -134,6 +134,7 @@ def test_a_solution_that_grows_too_much_is_refused(device: Device) -> None:
     assert np.count_nonzero(compacted.sh[1, :, 0]) <= 3
 
 
+@pytest.mark.slow
 @given(
     seed=st.integers(0, 2**32 - 1),
     views=st.integers(1, 30),

@@ -73,6 +73,7 @@ def test_views_that_judge_find_the_mean_squared_error(device):
         assert found == pytest.approx(mean_error(device, targets, scene, [cameras[k] for k in held_out]), rel=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "only",
     [*(pytest.param((name,), marks=pytest.mark.one_family) for name in PARAMETERS), PARAMETERS],
@@ -90,6 +91,7 @@ def test_errors_of_every_kind_are_mended(device, only):
     )
 
 
+@pytest.mark.slow
 def test_an_antialiased_scene_is_mended(family_device):
     source = dataclasses.replace(visible_scene(60, 1, seed=3), antialiased=True)
     result = fitted_to(family_device, source, shaken(source), ring_of_cameras(8, size=48))

@@ -66,6 +66,7 @@ def of_the_truth(tmp_path_factory, device, scene, cameras):
     return photographs(tmp_path_factory.mktemp("photographs"), device, scene, cameras)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fit", [2, 20])
 @pytest.mark.parametrize("prune", [True, False])
 def test_the_file_is_nearer_to_unseen_photographs_than_the_scene(of_the_truth, device, moved, cameras, fit, prune):
@@ -95,6 +96,7 @@ def test_the_refit_comes_back_to_what_was_fitted(of_the_truth, device, moved, ca
     assert errors[0] < 0.2 * errors[1]
 
 
+@pytest.mark.slow
 def test_photographs_of_noise_are_not_fitted_to(tmp_path, device, scene, cameras):
     """The file is then that of an encode that never heard of photographs, but for what the re-fit finds."""
     folder = photographs(tmp_path, device, scene, cameras, noisy)

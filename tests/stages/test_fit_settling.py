@@ -91,6 +91,7 @@ def test_a_fit_can_look_at_what_a_file_will_hold(device, plush_excerpt, views):
     assert unrounded.errors[0] < 1e-3 * expected, "the form of files shows the same"
 
 
+@pytest.mark.slow
 def test_coefficients_are_chosen_and_the_rest_moves(device, plush_excerpt, views):
     _, then, errors, _ = settled(device, plush_excerpt, views, Settling(0.5, 0, 0.1))
     assert then.geometry is None
@@ -100,6 +101,7 @@ def test_coefficients_are_chosen_and_the_rest_moves(device, plush_excerpt, views
     assert not np.array_equal(then.scene.means, plush_excerpt.means)
 
 
+@pytest.mark.slow
 @pytest.mark.one_family
 def test_the_refit_takes_no_coefficient_back(device, plush_excerpt, views):
     """Unless it is asked for other steps, which other coefficients may suit."""

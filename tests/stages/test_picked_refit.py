@@ -152,7 +152,7 @@ def test_what_views_reach_is_found_once(device, monkeypatch, slices):
 
 
 #: Bytes that all lists fit and some geometry, that some views fit, and none.
-@pytest.mark.parametrize("memory", [None, 400_000, 150_000, 0])
+@pytest.mark.parametrize("memory", [None, 150_000, 0])
 def test_products(device, picked, memory):
     with case_of(device, 3) as case:
         direction = np.random.default_rng(5).normal(size=case.scene.sh.shape)
@@ -181,15 +181,13 @@ def test_a_view_that_sees_nothing(device, picked):
     assert np.array_equal(errors[0][1], errors[1][1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("slices", "way"),
     [
         pytest.param(None, "colour_grid", id="in one piece, colour_grid"),
         pytest.param(None, "fix_ac", id="in one piece, fix_ac"),
         pytest.param(256, "solve", id="in slices, solve"),
-        pytest.param(None, "solve", id="in one piece, solve", marks=pytest.mark.slow),
-        pytest.param(256, "colour_grid", id="in slices, colour_grid", marks=pytest.mark.slow),
-        pytest.param(256, "fix_ac", id="in slices, fix_ac", marks=pytest.mark.slow),
     ],
 )
 def test_a_solution(device, picked, way, slices, monkeypatch):
@@ -230,7 +228,7 @@ def test_more_views_stay(device, picked):
 
 @pytest.mark.slow
 @pytest.mark.one_runtime
-@pytest.mark.parametrize("part", [0.3, 0.6])
+@pytest.mark.parametrize("part", [0.3])
 def test_little_memory_is_enough(device, picked, part, monkeypatch):
     """What lies on the device keeps to what is given, as soon as that is more than the least."""
     monkeypatch.setattr(placement, "_ANYWAY", 0)
@@ -251,6 +249,7 @@ def test_little_memory_is_enough(device, picked, part, monkeypatch):
     assert same(*results)
 
 
+@pytest.mark.slow
 def test_the_same_file(device, picked):
     """Of a whole encode, on one device and on two."""
     scene, cameras = crowded(400)

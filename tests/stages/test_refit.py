@@ -115,6 +115,7 @@ def test_a_part_of_many_views_stands_for_all(device, views, monkeypatch):
             assert relative(half * number[part] / views, linear.normal(direction)) < 1e-5
 
 
+@pytest.mark.slow
 def test_lists_of_more_splats_than_are_walked_at_a_time(device):
     """CPU kernels take 1024 at a time."""
     scene = visible_scene(1400, 1)

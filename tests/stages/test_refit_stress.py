@@ -144,6 +144,7 @@ def test_a_strong_pull_to_zero_is_no_better_than_what_it_costs(case):
     solve_and_check(case, RefitOptions(steps=20, gain=0, prior=1e12))
 
 
+@pytest.mark.slow
 def test_absurd_coefficients(device):
     for where in ["dc", "ac", "both"]:
         for value in [1e4, 1e10, 1e30, 3e38]:
@@ -184,7 +185,7 @@ def test_views_of_different_sizes(device):
 
 @pytest.mark.one_runtime
 @pytest.mark.parametrize(
-    "count", [20_000, pytest.param(1_000_000, marks=pytest.mark.slow)]
+    "count", [20_000, pytest.param(400_000, marks=[pytest.mark.slow, pytest.mark.one_family])]
 )  # fmt: skip
 def test_overlapping_splats_on_one_pixel_column(device, count):
     rng = np.random.default_rng(0)

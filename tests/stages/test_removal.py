@@ -15,7 +15,8 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions, prune
-from potr_cl.stages.pruning.sweep_options import SweepOptions, default_memory
+from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.views.budget import default_memory
 from tests.devices import KERNELS, open_device
 from tests.reference import raster as reference
 from tests.reference.removal import BruteForce
@@ -154,7 +155,7 @@ def test_a_small_memory_budget_changes_the_time_and_nothing_else(device, plush_e
             Rasterizer(device, plush_excerpt) as rasterizer,
             RemovalSweep(rasterizer, cameras, SweepOptions(0, 1, memory)) as removal,
         ):
-            kept = removal.cached_views
+            kept = removal.resident_views
             removal.measure()
             for start in (0, 5):
                 removal.remove(np.arange(start, 1500, 10))
@@ -177,7 +178,7 @@ def test_buffers_too_small_for_all_views_change_nothing(device, plush_excerpt, p
             removal.measure()
             removal.remove(np.arange(0, 1500, 10))
             results.append(np.stack(removal.measure())[:, np.arange(1, 1500, 10)])
-            assert removal.cached_views == 7
+            assert removal.resident_views == 7
     assert np.array_equal(*results)
 
 
@@ -271,6 +272,7 @@ def test_views_of_different_sizes_count_the_same(device):
         assert np.allclose(together[i], (separate[0][i] + separate[1][i]) / 2, rtol=1e-5, atol=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.one_family
 @pytest.mark.one_runtime
 def test_the_memory_budget_is_used_and_not_exceeded(device):
@@ -306,7 +308,7 @@ def test_a_failure_gives_all_memory_back(device, monkeypatch, share):
         before = device.allocated
         with RemovalSweep(rasterizer, cameras, keep_all) as removal:
             needed = device.allocated - before
-            assert removal.cached_views == 5
+            assert removal.resident_views == 5
         scratch = device.allocated - before
         limit = int(before + scratch + share * (needed - scratch))
         monkeypatch.setattr(device, "info", dataclasses.replace(device.info, memory=limit))

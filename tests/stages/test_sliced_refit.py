@@ -51,8 +51,7 @@ def coarse(sh, refit):
     return np.concatenate([sh[:, :1], np.round(sh[:, 1:] * 10 + refit.worth()[:, 1:, None]) / 10], axis=1)
 
 
-@pytest.mark.parametrize("degree", [0, 2, 3])
-@pytest.mark.parametrize("memory", [None, 0], ids=["views kept", "no view kept"])
+@pytest.mark.parametrize(("degree", "memory"), [(0, 0), (2, None), pytest.param(3, 0, marks=pytest.mark.slow)])
 def test_a_solution(device, degree, memory):
     options = {"steps": 6, "gain": 0.0, "drop": 1e-7, "selection_lam": 0.3, "memory": memory}
     with case_of(device, degree) as case:
@@ -64,7 +63,7 @@ def test_a_solution(device, degree, memory):
 
 
 @pytest.mark.parametrize("way", ["colour_grid", "fix_ac"])
-@pytest.mark.parametrize("resident", [0, 1, 3, 7], ids="{} vectors on the device".format)
+@pytest.mark.parametrize("resident", [0, 3, 7], ids="{} vectors on the device".format)
 def test_what_a_file_holds(device, way, resident, monkeypatch):
     """Rounded in rounds, and rounded by somebody who asks what coefficients are worth."""
     monkeypatch.setattr(placement, "_FEWEST", resident)
@@ -108,6 +107,7 @@ def test_any_number_of_splats(device, count):
     assert same(sliced, whole)
 
 
+@pytest.mark.slow
 @pytest.mark.one_family
 @pytest.mark.one_runtime
 @pytest.mark.parametrize("own", [False, True], ids=["the host's memory", "memory of its own"])
@@ -136,6 +136,7 @@ def test_slices_of_nothing():
         RefitOptions(slices=0)
 
 
+@pytest.mark.slow
 @pytest.mark.one_family
 @pytest.mark.one_runtime
 def test_the_same_file(device, plush_excerpt, plush_excerpt_cameras, monkeypatch):

@@ -78,15 +78,6 @@ def test_removals_of_host_and_device_add_up(device, survivors):
     assert survivors.alive.tolist() == [False, False, True, True, False]
 
 
-def test_none_removed_for_a_while(device, survivors):
-    survivors.remove(np.array([2]))
-    survivors.settle()
-    with survivors.none_removed():
-        assert on_device(device, survivors) == [ALIVE] * 8
-    assert on_device(device, survivors)[2] == REMOVED
-    assert survivors.alive.tolist() == [True, True, False, True, True]
-
-
 def test_marks_travel_as_bits(device, survivors):
     """Another device that is told the bits has the same states as the one whose controller marked the splats."""
     with Survivors(device, 5, 8, lambda: None) as told:

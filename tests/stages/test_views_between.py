@@ -22,7 +22,8 @@ from potr_cl.pipeline.target import Target
 from potr_cl.placement.virtual import place_cameras
 from potr_cl.quality.metrics import psnr
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.pruning.prepared_views import PreparedViews
+from potr_cl.stages.pruning.removal import RemovalSweep
+from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.stages.views_between import Between
 
@@ -40,6 +41,7 @@ def file_of(device, scene, cameras, chosen) -> bytes:
     return b"".join(encode(scene, cameras, chosen, device=device).pieces)
 
 
+@pytest.mark.slow
 def test_added_views_are_looked_at_as_if_they_had_been_given(device, plush_excerpt, plush_excerpt_cameras):
     given = train_views(plush_excerpt_cameras)
     more = [*given, *views_between(plush_excerpt, given, 2)]
@@ -49,6 +51,7 @@ def test_added_views_are_looked_at_as_if_they_had_been_given(device, plush_excer
     assert asked != file_of(device, plush_excerpt, given, options(0))
 
 
+@pytest.mark.slow
 def test_what_lies_between_few_views_gets_better_at_no_more_bytes(device, plush_excerpt, plush_excerpt_cameras):
     judges = test_views(plush_excerpt_cameras)
 
@@ -94,6 +97,7 @@ def test_dense_views_get_none(device, plush_excerpt, plush_excerpt_cameras):
     assert state.views == tuple(dense)
 
 
+@pytest.mark.slow
 def test_only_as_many_are_added_as_fit_the_memory_beside_the_given_ones(device, plush_excerpt, plush_excerpt_cameras):
     given = train_views(plush_excerpt_cameras)
     wanted, _ = added(device, plush_excerpt, given)
@@ -106,12 +110,13 @@ def test_only_as_many_are_added_as_fit_the_memory_beside_the_given_ones(device, 
     _, state = added(device, plush_excerpt, given, memory=some * 250_000)
     with Rasterizer(device, plush_excerpt) as rasterizer:
         before = device.allocated
-        with PreparedViews(rasterizer, state.views, some * 250_000, 1) as prepared:
-            assert not prepared.uncached
+        with RemovalSweep(rasterizer, state.views, SweepOptions(memory=some * 250_000)) as sweep:
+            assert sweep.resident_views == len(state.views)
             assert device.allocated - before < some * 250_000 + 1_000_000
     assert device.allocated == 0
 
 
+@pytest.mark.slow
 def test_a_search_finds_them_once(device, plush_excerpt, plush_excerpt_cameras):
     began = []
     chosen = EncodeOptions.for_preset("best", prune={"iterations": 16})
@@ -145,6 +150,7 @@ def test_single_cameras_get_none(device, plush_excerpt, plush_excerpt_cameras):
     assert alone == asked
 
 
+@pytest.mark.slow
 def test_virtual_cameras_get_some_if_they_are_asked_for(device, plush_excerpt):
     """By themselves none: as many as are needed have been placed. With them, they go on to be virtual."""
     state = State.of(plush_excerpt, train_views(place_cameras(plush_excerpt, 8, 64)))

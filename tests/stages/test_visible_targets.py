@@ -12,14 +12,14 @@ from potr_cl.model import splat_groups
 from potr_cl.opencl.memory import Memory
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.raster.culling import Sights
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
 from potr_cl.raster.scene_buffers import uploaded
 from potr_cl.stages import refit
-from potr_cl.stages.pruning import visible_parts
 from potr_cl.stages.refitting.targets import RenderedTargets
 from potr_cl.stages.refitting.visible_targets import VisibleTargets
+from potr_cl.views import visibility
+from potr_cl.views.visibility import Visibility
 from tests.cases.streets import street
 from tests.devices import KERNELS, open_device
 
@@ -42,7 +42,7 @@ def test_the_same_pictures(device):
     away = dataclasses.replace(cameras[0], rotation=np.diag([1.0, -1.0, -1.0]) @ cameras[0].rotation)
     away = dataclasses.replace(away, translation=-away.rotation @ (cameras[0].centre + 1000), width=50)
     cameras = [*cameras, away, cameras[1]]
-    sights = Sights.of(scene, cameras, INRIA.near)
+    sights = Visibility.of(scene, cameras, INRIA.near)
     assert sights.totals[-2] == 0
     assert sights.totals.sum() < 0.5 * len(scene) * len(cameras)
     pixels = [3 * camera.width * camera.height for camera in cameras]
@@ -67,7 +67,7 @@ def test_the_same_pictures(device):
 
 def test_fewer_together_where_the_device_has_no_room(device, monkeypatch):
     scene, cameras = street()
-    sights = Sights.of(scene, cameras, INRIA.near)
+    sights = Visibility.of(scene, cameras, INRIA.near)
     pixels = sum(3 * camera.width * camera.height for camera in cameras)
     together = []
     prepare = Rasterizer.prepare_set
@@ -91,6 +91,7 @@ def test_fewer_together_where_the_device_has_no_room(device, monkeypatch):
     assert np.array_equal(*found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("memory", [None, 3_000_000], ids=["all memory", "little"])
 def test_a_refit_takes_them_and_the_bytes_stay(device, monkeypatch, memory):
     scene, cameras = street(6, 400)
@@ -104,7 +105,7 @@ def test_a_refit_takes_them_and_the_bytes_stay(device, monkeypatch, memory):
             made.append(self)
             super().__init__(*args)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1)
+    monkeypatch.setattr(visibility, "LEAST_SPLATS", 1)
     monkeypatch.setattr(refit, "VisibleTargets", Noting)
     got = encode(scene, cameras, options, device=device)
     assert len(made) == 1

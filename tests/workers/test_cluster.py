@@ -26,7 +26,7 @@ from potr_cl.outputs.potr import Potr
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
-from potr_cl.stages.pruning import visible_parts
+from potr_cl.views import visibility
 from potr_cl.workers.cluster import ClusterPool
 from potr_cl.workers.parts import Parts
 from potr_cl.workers.pool import Part, WorkerLost
@@ -95,9 +95,7 @@ def expected(scene, cameras, device):
     return encode(scene, cameras, OPTIONS, device=device).data
 
 
-@pytest.mark.parametrize(
-    "workers", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("workers", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_the_same_bytes(workers, scene, cameras, device, expected):
     with local_cluster(workers) as cluster:
         with ClusterPool(cluster.scheduler_address, device) as pool:
@@ -125,7 +123,7 @@ def test_workers_get_what_their_views_see(device, monkeypatch):
     options = dataclasses.replace(OPTIONS, cameras_anyway=True)
     with local_cluster(2) as cluster, ClusterPool(cluster.scheduler_address, device) as pool:
         every = encode(scene, cameras, options, device=device, pool=pool)
-        monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1)
+        monkeypatch.setattr(visibility, "LEAST_SPLATS", 1)
         some = encode(scene, cameras, options, device=device, pool=pool)
     assert some.data == every.data == encode(scene, cameras, options, device=device).data
     assert some.shared is not None
@@ -186,6 +184,7 @@ def test_nobody_waits_for_a_judge_that_stands_still(scene, device, judged, caplo
     assert "continuing on" in caplog.text
 
 
+@pytest.mark.slow
 def test_scenes_are_compared_by_a_cluster(scene, cameras, device, judged, tmp_path):
     coded, _, _ = judged
     (tmp_path / "b.potr").write_bytes(coded.data)
@@ -199,6 +198,7 @@ def test_scenes_are_compared_by_a_cluster(scene, cameras, device, judged, tmp_pa
             ]
 
 
+@pytest.mark.slow
 def test_a_file_that_workers_get_is_read_once(scene, cameras, device, judged, tmp_path, monkeypatch):
     """All judge the same bytes then, whoever writes to the file meanwhile."""
     path, opened, plainly = tmp_path / "b.potr", [], Path.open
@@ -281,8 +281,7 @@ def processes_of_a_cluster(workers, without=None, env=None, more=0):
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="sends a signal")
-@pytest.mark.parametrize("lost", ["scheduler", "workers"])
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize(("lost", "how"), [("scheduler", signal.SIGSTOP), ("workers", signal.SIGKILL)])
 def test_what_is_printed_when_the_cluster_is_gone(lost, how, tmp_path, data):
     """One line that says so, and that this computer goes on; none of Dask's own."""
     output = tmp_path / "out.potr"
@@ -464,6 +463,7 @@ def test_a_cluster_without_workers(device, monkeypatch, caplog):
     assert "the cluster has no worker yet: waiting" in caplog.text
 
 
+@pytest.mark.slow
 def test_workers_may_come_later(scene, cameras, device, expected, monkeypatch, caplog):
     """The first one is waited for; another one gets views from the next stage on."""
     monkeypatch.setattr("potr_cl.workers.cluster._NEW", 0.1)
@@ -477,6 +477,7 @@ def test_workers_may_come_later(scene, cameras, device, expected, monkeypatch, c
             assert encode(scene, cameras, OPTIONS, device=device, pool=pool).data == expected
 
 
+@pytest.mark.slow
 def test_nobody_of_a_computer_is_asked_again_where_one_was_lost_as_it_was_met(device, monkeypatch, caplog):
     monkeypatch.setattr("potr_cl.workers.cluster._NEW", 0.05)
     asked = []
@@ -497,6 +498,7 @@ def test_nobody_of_a_computer_is_asked_again_where_one_was_lost_as_it_was_met(de
     assert caplog.text.count("ignoring this worker") == 1
 
 
+@pytest.mark.slow
 def test_devices_of_several_kinds_are_told(device, monkeypatch, caplog):
     other = SimpleNamespace(family=device.family, info="another device", digits=device.digits)
     with local_cluster(1) as cluster:
@@ -509,6 +511,7 @@ def test_devices_of_several_kinds_are_told(device, monkeypatch, caplog):
             assert not caplog.text
 
 
+@pytest.mark.slow
 @pytest.mark.skipif("Intel" not in str(choose_device()), reason="only this runtime can be told the instructions")
 def test_other_instructions_under_the_same_name_are_told(device, caplog):
     """As hosts of two generations have; they give other bytes."""
@@ -565,6 +568,7 @@ def test_several_devices_and_a_cluster(scene, cameras, device):
         potr_cl.encode(scene, cameras, device=[device, Device()], cluster="tcp://127.0.0.1:1")
 
 
+@pytest.mark.slow
 def test_another_version_is_refused(device, monkeypatch):
     with local_cluster(1) as cluster:
         monkeypatch.setattr(potr_cl, "__version__", "0.0.0")

@@ -18,12 +18,12 @@ from potr_cl.opencl.discovery import choose_device, choose_devices
 from potr_cl.opencl.memory import Memory
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.stages.pruning import measured, part, shared_removal, visible_parts
+from potr_cl.stages.pruning import removal
 from potr_cl.stages.pruning.part import RemovalPart
-from potr_cl.stages.pruning.view_by_view import ViewByView
 from potr_cl.stages.refitting import pictures_ahead
 from potr_cl.stages.refitting.part import ColourPart
 from potr_cl.stages.refitting.targets import RenderedTargets
+from potr_cl.views import visibility
 from potr_cl.workers.host import HostPool
 from potr_cl.workers.opening import open_workers
 from potr_cl.workers.parts import Parts
@@ -56,7 +56,7 @@ def few(cameras, size=80):
 
 
 #: Ways of :func:`test_the_same_bytes` that are tried in the quick subset: each family once.
-QUICK = {("cpu", "nothing is kept of any view", 3), ("gpu", "a GPU decides itself", 3)}
+QUICK = {("cpu", "nothing is kept of any view"), ("gpu", "a GPU decides itself")}
 
 
 @pytest.fixture(scope="module", params=FAMILIES)
@@ -65,11 +65,10 @@ def family(request):
 
 
 @pytest.mark.parametrize(
-    ("family", "options", "count"),
+    ("family", "options"),
     [
-        pytest.param(family, options, count, marks=() if (family, name, count) in QUICK else pytest.mark.slow)
+        pytest.param(family, options, marks=() if (family, name) in QUICK else pytest.mark.slow)
         for family in FAMILIES
-        for count in (2, 3)
         for name, options in {
             "by number": OPTIONS,
             "nothing is kept of any view": OPTIONS.changed(memory=0),
@@ -77,8 +76,8 @@ def family(request):
         }.items()
     ],
 )
-def test_the_same_bytes(plush_excerpt, plush_excerpt_cameras, family, options, count):
-    cameras = few(plush_excerpt_cameras)
+def test_the_same_bytes(plush_excerpt, plush_excerpt_cameras, family, options):
+    count, cameras = 3, few(plush_excerpt_cameras)
     alone = open_device(family)
     expected = encode(plush_excerpt, cameras, options, device=alone)
     assert expected.shared is None
@@ -93,10 +92,9 @@ def test_the_same_bytes(plush_excerpt, plush_excerpt_cameras, family, options, c
     assert [device.allocated for device in devices] == [0] * count
 
 
-@pytest.mark.parametrize("count", [pytest.param(2, marks=pytest.mark.slow), 4])
-def test_steps_by_a_part_of_the_views_give_the_same_bytes(
-    plush_excerpt, plush_excerpt_cameras, family, count, monkeypatch
-):
+@pytest.mark.slow
+@pytest.mark.one_family
+def test_steps_by_a_part_of_the_views_give_the_same_bytes(plush_excerpt, plush_excerpt_cameras, family, monkeypatch):
     """Every device knows which of its views these are, and whether there are any."""
     cameras = few(plush_excerpt_cameras)
     options = OPTIONS.changed(prune={"iterations": 2}, compact=False)
@@ -104,11 +102,12 @@ def test_steps_by_a_part_of_the_views_give_the_same_bytes(
     monkeypatch.setattr("potr_cl.stages.refitting.colour_map.ENOUGH", 2)
     expected = encode(plush_excerpt, cameras, options, device=open_device(family)).data
     assert expected != every
-    devices = [open_device(family) for _ in range(count)]
+    devices = [open_device(family) for _ in range(4)]
     with HostPool(devices) as pool:
         assert encode(plush_excerpt, cameras, options, device=devices[0], pool=pool).data == expected
 
 
+@pytest.mark.slow
 def test_pictures_are_rendered_ahead_by_the_device_that_needs_them(plush_excerpt, plush_excerpt_cameras, monkeypatch):
     """Each its own, before the re-fit asks for any; nobody renders one again; and the bytes are those without."""
     cameras = few(plush_excerpt_cameras)
@@ -138,6 +137,7 @@ def test_pictures_are_rendered_ahead_by_the_device_that_needs_them(plush_excerpt
     assert [device.allocated for device in devices] == [0] * 3
 
 
+@pytest.mark.slow
 @pytest.mark.one_family
 def test_more_devices_than_views(plush_excerpt, plush_excerpt_cameras, family):
     cameras = few(plush_excerpt_cameras)[:2]
@@ -185,6 +185,7 @@ def pruned_by_threshold(plush_excerpt, plush_excerpt_cameras):
     return options, encode(plush_excerpt, few(plush_excerpt_cameras), options, device=open_device("gpu")).data
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "command", "call"),
     [
@@ -267,6 +268,7 @@ def test_the_environment_may_name_several(monkeypatch, plush_excerpt, plush_exce
     assert potr_cl.encode(plush_excerpt, few(plush_excerpt_cameras), OPTIONS).nbytes > 0
 
 
+@pytest.mark.slow
 def test_python_takes_several_devices(plush_excerpt, plush_excerpt_cameras):
     cameras = few(plush_excerpt_cameras)
     device = Device()
@@ -289,6 +291,7 @@ def test_a_search_shares_views_out_too(plush_excerpt, plush_excerpt_cameras):
     assert together.shared is not None
 
 
+@pytest.mark.slow
 def test_large_scenes_view_by_view(monkeypatch):
     """Each device looks at its views with what these may draw."""
     scene, cameras = street(5, 900)
@@ -297,17 +300,16 @@ def test_large_scenes_view_by_view(monkeypatch):
     alone = open_device("gpu")
     expected = encode(scene, cameras, options, device=alone)
     monkeypatch.setattr(splat_groups, "LARGEST", 32)
-    monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1)
+    monkeypatch.setattr(visibility, "LEAST_SPLATS", 1)
     shares = []
 
-    class Noting(ViewByView):
-        def __init__(self, *given, **named):
-            super().__init__(*given, **named)
-            shares.append(self.kept_views)
+    made = removal.RemovalSweep.__init__
 
-    for module in (measured, part):
-        monkeypatch.setattr(module, "ViewByView", Noting)
-    monkeypatch.setattr(shared_removal, "ViewByView", ViewByView)
+    def noting(self, *given, **named):
+        made(self, *given, **named)
+        shares.append(self.resident_views)
+
+    monkeypatch.setattr(removal.RemovalSweep, "__init__", noting)
     devices = [open_device("gpu") for _ in range(3)]
     with HostPool(devices) as pool:
         found = encode(scene, cameras, options, device=devices[0], pool=pool)

@@ -20,11 +20,12 @@ from potr_cl.quality.by_photographs import judge_by_photographs
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.quality.judging import JudgingPart
-from potr_cl.raster import culling, kept_scene, seen_rasterizer
+from potr_cl.raster import kept_scene
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rasterizer import Rasterizer, render
 from potr_cl.raster.scene_buffers import SceneBuffers, uploaded
-from potr_cl.raster.seen_rasterizer import SeenRasterizer, rasterizer_of
+from potr_cl.views import pictures, visibility
+from potr_cl.views.pictures import SeenRasterizer, rasterizer_of
 from potr_cl.workers.host import HostPool
 from tests.cases.elsewhere import ElsewherePool
 from tests.cases.streets import street
@@ -109,6 +110,7 @@ def test_a_scene_that_is_kept_is_not_sent_again(plush_excerpt, cameras, coded, f
     assert [device.allocated for device in devices] == [0] * 2
 
 
+@pytest.mark.slow
 def test_a_candidate_of_the_host_is_judged_too(plush_excerpt, cameras, coded, family):
     """As files are whose readers make no scene on a device; and pictures are remembered from one to the next."""
     views, worse = EvaluationViews.of(cameras), coded.output.read(coded.data)
@@ -140,6 +142,8 @@ def test_views_of_the_same_name(plush_excerpt, cameras, coded, family):
     assert [device.allocated, another.allocated] == [0, 0]
 
 
+@pytest.mark.slow
+@pytest.mark.one_family
 @pytest.mark.parametrize("kind", [HostPool, ElsewherePool])
 @pytest.mark.parametrize("command", ["__init__", "take", "figures"])
 @pytest.mark.parametrize("lost", ["one", "all"])
@@ -175,6 +179,7 @@ def test_a_large_scene_is_not_sent_to_be_judged(plush_excerpt, cameras, coded, m
         assert len(coded.data) <= pool.traffic.sent < 2 * len(coded.data) + 1000
 
 
+@pytest.mark.slow
 def test_a_search_for_a_psnr_judges_together(plush_excerpt, cameras, monkeypatch):
     options = EncodeOptions.for_preset("best", prune={"iterations": 4}, refit={"steps": 2}, between=False)
     device = open_device("cpu")
@@ -217,11 +222,12 @@ def test_photographs_are_judged_by_together(plush_excerpt, cameras, coded, tmp_p
 def _small_groups(monkeypatch):
     """Scenes count as large, and devices as small."""
     monkeypatch.setattr(splat_groups, "LARGEST", 32)
-    monkeypatch.setattr(seen_rasterizer, "_LEAST_SPLATS", 1)
-    monkeypatch.setattr(seen_rasterizer, "_PART", 0)
-    monkeypatch.setattr(culling, "_SAMPLED", 2)
+    monkeypatch.setattr(visibility, "LEAST_SPLATS", 1)
+    monkeypatch.setattr(pictures, "_PART", 0)
+    monkeypatch.setattr(visibility, "_SAMPLED", 2)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_small_groups")
 def test_views_of_a_large_scene_are_judged_by_what_they_see(family, monkeypatch):
     scene, cameras = street(5, 500, across=True)
@@ -229,7 +235,7 @@ def test_views_of_a_large_scene_are_judged_by_what_they_see(family, monkeypatch)
     coded = CodedScene(Potr(), encode(scene, None, OPTIONS.changed(prune=False, refit=False, compact=False)).data)
     views = EvaluationViews.of(cameras)
     with monkeypatch.context() as patch:
-        patch.setattr(seen_rasterizer, "_LEAST_SPLATS", 1 << 30)
+        patch.setattr(visibility, "LEAST_SPLATS", 1 << 30)
         expected = judged(open_device(family), scene, coded, views)
     projected = []
     made = Rasterizer.__init__
@@ -248,7 +254,7 @@ def test_views_of_a_large_scene_are_judged_by_what_they_see(family, monkeypatch)
         assert judged(devices[0], scene, coded, views, pool) == expected
         with KeptScene(devices[0], scene, memory=0) as kept:
             kept.groups = SplatGroups.of(scene)
-            monkeypatch.setattr(seen_rasterizer, "_LEAST_SPLATS", 1 << 30)
+            monkeypatch.setattr(visibility, "LEAST_SPLATS", 1 << 30)
             assert judged(devices[0], kept, coded, views, pool) == expected
             assert devices[0].allocated == 0
     assert [device.allocated for device in devices] == [0] * 2
@@ -264,7 +270,7 @@ def test_with_little_memory_a_decoded_file_is_judged_by_what_views_see_too(famil
     coded = CodedScene(Potr(), encode(scene, None, OPTIONS.changed(prune=False, refit=False, compact=False)).data)
     device = open_device(family)
     with monkeypatch.context() as patch:
-        patch.setattr(seen_rasterizer, "_LEAST_SPLATS", 1 << 30)
+        patch.setattr(visibility, "LEAST_SPLATS", 1 << 30)
         expected = judged(device, scene, coded, views)
     projected = []
     made = Rasterizer.__init__
@@ -288,9 +294,10 @@ def test_with_little_memory_a_decoded_file_is_judged_by_what_views_see_too(famil
         assert np.mean(projected) < 0.4 * len(scene)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_small_groups")
 def test_an_encode_leaves_the_groups_that_it_has_found(family, monkeypatch):
-    monkeypatch.setattr("potr_cl.stages.pruning.visible_parts.LEAST_SPLATS", 1)
+    monkeypatch.setattr("potr_cl.views.visibility.LEAST_SPLATS", 1)
     scene, cameras = street(5, 500, across=True)
     device = open_device(family)
     with KeptScene(device, scene) as kept:
@@ -353,6 +360,7 @@ def test_scenes_are_compared_together(plush_excerpt, cameras, coded, family, mon
     assert [device.allocated for device in devices] == [0] * 2
 
 
+@pytest.mark.slow
 def test_a_ladder_keeps_the_scene_on_the_devices(plush_excerpt, cameras, tmp_path, monkeypatch):
     options = EncodeOptions.for_preset("fast", prune={"iterations": 2}, between=False)
     expected = potr_cl.encode_ladder(plush_excerpt, tmp_path / "alone", "0.2,0.4", cameras, options)

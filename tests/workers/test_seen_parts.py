@@ -14,13 +14,15 @@ from potr_cl.errors import DeviceMemoryError
 from potr_cl.model import splat_groups
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.raster.culling import Sights
+from potr_cl.raster.carried import Excerpt
 from potr_cl.raster.rules import INRIA
-from potr_cl.raster.view_shares import Excerpt, ViewShares
-from potr_cl.stages.pruning import part, visible_parts
+from potr_cl.stages.pruning import part
 from potr_cl.stages.refitting.drawn_rows import DrawnRows
 from potr_cl.stages.refitting.packed_row import PackedRow
 from potr_cl.stages.refitting.part import ColourPart
+from potr_cl.views import visibility
+from potr_cl.views.shares import ViewShares
+from potr_cl.views.visibility import Visibility
 from tests.cases.elsewhere import ElsewherePool
 from tests.cases.streets import street
 from tests.devices import FAMILIES, open_device
@@ -38,7 +40,7 @@ OPTIONS = dataclasses.replace(
 @pytest.fixture(autouse=True)
 def _small_groups(monkeypatch):
     monkeypatch.setattr(splat_groups, "LARGEST", 32)
-    monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1)
+    monkeypatch.setattr(visibility, "LEAST_SPLATS", 1)
 
 
 @pytest.fixture(scope="module", params=FAMILIES)
@@ -67,6 +69,7 @@ def array_fields(scene):
     return [f for f in dataclasses.fields(scene) if isinstance(getattr(scene, f.name), np.ndarray)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
@@ -108,6 +111,7 @@ def test_the_same_bytes(family, options, monkeypatch):
     assert [device.allocated for device in devices] == [0] * 4
 
 
+@pytest.mark.slow
 def test_a_re_fit_sends_what_views_draw(family, monkeypatch):
     """Of a direction, each worker gets the coefficients of these splats alone; what it finds is the same."""
     scene, cameras = street(5, 500, across=True)
@@ -124,10 +128,11 @@ def test_a_re_fit_sends_what_views_draw(family, monkeypatch):
     assert 0 < sent[1] < 0.8 * sent[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lost_at", [3, 6])
 def test_who_is_told_again_is_told_the_colours_of_then(lost_at, monkeypatch, plush_excerpt, plush_excerpt_cameras):
     """Of two re-fits on the way; the worker is lost after the first or the second one."""
-    monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1 << 40)
+    monkeypatch.setattr(visibility, "LEAST_SPLATS", 1 << 40)
     options = EncodeOptions.for_preset(
         "best", q=0.3, prune={"keep": 0.4, "iterations": 8}, refit={"at": (0.3, 0.6), "steps": 3, "drop": 1e-7},
         between=False,
@@ -135,7 +140,7 @@ def test_who_is_told_again_is_told_the_colours_of_then(lost_at, monkeypatch, plu
     cameras = [smaller(camera, 80) for camera in plush_excerpt_cameras[:5]]
     devices = [open_device("cpu") for _ in range(3)]
     expected = encode(plush_excerpt, cameras, options, device=devices[0]).data
-    measure, asked = part.RemovalPart.measure_changes, []
+    measure, asked = part.RemovalPart.changes, []
 
     def losing(removal):
         if not asked or asked[0] is removal:
@@ -144,12 +149,13 @@ def test_who_is_told_again_is_told_the_colours_of_then(lost_at, monkeypatch, plu
                 raise DeviceMemoryError("no room")
         return measure(removal)
 
-    monkeypatch.setattr(part.RemovalPart, "measure_changes", losing)
+    monkeypatch.setattr(part.RemovalPart, "changes", losing)
     with ElsewherePool(devices) as pool:
         assert encode(plush_excerpt, cameras, options, device=devices[0], pool=pool).data == expected
     assert asked.count(asked[0]) == lost_at
 
 
+@pytest.mark.slow
 def test_a_re_fit_without_room_for_that_sends_all(monkeypatch):
     """The bytes are the same, and nothing stays taken."""
     scene, cameras = street(5, 500, across=True)
@@ -171,9 +177,10 @@ def test_a_re_fit_without_room_for_that_sends_all(monkeypatch):
     assert [device.allocated for device in devices] == [0] * 4
 
 
+@pytest.mark.slow
 def test_the_uncompressed_scene_travels_once(family, monkeypatch):
     """Where workers get all of it: of what is pruned, once unseen splats are set aside, they get the numbers."""
-    monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1 << 40)
+    monkeypatch.setattr(visibility, "LEAST_SPLATS", 1 << 40)
     scene, cameras = street(5, 500, across=True)
     scene = with_a_house_that_nobody_sees(scene)
     options = OPTIONS.changed(prune={"keep": None}, refit={"at": ()})
@@ -198,26 +205,26 @@ def test_workers_with_gpus_look_at_each_view_with_what_it_may_draw(keep, monkeyp
     expected = encode(scene, cameras, options, device=open_device(family)).data
     monkeypatch.setattr("potr_cl.raster.kept_scene.fits_whole", lambda device, scene: True)
     made = []
-    for module, name in (("pruning", "ViewByView"), ("refitting", "VisibleTargets")):
-        where = f"potr_cl.stages.{module}.part.{name}"
-        kind = importlib.import_module(where.rpartition(".")[0]).__dict__[name]
+    for where, name in (("pruning.planned", "NamedSplats"), ("refitting.part", "VisibleTargets")):
+        where = f"potr_cl.stages.{where}"
+        kind = importlib.import_module(where).__dict__[name]
 
         def noted(*args, kind=kind, **named):
             made.append(kind.__name__)
             return kind(*args, **named)
 
-        monkeypatch.setattr(where, noted)
+        monkeypatch.setattr(f"{where}.{name}", noted)
     devices = [open_device(family) for _ in range(3)]
     with ElsewherePool(devices) as pool:
         assert encode(scene, cameras, options, device=devices[0], pool=pool).data == expected
-    assert made.count("ViewByView") == 2
+    assert made.count("NamedSplats") == 2
     assert made.count("VisibleTargets") == 4
     assert [device.allocated for device in devices] == [0] * 3
 
 
 def test_neighbours_go_to_the_same():
     scene, cameras = street(across=True)
-    sights = Sights.of(scene, cameras, INRIA.near)
+    sights = Visibility.of(scene, cameras, INRIA.near)
     dealt = ViewShares.of(cameras, sights, [1.0, 1.0], scene, np.arange(len(scene)))
     numbers = [share.numbers for share in dealt.shares]
     assert sorted(chain(*numbers)) == list(range(len(cameras)))
@@ -230,14 +237,14 @@ def test_neighbours_go_to_the_same():
 
 def test_twice_as_fast_gets_twice_as_much():
     scene, cameras = street(8, across=True)
-    sights = Sights.of(scene, cameras, INRIA.near)
+    sights = Visibility.of(scene, cameras, INRIA.near)
     work = [int(sights.totals[own].sum()) for own in sights.dealt([2.0, 1.0])]
     assert 1.4 < work[0] / work[1] < 2.8
 
 
 def test_a_share_names_its_splats_by_their_places():
     scene, cameras = street(across=True)
-    sights = Sights.of(scene, cameras, INRIA.near)
+    sights = Visibility.of(scene, cameras, INRIA.near)
     splats, own = sights.of_views([3, 4])
     assert np.array_equal(splats, sights.groups.splats(sights.seen[3] | sights.seen[4]))
     assert own.totals[3] == sights.totals[3]
@@ -248,11 +255,11 @@ def test_a_share_names_its_splats_by_their_places():
 def test_views_that_see_nothing_have_a_share_too():
     scene, cameras = street(across=True)
     away = dataclasses.replace(cameras[0], translation=cameras[0].translation + np.array([0, 0, -500.0]))
-    sights = Sights.of(scene, [*cameras, away, away], INRIA.near)
+    sights = Visibility.of(scene, [*cameras, away, away], INRIA.near)
     assert sights.totals[-1] == 0
     splats, _ = sights.of_views([len(cameras)])
     assert len(splats) > 0
-    assert all(len(each.splats) for each in sights.parts([len(cameras), len(cameras) + 1]))
+    assert all(len(each.splats) for each in sights.clusters([len(cameras), len(cameras) + 1]))
 
 
 def test_an_excerpt_arrives_as_a_scene():

@@ -20,7 +20,7 @@ import potr_cl.codec.native
 SOURCES = Path(potr_cl.codec.native.__file__).parent
 _PLAIN = ["-O3"]
 _SANITIZED = [
-    "-O1",
+    "-O2",
     "-g",
     "-fno-omit-frame-pointer",
     "-fsanitize=address,undefined",

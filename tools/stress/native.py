@@ -22,7 +22,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager
 from functools import cache
 from pathlib import Path
@@ -32,7 +32,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-from potr_cl.codec import plain_values
+from potr_cl.codec import block_values, plain_values
 from potr_cl.codec.body import Body
 from potr_cl.codec.decoder import PotrFile, open_file
 from potr_cl.codec.destination import BundleTaker, SceneArrays
@@ -113,6 +113,7 @@ def work(seed: int, first: int, stop: int, compare: int) -> None:
         ExitStack() as patches,
         patch.object(plain_values, "thread_pool", _at_once),
         patch.object(bundles.BundledFile, "work", _work_again(bundles.BundledFile.work)),
+        patch.object(block_values, "ThreadPoolExecutor", _OneThread),
     ):
         for module in (arrays, functions, bundles, octree, share, values):
             patches.enter_context(patch.object(module, "address", copied))
@@ -121,6 +122,8 @@ def work(seed: int, first: int, stop: int, compare: int) -> None:
             data = changed_file(seed, number)
             os.environ[VARIABLE] = "1"
             os.environ[VECTORS_VARIABLE] = str(number // 3 % 2)  # with and without, whatever else goes by the number
+            # Levels beyond tables take another way.
+            block_values._TABLE = 1 << (16 if number // 8 % 8 == 0 else 9)
             os.pwrite(at, b"%20d" % number, 0)
             try:
                 file = open_file(data)
@@ -128,7 +131,7 @@ def work(seed: int, first: int, stop: int, compare: int) -> None:
                 tally["refused"] += 1
             else:
                 found = _outcome(file)
-                packed = _outcome_packed(file)
+                packed = _outcome_packed(file) if number // 2 % 4 == 0 else None
                 kept.clear()
                 if packed not in (None, found):
                     told = {"differs": number, "native": _told(found), "numpy": f"(packed) {_told(packed or '')}"}
@@ -158,6 +161,22 @@ class _AtOnce:
         except DataError as error:
             future.set_exception(error)
         return future
+
+
+class _OneThread:
+    """In place of pools of threads that wait for others: one that lives on."""
+
+    _pool = ThreadPoolExecutor(1)
+
+    def __init__(self, _: int) -> None:
+        self._futures: list[Future[Any]] = []
+
+    def submit(self, work: Callable[..., Any], *args: Any) -> Future[Any]:
+        self._futures.append(self._pool.submit(work, *args))
+        return self._futures[-1]
+
+    def shutdown(self, cancel_futures: bool) -> None:
+        wait(self._futures)
 
 
 @contextmanager
@@ -271,12 +290,13 @@ def _attack(args: argparse.Namespace, library: Path, folder: Path) -> _Findings:
     """Share the files out over processes that read a batch each at a time; one that ends early is a finding."""
     found = _Findings()
     end = time.monotonic() + args.seconds
-    # A worker for every share of files: long enough for its start not to count.
-    shares = iter(range(args.first, args.first + args.count, 20 * _BATCH))
+    # Long enough for the start of a worker not to count.
+    share = max(1, min(20 * _BATCH, -(-args.count // args.processes)))
+    shares = iter(range(args.first, args.first + args.count, share))
     workers: list[_Worker] = []
     while True:
         while len(workers) < args.processes and time.monotonic() < end and (first := next(shares, None)) is not None:
-            stop = min(first + 20 * _BATCH, args.first + args.count)
+            stop = min(first + share, args.first + args.count)
             workers.append(_Worker(args, first, stop, library, folder))
         if not workers:
             return found
@@ -302,7 +322,7 @@ class _Worker:
             # What the library is given is copied to memory of its own; what was freed waits in a cache's worth.
             "ASAN_OPTIONS": "detect_leaks=0:abort_on_error=1:allocator_may_return_null=1:quarantine_size_mb=16",
             "UBSAN_OPTIONS": "print_stacktrace=1",
-            "PYTHONPATH": str(ROOT),
+            "PYTHONPATH": os.pathsep.join([str(ROOT), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]),
             "OPENBLAS_NUM_THREADS": "1",
             "POTR_STRESS_AT": str(self._at),
         }

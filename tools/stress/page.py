@@ -278,7 +278,7 @@ def main() -> None:
         viewer = subprocess.Popen(command, stdout=printed, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL)
         try:
             content = b""
-            while (found := re.search(rb"http://([\d.]+:\d+)\S* shows it[^\n]*\n", content)) is None:
+            while (found := re.search(rb"http://([\d.]+:\d+)[^\n]*\n", content)) is None:
                 if viewer.poll() is not None:
                     sys.exit(f"the viewer does not start:\n{content!r}")
                 time.sleep(0.1)

@@ -49,7 +49,6 @@ from potr_cl.opencl.memory import Memory
 from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.raster import launch_gpu
 from potr_cl.raster import long_lists as long_lists_module
-from potr_cl.raster.culling import Sights, parts_of_views
 from potr_cl.raster.picked_splats import Picker
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import GSPLAT, INRIA
@@ -63,12 +62,11 @@ from potr_cl.stages.fitting.parameters import UNROUNDED, Factors, in_form_of_fil
 from potr_cl.stages.pruning.alive_packing import AlivePacking
 from potr_cl.stages.pruning.changed_totals import AddedChanges, ChangedTotals
 from potr_cl.stages.pruning.on_device import prune_scene
+from potr_cl.stages.pruning.planned import planned_sweep
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions
 from potr_cl.stages.pruning.survivors import Survivors
 from potr_cl.stages.pruning.sweep_options import SweepOptions
-from potr_cl.stages.pruning.view_by_view import ViewByView
-from potr_cl.stages.pruning.visible_parts import PartedRemoval
 from potr_cl.stages.refitting import coefficients, reached, sliced_coefficients
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.packing import Packing
@@ -76,6 +74,7 @@ from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.refitting.targets import RenderedTargets
 from potr_cl.stages.refitting.vector_space import Layout
+from potr_cl.views.visibility import Visibility
 from tests.reference import raster as reference
 from tests.reference.scenes import plain_splats, random_splats, straight_camera, tilted_camera
 from tools.results import Results
@@ -150,19 +149,19 @@ def _tower() -> tuple[Scene, list[Camera]]:
 
 
 def view_by_view(device: Device) -> None:
-    """Pruning of a scene of which views see little: on GPUs view by view, with picked splats; with views that are kept,
-    and with none."""
+    """Pruning of a scene of which views see little: on GPUs view by view, with named splats; with resident views, and
+    with streamed ones."""
     if device.family != "gpu":
         return
     scene, views = _apart()
     with patch.object(splat_groups, "LARGEST", 8), uploaded(device, scene) as whole:
-        sights = Sights.of(scene, views, INRIA.near)
+        sights = Visibility.of(scene, views, INRIA.near)
         for memory in (None, 0):
-            with ViewByView(device, whole, views, sights, SweepOptions(0.0, memory=memory)) as removal:
+            with planned_sweep(device, whole, views, SweepOptions(0.0, memory=memory), visibility=sights) as removal:
                 removal.measure()
                 removal.remove(np.arange(0, len(scene), 5))
                 removal.measure()
-            with ViewByView(device, whole, views, sights, SweepOptions(0.05, memory=memory)) as removal:
+            with planned_sweep(device, whole, views, SweepOptions(0.05, memory=memory), visibility=sights) as removal:
                 prune_scene(removal, PruningOptions(1e-2, 3))
 
 
@@ -170,9 +169,9 @@ def part_by_part(device: Device) -> None:
     """The same scene in parts that see much of the same."""
     scene, views = _apart()
     with patch.object(splat_groups, "LARGEST", 8):
-        parts = parts_of_views(scene, views, INRIA.near)
-        assert len(parts) > 1
-        with PartedRemoval(device, scene, scene, views, parts, SweepOptions(0.0)) as removal:
+        sights = Visibility.of(scene, views)
+        assert len(sights.clusters()) > 1
+        with planned_sweep(device, scene, views, SweepOptions(0.0), visibility=sights) as removal:
             removal.measure()
             prune_scene(removal, PruningOptions(1e-2, 3))
 

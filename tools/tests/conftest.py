@@ -1,5 +1,5 @@
 """The scenes of the package's tests."""
 
-from tests.conftest import data, judged_once, lego, plush, plush_excerpt, plush_excerpt_cameras
+from tests.conftest import computed_once, data, lego, plush, plush_excerpt, plush_excerpt_cameras
 
-__all__ = ["data", "judged_once", "lego", "plush", "plush_excerpt", "plush_excerpt_cameras"]
+__all__ = ["computed_once", "data", "lego", "plush", "plush_excerpt", "plush_excerpt_cameras"]

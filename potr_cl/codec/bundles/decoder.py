@@ -5,9 +5,10 @@ Bundles are decoded one by one by the native path, and side by side by NumPy.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,9 @@ from potr_cl.codec.bundles.rans import LOWEST, check_end, no_words_left
 from potr_cl.codec.bundles.sections import MAIN, ORDER, ROTATION, Section
 from potr_cl.codec.bundles.streams import band, differences, step_terms, streams_of
 from potr_cl.codec.native.bundles import FINE, TOO_FEW_WORDS, BundledFile
-from potr_cl.codec.native.library import native, vectors
+from potr_cl.codec.native.functions import Functions
+from potr_cl.codec.native.library import vectors
+from potr_cl.codec.native.table import definition
 from potr_cl.codec.sections import Property
 from potr_cl.codec.steps.rule import ColourSteps
 from potr_cl.errors import DataError
@@ -82,7 +85,7 @@ class Reader:
         self.bundles = Bundles(splats)
         self._open_section, self._open_steps = open_section, open_steps
         self._sections: dict[Property, Section | None] = {}
-        self._files: dict[Wanted, BundledFile | None] = {}
+        self._files: dict[Wanted, list[BundledFile]] = {}
 
     @cached_property
     def steps(self) -> ColourSteps | None:
@@ -130,18 +133,41 @@ class Reader:
         Raises:
             DataError: damaged.
         """
-        functions = native()
         # By whatever path, they are looked at before anything is decoded.
         sections = {ORDER.index(key): self.section(key) for key in wanted.keys}
         steps = self.steps if wanted.sections > 2 else None
-        if functions is None:
-            return None
-        if wanted not in self._files:
-            there = {number: section for number, section in sections.items() if section is not None}
-            fit = all(section.fits for section in there.values())
-            words = {number: section.for_native() for number, section in there.items()}
-            self._files[wanted] = functions.bundled_file(self.bundles.splats, words, steps, vectors()) if fit else None
-        return self._files[wanted]
+        return bundled_file(self.bundles.splats, sections, steps, self._files.setdefault(wanted, []))
+
+
+@definition
+def bundled_file(
+    splats: int, sections: Mapping[int, Section | None], steps: ColourSteps | None, kept: list[BundledFile]
+) -> BundledFile | None:
+    """What C decodes bundles from.
+
+    Args:
+        splats: n of the file.
+        sections: by their place in the order of decoding.
+        steps: of colours.
+        kept: it is made once.
+    """
+    return None
+
+
+def _bundled_file_by_c(
+    functions: Functions,
+    splats: int,
+    sections: Mapping[int, Section | None],
+    steps: ColourSteps | None,
+    kept: list[BundledFile],
+) -> Any:
+    there = {number: section for number, section in sections.items() if section is not None}
+    if not all(section.fits for section in there.values()):
+        return NotImplemented
+    if not kept:
+        words = {number: section.for_native() for number, section in there.items()}
+        kept.append(functions.bundled_file(splats, words, steps, vectors()))
+    return kept[0]
 
 
 class _Run:

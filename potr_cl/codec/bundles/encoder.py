@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from potr_cl.codec.bundles.description import Fitted
 from potr_cl.codec.bundles.fitting import expected_sizes, fit_model, products, recent_sizes, samples, solve
 from potr_cl.codec.bundles.layout import LANES, Bundles, Layout
-from potr_cl.codec.bundles.native_encoder import encode_natively, narrow
+from potr_cl.codec.bundles.native_encoder import narrow
 from potr_cl.codec.bundles.ranges import Tokens, encode_section
 from potr_cl.codec.bundles.rans import LOWEST
 from potr_cl.codec.bundles.sections import MAIN, ORDER, ROTATION, stored_section
 from potr_cl.codec.bundles.streams import Stream, band, differences, step_terms, streams_of
 from potr_cl.codec.bundles.tokens import MOST_BITS, tokens_of
-from potr_cl.codec.native.library import native
+from potr_cl.codec.native.table import definition
 from potr_cl.codec.sections import Property
 from potr_cl.host.threads import Run
 
@@ -43,27 +43,22 @@ def encode(
     Returns:
         The stored bytes of each section; None if an integer is too large.
     """
-    functions = native()
-    arrays = narrow(values, run)
-
-    def coded(known: frozenset[Property]) -> dict[Property, bytes] | None:
-        if functions is not None and arrays is not None:
-            return encode_natively(functions, arrays, classes, known, run)
-        return _encode(values, classes, known)
-
-    fitted = coded(frozenset())
-    if fitted is None or arrays is None or len(classes) >= _FEW:
+    narrowed = narrow(values, run)
+    arrays = narrowed or values
+    fitted = coded(arrays, classes, frozenset(), run)
+    if fitted is None or narrowed is None or len(classes) >= _FEW:
         return fitted
     # What is fitted to few splats may weigh more than it saves.
-    without = coded(frozenset(values))
+    without = coded(arrays, classes, frozenset(values), run)
     assert without is not None
-    return coded(frozenset(key for key in values if len(without[key]) < len(fitted[key])))
+    return coded(arrays, classes, frozenset(key for key in values if len(without[key]) < len(fitted[key])), run)
 
 
-def _encode(
-    values: Mapping[Property, Values], classes: NDArray[np.int8], known: frozenset[Property]
+@definition
+def coded(
+    values: Mapping[Property, Values], classes: NDArray[np.int8], known: frozenset[Property], run: Run
 ) -> dict[Property, bytes] | None:
-    """:func:`encode` by NumPy, with some sections by models that decoders know."""
+    """:func:`encode` with some sections by models that decoders know."""
     drafts = _Drafts(Bundles(len(classes)), classes, known)
     keys = [key for key in ORDER if key in values]
     sections: dict[Property, list[Tokens]] = {}
@@ -72,15 +67,15 @@ def _encode(
         if made is None:
             return None
         sections[key] = made
-    coded: dict[Property, bytes] = {}
+    stored: dict[Property, bytes] = {}
     lanes = (np.arange(LANES) < drafts.bundles.lanes[:, None]).ravel()
     for chain in (MAIN, (ROTATION,)):
         states = np.full(LANES * drafts.bundles.number, LOWEST, np.int64)
         for key in reversed([key for key in chain if key in sections]):
             counts, words = encode_section(sections[key], states)
             first = states[lanes] if key == chain[0] else None
-            coded[key] = stored_section([tokens.fitted for tokens in sections[key]], first, counts, words)
-    return coded
+            stored[key] = stored_section([tokens.fitted for tokens in sections[key]], first, counts, words)
+    return stored
 
 
 class _Drafts:

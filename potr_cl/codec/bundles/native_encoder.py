@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,18 +38,14 @@ _NOTHING = NativeModel(np.zeros(256, np.uint8), np.full((1, 1), TOTAL, np.uint16
 
 def encode_natively(
     functions: Functions,
-    values: Mapping[Property, list[I32]],
+    values: Mapping[Property, Sequence[NDArray[np.integer]]],
     classes: NDArray[np.int8],
     known: frozenset[Property],
     run: Run,
-) -> dict[Property, bytes]:
-    """:func:`potr_cl.codec.bundles.encoder.encode` of integers that :func:`narrow` lets through.
-
-    Args:
-        functions: of the library.
-        values, classes, run: as there.
-        known: sections whose models decoders know.
-    """
+) -> Any:
+    """:func:`potr_cl.codec.bundles.encoder.coded`, of integers that :func:`narrow` lets through."""
+    if not isinstance(values, Narrow):
+        return NotImplemented
     bundles = Bundles(len(values[MAIN[0]][0]))
     # Asked for once: threads that ask for the first time side by side get each their own.
     of_section = [streams_of(key) for key in ORDER]
@@ -108,9 +105,11 @@ def encode_natively(
     return dict(zip([ORDER[number] for number in numbers_of], run(section, numbers_of), strict=True))
 
 
-def narrow(
-    values: Mapping[Property, Sequence[NDArray[np.integer]]], run: Run = map
-) -> dict[Property, list[I32]] | None:
+class Narrow(dict[Property, list[I32]]):
+    """Integers that the native path takes."""
+
+
+def narrow(values: Mapping[Property, Sequence[NDArray[np.integer]]], run: Run = map) -> Narrow | None:
     """The integers as the native path takes them; None if one is too large for it."""
 
     def narrowed(stream: NDArray[np.integer]) -> I32 | None:
@@ -121,7 +120,7 @@ def narrow(
 
     made = iter(list(run(narrowed, [stream for streams in values.values() for stream in streams])))
     found = {key: [next(made) for _ in streams] for key, streams in values.items()}
-    arrays = {key: [stream for stream in streams if stream is not None] for key, streams in found.items()}
+    arrays = Narrow({key: [stream for stream in streams if stream is not None] for key, streams in found.items()})
     return arrays if all(len(arrays[key]) == len(values[key]) for key in values) else None
 
 

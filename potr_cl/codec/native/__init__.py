@@ -1,8 +1,8 @@
 """The native path: what takes most of a codec's time, in C, which ``pip install`` builds where there is a compiler.
 
 It gives the same bits as the NumPy modules around it, which are its definition and what runs where it is not there.
-:func:`potr_cl.codec.native.library.native` says which of both is taken. The C sources lie beside this file; each has
-its twin in Python:
+:data:`potr_cl.codec.native.table.TABLE` says which C function stands for which definition, and
+:func:`potr_cl.codec.native.library.native` whether there are any. The C sources lie beside this file:
 
 ====================  =========================================================================================
 ``bundles.c``         :mod:`potr_cl.codec.bundles`: a bundle's integers
@@ -14,6 +14,8 @@ its twin in Python:
 ``bundles_encode.c``  :mod:`potr_cl.codec.bundles.encoder`: what contexts are fitted to, and range coding
 ``bundles_fit.c``     :mod:`potr_cl.codec.bundles.fitting`: contexts from counts
 ``octree.c``          :mod:`potr_cl.codec.octree`: streams to centres
+``octree_build.c``    :mod:`potr_cl.codec.octree`: centres to streams
+``quantise.c``        the encoder's loops over all splats
 ``module.c``          nothing: it makes a Python module of the library, so that it is built and found as one
 ====================  =========================================================================================
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.native.library import native
+from potr_cl.codec.native.functions import Functions
 from potr_cl.codec.native.octree_build import OctreeBuilding
+from potr_cl.codec.native.table import definition
 from potr_cl.codec.octree.parser import parse
 from potr_cl.codec.octree.streams import DEEPEST_LEVEL, U8, U64, OctreeStreams, check_centres
 from potr_cl.host.threads import Run
@@ -61,15 +63,13 @@ class Begun:
     decoded: Callable[[Run], NDArray[np.float32]]
 
 
+@definition
 def begin(means: NDArray[np.float32], tolerance: F64 | float, absolute: bool = False, run: Run = map) -> Begun:
     """:func:`build`, where what the streams are not needed for need not wait for them.
 
     Args:
         means, tolerance, absolute, run: as :func:`build` takes them.
     """
-    functions = native()
-    if absolute and functions is not None:
-        return _begin_natively(functions.octree_build, means, tolerance, run)
     streams, order = _build_in_numpy(means, tolerance, absolute)
     parts = -(-len(order) // _BLOCK)
     return Begun(order, streams.depth, lambda: streams, lambda run: parse(streams, len(order), run, parts))
@@ -120,33 +120,39 @@ def _build_in_numpy(
     return streams, order
 
 
+@definition
 def leaf_order(means: NDArray[np.float32], tolerance: F64 | float) -> NDArray[np.int64]:
     """(N,) the order that :func:`build` returns, without the streams; centres and tolerances as it takes them."""
-    functions = native()
-    if functions is not None:
-        *_, words = _words_of(functions.octree_build, means, tolerance)
-        return functions.octree_build.order(words)[0]
     *_, depth, grid = _gridded(means, tolerance)
     return _depth_first(_morton_words(grid, depth))
 
 
-def _begin_natively(functions: OctreeBuilding, means: NDArray[np.float32], tolerance: F64 | float, run: Run) -> Begun:
-    """:func:`begin` with ``absolute``."""
-    low, side, limit, depth, words = _words_of(functions, means, tolerance, run)
-    order, words = functions.order(words, run)
+def _leaf_order_by_c(functions: Functions, means: NDArray[np.float32], tolerance: F64 | float) -> NDArray[np.int64]:
+    *_, words = _words_of(functions.octree_build, means, tolerance)
+    return functions.octree_build.order(words)[0]
+
+
+def _begin_by_c(
+    functions: Functions, means: NDArray[np.float32], tolerance: F64 | float, absolute: bool = False, run: Run = map
+) -> Any:
+    if not absolute:
+        return NotImplemented
+    building = functions.octree_build
+    low, side, limit, depth, words = _words_of(building, means, tolerance, run)
+    order, words = building.order(words, run)
     half_diagonal = _half_diagonal(side)
-    wanted = functions.wanted(limit, half_diagonal, depth) if half_diagonal else np.zeros(len(limit), np.int8)
+    wanted = building.wanted(limit, half_diagonal, depth) if half_diagonal else np.zeros(len(limit), np.int8)
     unclear = np.flatnonzero(wanted < 0)
     wanted[unclear] = _levels_for(side, limit[unclear], depth)
     origin = (float(low[0]), float(low[1]), float(low[2]))
 
     def streams() -> OctreeStreams:
-        found = functions.streams(words, depth, order, wanted)
+        found = building.streams(words, depth, order, wanted)
         return OctreeStreams(origin, side, depth, *found)
 
     def decoded(run: Run) -> NDArray[np.float32]:
         sides = np.ldexp(side, -np.arange(depth + 1))
-        centres = functions.decoded(words, depth, order, wanted, sides, np.array(origin), run)
+        centres = building.decoded(words, depth, order, wanted, sides, np.array(origin), run)
         check_centres(origin, side, centres)
         return centres
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.native.functions import Functions
-from potr_cl.codec.native.library import native
+from potr_cl.codec.native.table import definition
 from potr_cl.codec.octree.streams import DEEPEST_LEVEL, U8, OctreeStreams, check_centres
 from potr_cl.errors import DataError
 from potr_cl.host.threads import Run
@@ -22,6 +22,7 @@ _PART = 1 << 10
 Cells = NDArray[np.unsignedinteger]
 
 
+@definition
 def parse(streams: OctreeStreams, splats: int, run: Run = map, parts: int = 1) -> NDArray[np.float32]:
     """Leaf centres of a serialised octree.
 
@@ -37,9 +38,6 @@ def parse(streams: OctreeStreams, splats: int, run: Run = map, parts: int = 1) -
     Raises:
         DataError: the streams contradict each other or the number of splats.
     """
-    functions = native()
-    if functions is not None:
-        return _parse_natively(functions, streams, splats, run, parts)
     depth = streams.depth
     levels = _parse_tree(streams)
     singles = sum(level.singles for level in levels)
@@ -95,10 +93,9 @@ def parse(streams: OctreeStreams, splats: int, run: Run = map, parts: int = 1) -
     return means
 
 
-def _parse_natively(
-    functions: Functions, streams: OctreeStreams, splats: int, run: Run, parts: int
+def _parse_by_c(
+    functions: Functions, streams: OctreeStreams, splats: int, run: Run = map, parts: int = 1
 ) -> NDArray[np.float32]:
-    """:func:`parse` by the native path."""
     depth = _checked_depth(streams.depth)
     tree = functions.octree.tree(streams.occupancy, streams.several, depth, _crowded_root(streams))
     if tree is None:

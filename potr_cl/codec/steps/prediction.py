@@ -11,7 +11,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.native.library import native
+from potr_cl.codec.native.functions import Functions
+from potr_cl.codec.native.table import definition
 from potr_cl.codec.steps.rule import CLASSES
 
 I64 = NDArray[np.int64]
@@ -46,12 +47,9 @@ def tables() -> tuple[I64, I64]:
     return steps, inverses
 
 
+@definition
 def to_residuals(levels: I64, classes: I8) -> I64:
     """(channels, n) levels, each less its prediction; ``classes`` (n,) are those of DC."""
-    functions = native()
-    if functions is not None:
-        levels, classes = np.ascontiguousarray(levels), np.ascontiguousarray(classes)
-        return functions.quantising.predicted(levels, classes, RUN, *tables())
     steps, inverses = (table[classes.astype(np.intp) + CLASSES] for table in tables())
     values = levels * steps
     total = np.zeros_like(values)
@@ -62,6 +60,10 @@ def to_residuals(levels: I64, classes: I8) -> I64:
             at = np.arange(RUN + k, levels.shape[1], RUN)
             total[:, at] -= values[:, at - back]
     return levels - ((total * inverses + _HALF) >> _MEAN_SHIFT)
+
+
+def _to_residuals_by_c(functions: Functions, levels: I64, classes: I8) -> I64:
+    return functions.quantising.predicted(np.ascontiguousarray(levels), np.ascontiguousarray(classes), RUN, *tables())
 
 
 def from_residuals(residuals: I64, classes: I8) -> I64:

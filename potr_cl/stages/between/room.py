@@ -2,26 +2,26 @@
 
 A view that does not fit is made again for each measurement. So added views that take the room of others cost many times
 what they should, and only as many are added as there is room for. Where views are made again in batches, each with what
-it may draw (:mod:`potr_cl.stages.pruning.view_by_view`), they cost less: half as many as were given are added anyway.
+it may draw (:func:`potr_cl.views.plan.by_view`), they cost less: half as many as were given are added anyway.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 
 import numpy as np
 
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
-from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import fits_whole
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
 from potr_cl.raster.scene_buffers import Drawable
-from potr_cl.stages.pruning.prepared_views import PreparedViews
-from potr_cl.stages.pruning.sweep_options import default_memory
-from potr_cl.stages.pruning.visible_parts import LIKELY, SCENES, groups_of_large, seen_part
+from potr_cl.stages.pruning.prepared_set import PreparedSet
 from potr_cl.stages.stage import State, Workbench
+from potr_cl.views.budget import SCENES, default_memory
+from potr_cl.views.visibility import MOST_SEEN, Visibility, groups_of_large, seen_part
 
 #: More bytes than a view takes, for each splat and each pixel: where there are so many, nothing has to be measured.
 _SPLAT, _PIXEL = 500, 200
@@ -31,8 +31,6 @@ _SAMPLE = 3
 _DRAWN, _TARGET = 104, 12
 #: So many are added there for each given one, whether they fit or not.
 _ANYWAY = 1 / 2
-#: Bytes that are enough for them.
-_PLENTY = 1e18
 #: By how much the others may take more; and how much more, where views of a part share its splats.
 _MARGIN, _MARGIN_OF_PARTS = 1.1, 1.6
 
@@ -55,7 +53,7 @@ def room_for(added: Sequence[Camera], state: State, bench: Workbench) -> int:
     if budget > _SPLAT * len(state.source) * (len(state.views) + len(added)) + _PIXEL * pixels:
         return len(added)
     sampled = _evenly(state.views, _SAMPLE), _evenly(added, _SAMPLE)
-    if seen_part(state.source, state.views) <= LIKELY:
+    if seen_part(state.source, state.views) <= MOST_SEEN:
         if _by_view(state, bench):
             own, more = (_nbytes_by_view(state, views) for views in (state.views, added))
             room = int(max((budget - own * len(state.views)) // more, _ANYWAY * len(state.views)))
@@ -91,7 +89,7 @@ def _nbytes_of_parts(state: State, bench: Workbench, views: Sequence[Camera]) ->
     """Bytes that is kept of a view where it is looked at with what it may draw and no more: the mean of some."""
     source = state.source
     with thread_pool(bench.threads) as pool:
-        sights = Sights.of(source, views, INRIA.near, groups_of_large(source, pool.map), pool.map)
+        sights = Visibility.of(source, views, INRIA.near, groups_of_large(source, pool.map), pool.map)
     held = [
         _nbytes(bench, source.subset(sights.groups.splats(seen)), [view])
         for view, seen in zip(views, sights.seen, strict=True)
@@ -103,7 +101,10 @@ def _nbytes_of_parts(state: State, bench: Workbench, views: Sequence[Camera]) ->
 def _nbytes(bench: Workbench, scene: Drawable, views: Sequence[Camera]) -> float:
     """Bytes that is kept of a view while splats are removed: the mean of some."""
     with Rasterizer(bench.opened, scene, background=bench.background) as rasterizer:
-        with PreparedViews(rasterizer, views, _PLENTY, 1):
+        with ExitStack() as prepared, rasterizer.preparing_many():
+            for number, view in enumerate(views):
+                own = PreparedSet(rasterizer, [number], rasterizer.prepare_set([view]))
+                prepared.enter_context(own)
             held = rasterizer.device.allocated
         # What the rasterizer works with is there before and after.
         return (held - rasterizer.device.allocated) / len(views)

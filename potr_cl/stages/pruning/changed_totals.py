@@ -19,8 +19,6 @@ from potr_cl.opencl.narrow import Narrowed, Narrowing
 #: (N / 64, rounded up) uint64, a bit for each splat, the lowest first; and (n, 2) int64, the changes of those whose bit
 #: is set.
 Changes: TypeAlias = "tuple[NDArray[np.uint64], Narrowed | NDArray[np.int64]]"
-#: For a master whose host adds up: splats as :func:`numbers_or_bits` tells them, and (2, n) int64, their changes.
-ChangesOfHost: TypeAlias = "tuple[NDArray[np.uint32 | np.uint8], Narrowed]"
 
 _SOURCE = "prune/changes.cl"
 #: Splats of a run (RUN of the kernels), and work-items of a work-group.
@@ -145,35 +143,6 @@ class AddedChanges(Owner):
             runs.close()
         self._changes.close()
         self._narrowing.close()
-
-
-def changes_on_host(totals: NDArray[np.int64], before: NDArray[np.int64], alive: NDArray[np.bool_]) -> Changes:
-    """What :class:`ChangedTotals` finds, where the host has the totals: those of now and of before, (N, 2) int64."""
-    changed = (totals != before).any(axis=1) & alive
-    bits = np.zeros(-(-len(totals) // _RUN) * _RUN, bool)
-    bits[: len(totals)] = changed
-    which = np.flatnonzero(changed)
-    masks = np.packbits(bits, bitorder="little").view("<u8").astype(np.uint64, copy=False)
-    return masks, totals.take(which, axis=0) - before.take(which, axis=0)
-
-
-def numbers_or_bits(numbers: NDArray[np.int64], meant: NDArray[np.bool_]) -> NDArray[np.uint32 | np.uint8]:
-    """Splats in as few bytes as may be, for :func:`numbers_of`: (n,) uint32 numbers, or (N / 8, rounded up) uint8 bits.
-
-    Args:
-        numbers: of the splats, ascending.
-        meant: (N,), the same.
-    """
-    if 32 * len(numbers) < len(meant):
-        return numbers.astype(np.uint32)
-    return np.packbits(meant, bitorder="little")
-
-
-def numbers_of(told: NDArray[np.uint32 | np.uint8]) -> NDArray[np.int64]:
-    """The numbers of splats that :func:`numbers_or_bits` has told of, ascending."""
-    if told.dtype == np.uint32:
-        return told.astype(np.int64)
-    return np.flatnonzero(np.unpackbits(told.view(np.uint8), bitorder="little"))
 
 
 class _Runs(Owner):

@@ -10,7 +10,7 @@ from potr_cl.opencl.kernel import Kernel
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.view_set import camera_struct
 from potr_cl.stages.pruning.fixed_point import FixedPoint
-from potr_cl.stages.pruning.prepared_views import PreparedSet
+from potr_cl.stages.pruning.prepared_set import PreparedSet
 from potr_cl.stages.pruning.sweep_buffers import SweepBuffers
 
 _SOURCE = "prune/removal_cpu.cl"
@@ -98,11 +98,6 @@ class _CpuKernels:
 
     def sweep_all(self) -> None:
         self.sweep(0, self._tiles)  # the sweep itself takes removed splats out of the lists
-
-    def store_target(self) -> None:
-        self._removal.set(first_time=1)
-        self.sweep(0, self._tiles)
-        self.target_is_known()
 
     def target_is_known(self) -> None:
         self._removal.set(first_time=0)

@@ -10,14 +10,12 @@ from potr_cl.opencl.kernel import Kernel
 from potr_cl.raster.macros import gpu_limits
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.fixed_point import FixedPoint
-from potr_cl.stages.pruning.prepared_views import PreparedSet
+from potr_cl.stages.pruning.prepared_set import PreparedSet
 from potr_cl.stages.pruning.sweep_buffers import SweepBuffers
 
 _SOURCE = "prune/removal_gpu.cl"
 #: Work-items of a work-group.
 _GROUP = 128
-#: ONLY_TARGET of the kernel.
-_ONLY_TARGET = 2
 
 
 class GpuLauncher:
@@ -119,11 +117,6 @@ class _GpuKernels:
     def sweep_all(self) -> None:
         self.note_removal()  # the sweep itself takes nothing out of the lists
         self.sweep(0, self._tiles)
-
-    def store_target(self) -> None:
-        self._removal.set(first_time=_ONLY_TARGET)
-        self.sweep(0, self._tiles)
-        self.target_is_known()
 
     def target_is_known(self) -> None:
         self._removal.set(first_time=0)

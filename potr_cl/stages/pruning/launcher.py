@@ -6,12 +6,13 @@ from typing import Protocol
 
 import pyopencl as cl
 
+from potr_cl.opencl.device import Device
 from potr_cl.raster.macros import totals_limits
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.fixed_point import FixedPoint
 from potr_cl.stages.pruning.launch_cpu import CpuLauncher
 from potr_cl.stages.pruning.launch_gpu import GpuLauncher
-from potr_cl.stages.pruning.prepared_views import PreparedSet
+from potr_cl.stages.pruning.prepared_set import PreparedSet
 from potr_cl.stages.pruning.sweep_buffers import SweepBuffers
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 
@@ -29,10 +30,6 @@ class SetKernels(Protocol):
     def sweep_all(self) -> None:
         """Enqueue the sweep of every tile, without what removed splats left in the lists. The list of tiles must begin
         with all numbers of the set's tiles."""
-
-    def store_target(self) -> None:
-        """Enqueue that the target picture is stored, from now on to be compared with; no splat must have been removed.
-        The list of tiles must begin with all numbers of the set's tiles. Sums and totals mean nothing afterwards."""
 
     def target_is_known(self) -> None:
         """From now on, sweeps compare with the target picture instead of storing it."""
@@ -92,5 +89,9 @@ def launcher_for(rasterizer: Rasterizer, options: SweepOptions, fixed_point: Fix
         "ALPHA_CAP": float(rules.alpha_cap),
         "TRANSMITTANCE_THRESHOLD": rules.transmittance_threshold if threshold is None else threshold,
     } | totals_limits(device)
-    launcher = GpuLauncher if device.family == "gpu" else CpuLauncher
-    return launcher(rasterizer, fixed_point, macros)
+    return launchers(device)(rasterizer, fixed_point, macros)
+
+
+def launchers(device: Device) -> type[CpuLauncher | GpuLauncher]:
+    """The kind of a device's launchers."""
+    return GpuLauncher if device.family == "gpu" else CpuLauncher

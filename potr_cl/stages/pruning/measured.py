@@ -9,23 +9,21 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import lying_on, whole_on_device
-from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.view_shares import ViewShares
-from potr_cl.stages.pruning.drawn_removal import DrawnRemoval
+from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.stages.pruning.part import RemovalPart
+from potr_cl.stages.pruning.planned import planned_sweep
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.shared_removal import SharedRemoval
 from potr_cl.stages.pruning.sweep_options import SweepOptions
-from potr_cl.stages.pruning.view_by_view import ViewByView, can_go_by_view
-from potr_cl.stages.pruning.visible_parts import PartedRemoval, first_totals
 from potr_cl.stages.stage import State, Workbench
+from potr_cl.views.shares import ViewShares
+from potr_cl.views.visibility import Visibility
 from potr_cl.workers.dealing import Shares, shares
 from potr_cl.workers.parts import Parts
 
-#: What measures: one device, perhaps part by part or view by view, or several together.
-Removal: TypeAlias = RemovalSweep | SharedRemoval | PartedRemoval | DrawnRemoval | ViewByView
+#: What measures: one device, or several together.
+Removal: TypeAlias = RemovalSweep | SharedRemoval
 
 
 @contextmanager
@@ -33,7 +31,7 @@ def measurement(
     state: State,
     bench: Workbench,
     options: SweepOptions,
-    sights: Sights | None = None,
+    sights: Visibility | None = None,
     spared: NDArray[np.bool_] | None = None,
     dealt: ViewShares | None = None,
     seen: NDArray[np.int64] | None = None,
@@ -43,7 +41,7 @@ def measurement(
     Args:
         state, bench, options: of the stage.
         sights: what the views see, where each had better be looked at with what it sees.
-        spared: as of :class:`~potr_cl.stages.pruning.visible_parts.PartedRemoval`; only with ``sights``.
+        spared: as of :class:`~potr_cl.stages.pruning.removal.RemovalSweep`; only with ``sights``.
         dealt: the views, for a pool whose workers get what these see and no more of the scene.
         seen: (n,) numbers of the splats that the sweep is to have, ascending, which it numbers from 0 on; None: all.
 
@@ -59,23 +57,14 @@ def measurement(
     share = None if pool is None else shares(pool, len(views))
     with ExitStack() as stack:
         if pool is None or share is None or not share.others:
+            scene = None
             if sights is not None:
                 scene = state.scene if seen is None else state.scene.subset(seen)
-                whole = stack.enter_context(whole_on_device(device, bench.drawable(scene)))
-                others_given = (options, bench.background, progress)
-                if can_go_by_view(whole, device, options):
-                    first = None if spared is None else first_totals(splats, spared)
-                    yield stack.enter_context(ViewByView(device, whole, views, sights, *others_given, first))
-                elif device.family == "cpu":
-                    in_parts = (device, scene, whole, views, sights.parts(), *others_given, spared)
-                    yield stack.enter_context(DrawnRemoval(*in_parts))
-                else:
-                    in_parts = (device, scene, whole, views, sights.parts(), *others_given, spared)
-                    yield stack.enter_context(PartedRemoval(*in_parts))
-                return
-            drawable = stack.enter_context(lying_on(device, bench.placed(state, seen)))
-            rasterizer = stack.enter_context(Rasterizer(device, drawable, background=bench.background))
-            yield stack.enter_context(RemovalSweep(rasterizer, views, options, progress))
+                drawable = stack.enter_context(whole_on_device(device, bench.drawable(scene)))
+            else:
+                drawable = stack.enter_context(lying_on(device, bench.placed(state, seen)))
+            given_all = (device, drawable, views, options, bench.background, sights, None, progress, scene, spared)
+            yield stack.enter_context(planned_sweep(*given_all))
             return
         given: list[tuple[Any, ...]] = []
         if dealt is not None:
@@ -88,25 +77,18 @@ def measurement(
             sights = sights if pool.in_process else None
             given = [(sent, views, options, bench.background, numbers, sights) for numbers in share.others]
         others = stack.enter_context(Parts(pool, RemovalPart, given, options.memory, share.names))
-        own: RemovalSweep | ViewByView | None = None
-        stride = splats
+        own: RemovalSweep | None = None
         if share.own:
             drawable = stack.enter_context(lying_on(device, bench.placed(state, seen)))
-            if sights is not None and can_go_by_view(drawable, device, options):
-                own = ViewByView(
-                    device, drawable, views, sights, options, bench.background, progress, numbers=share.own
-                )
-                stride = drawable.stride
-            else:
-                rasterizer = stack.enter_context(Rasterizer(device, drawable, background=bench.background))
-                own = RemovalSweep(rasterizer, views, options, progress, share.own)
-                stride = rasterizer.stride
-            stack.callback(own.close)
+            # Only what lies on the device already is looked at in parts.
+            own_sights = sights if isinstance(drawable, SceneBuffers) else None
+            with_own = (device, drawable, views, options, bench.background, own_sights, share.own, progress)
+            own = stack.enter_context(planned_sweep(*with_own))
         others.ready()
         steers = all(others.ask(place, "can_steer") for place in range(len(others)))
         steers = steers and (device.family == "gpu" if own is None else own.steering is not None)
         numbers = None if dealt is None else [each.splats for each in dealt.shares]
-        shared = SharedRemoval(device, splats, stride, views, own, others, pool, steers, numbers)
+        shared = SharedRemoval(device, splats, views, own, others, pool, steers, numbers)
         yield stack.enter_context(shared)
 
 

@@ -20,7 +20,6 @@ from potr_cl.opencl.structs import bytes_before, struct_dtype
 from potr_cl.raster.macros import totals_limits
 from potr_cl.stages.pruning.measured import Removal
 from potr_cl.stages.pruning.schedule import Course, Indices, Iteration, Pruned, PruningOptions, prune
-from potr_cl.stages.pruning.steering import Steered
 
 _SOURCE = "prune/choose_gpu.cl"
 #: A score has so many digits, each of so many values; a work-group has a work-item for each value.
@@ -58,7 +57,7 @@ class _Controller(Owner):
         DeviceError: the device has no room for the state.
     """
 
-    def __init__(self, removal: Steered, options: PruningOptions, spared: NDArray[np.bool_] | None) -> None:
+    def __init__(self, removal: Removal, options: PruningOptions, spared: NDArray[np.bool_] | None) -> None:
         self._removal, self._options = removal, options
         self._device = device = removal.device
         self._splats = removal.splats

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Iterator
+from typing import TypeVar
 
 import pyopencl as cl
 
 from potr_cl.opencl.device import Device
+
+T = TypeVar("T")
 
 
 class Queues:
@@ -25,11 +28,11 @@ class Queues:
             properties = device.queue.properties
             self._queues = [cl.CommandQueue(device.context, device.info.handle, properties) for _ in range(most)]
 
-    def enqueue(self, work: Sequence[Callable[[cl.CommandQueue], None]]) -> None:
-        """Enqueue pieces of work, after all that the device's own queue has; :meth:`wait` for them."""
+    def dealt(self, work: Iterable[T]) -> Iterator[tuple[T, cl.CommandQueue]]:
+        """Each piece of work with the queue that it goes to, after what the device's own has; :meth:`wait` for all."""
         self._device.queue.finish()
         for piece, queue in zip(work, itertools.cycle(self._queues)):
-            piece(queue)
+            yield piece, queue
             queue.flush()
 
     def wait(self) -> None:

@@ -3,19 +3,20 @@ splat's removal"). Start with :class:`RemovalSweep`.
 
 A view's projection, tile lists and depth order are made once: pruning never changes them, it only takes intersections
 out. Each measurement is one sweep over the tiles of every view (cl/prune/removal_*.cl), whose sums go to exact integer
-totals a splat; a tile in which little has changed since its last sweep keeps its sums. What does not fit the memory
-budget is made again when it is needed: first the projections, then whole views.
+totals a splat, in units that follow from all views. So it makes no difference to any bit which views are looked at
+together, with which splats, and which of them stay on the device: that is the plan's matter
+(:mod:`potr_cl.views.plan`), and the engine's (:mod:`potr_cl.views.engine`).
 
-The parts: sweep_options.py (what may be traded for speed), prepared_views.py (the views, and which fit the budget),
-launcher.py (the kernels of either family), cached_sweep.py and uncached_sweep.py (measuring views that fit and views
-that do not), staleness.py (which tiles are swept again), survivors.py (which splats are left), fixed_point.py (the
-totals' units) and steering.py (all of it for a controller on the device).
+The parts: sweep_options.py (what may be traded for speed), resident.py and streamed.py (measuring views that stay on
+the device and views that do not), prepared_set.py (what is kept of them), ledger.py (who numbers splats how),
+launcher.py (the kernels of either family), staleness.py (which tiles the host has swept again), survivors.py (which
+splats are left) and fixed_point.py (the totals' units).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 
 import numpy as np
 import pyopencl as cl
@@ -26,38 +27,52 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.pruning.cached_sweep import CachedSweep
-from potr_cl.stages.pruning.fixed_point import FixedPoint, zero_totals
-from potr_cl.stages.pruning.launcher import launcher_for
-from potr_cl.stages.pruning.prepared_views import PreparedSet, PreparedViews
+from potr_cl.raster.view_set import ViewSet
+from potr_cl.stages.pruning.fixed_point import FixedPoint
+from potr_cl.stages.pruning.launcher import launchers
+from potr_cl.stages.pruning.ledger import Ledger
+from potr_cl.stages.pruning.prepared_set import PreparedSet
 from potr_cl.stages.pruning.queues import Queues
-from potr_cl.stages.pruning.staleness import TileSchedule
-from potr_cl.stages.pruning.steering import Steering
-from potr_cl.stages.pruning.survivors import Survivors
-from potr_cl.stages.pruning.sweep_options import SweepOptions, default_memory
-from potr_cl.stages.pruning.uncached_sweep import UncachedSweep
+from potr_cl.stages.pruning.resident import ResidentSweep
+from potr_cl.stages.pruning.streamed import StreamedSweep
+from potr_cl.stages.pruning.survivors import Bits, Survivors
+from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.views import plan as plans
+from potr_cl.views.budget import default_memory, tiles_of
+from potr_cl.views.engine import ViewEngine
+from potr_cl.views.plan import ViewPlan
+from potr_cl.views.subsets import SplatSource, Subset, WholeScene
 
 F64 = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
+#: The total that spares a splat: a ΔMSE of about 1, by the bounds of :class:`FixedPoint`; and what limits it is beyond.
+_SPARED, LARGEST_LIMIT = 1 << 58, 0.1
+_GROUP = 64
+
 
 class RemovalSweep(Owner):
-    """Measures removal effects and importances while splats are taken out.
+    """Measures removal effects and importances while splats are taken out, on one device.
 
     Args:
-        rasterizer: holds the uncompressed scene, its rules and its background.
-        cameras: the views that count.
+        scene: the uncompressed scene, drawn by a rasterizer with its rules and its background, which stays the
+            caller's; or a source of its splats, which is this object's from now on.
+        cameras: all views; the totals' units follow from them.
         options: speed/accuracy trade-offs.
         progress: called with the views prepared and their number.
         numbers: of the views that are measured here, ascending, where others are measured elsewhere and all totals are
             added up (:mod:`potr_cl.stages.pruning.shared_removal`); None: all.
+        plan: of these views; None: all of them with all splats.
+        spared: (N,) splats whose effects are to be beyond :data:`LARGEST_LIMIT`, so that they are never removed.
 
     Attributes:
-        splats: N.
+        device: where the totals and the marks are. splats: N.
+        totals: (N, 2) int64 in the device's memory, and units: ΔMSE and I of 1 there.
+        marks: (N,) uint8 in the device's memory, :class:`~potr_cl.stages.pruning.survivors.SplatState`. A controller on
+            the device marks splats as JUST_REMOVED and calls :meth:`remove_marked`; when it marks the next ones, it
+            changes the earlier marks to REMOVED.
         fixed_point: the totals' units, those of all views.
-        cached_views: views whose lists fit the memory budget; the others are made again for every measurement.
-        steering: the interface for a controller that runs on the device; None if the host has to decide, because of the
-            kernel family, the options, or views that do not fit the budget.
+        resident_views: how many views stay on the device, or draw nothing.
 
     Raises:
         UsageError: no camera.
@@ -66,66 +81,136 @@ class RemovalSweep(Owner):
 
     def __init__(
         self,
-        rasterizer: Rasterizer,
+        scene: Rasterizer | SplatSource,
         cameras: Sequence[Camera],
         options: SweepOptions | None = None,
         progress: Callable[[int, int], None] | None = None,
         numbers: Sequence[int] | None = None,
+        plan: ViewPlan | None = None,
+        spared: NDArray[np.bool_] | None = None,
     ) -> None:
+        source = scene if isinstance(scene, SplatSource) else WholeScene(scene)
         if not cameras:
             raise UsageError("removal effects need at least one view")
-        options = options or SweepOptions()
-        self._numbers = range(len(cameras)) if numbers is None else numbers
-        self._rasterizer = rasterizer
-        self._device = device = rasterizer.device
+        self._options = options = options or SweepOptions()
+        self.device, self.splats, self._spared = source.device, source.splats, spared
         self.fixed_point = FixedPoint.of_views(cameras)
-        self._original_sh: cl.Buffer | None = None
-        self.splats = rasterizer.splats
+        self.units = self.fixed_point.units
+        if plan is None:
+            room = default_memory(self.device) if options.memory is None else options.memory
+            plan = plans.whole(range(len(cameras)) if numbers is None else numbers, self.splats, room)
+        self._cameras, self._pending = cameras, list[cl.Event]()
         with ExitStack() as owned:
-            self._memory = memory = owned.enter_context(Memory(device))
-            self._totals = memory.upload(zero_totals(rasterizer.stride), "the removal effects")
-            launcher = launcher_for(rasterizer, options, self.fixed_point)
-            budget = default_memory(device) if options.memory is None else options.memory
-            self._prepared = prepared = owned.enter_context(
-                PreparedViews(rasterizer, [cameras[k] for k in self._numbers], budget, launcher.most_views, progress)
+            owned.callback(source.close)
+            self._memory = owned.enter_context(Memory(self.device))
+            self.totals: cl.Buffer = self._memory.allocate(16 * source.stride, "the removal effects")
+            self._begin_totals()
+            self._survivors = owned.enter_context(
+                Survivors(self.device, self.splats, source.stride, lambda: self._queues.wait())
             )
+            self.marks: cl.Buffer = self._survivors.buffer
+            family = launchers(self.device)
+            self._queues = Queues(self.device, 1)
+            self._engine = ViewEngine(source, cameras, plan, self._attach, family.most_views, progress)
+            owned.enter_context(self._engine)
+            self._pending.clear()
+            resident = self._engine.resident
+            ledgers = {
+                id(each): owned.enter_context(Ledger(self._survivors, self.totals, each))
+                for each in {id(ready.subset): ready.subset for ready in resident}.values()
+            }
+            self._local = [ledger for ledger in ledgers.values() if ledger.is_local]
             # Sets that share the memory of their projections have to be swept one after the other.
-            queues = Queues(device, 1 if prepared.geometry_is_shared else launcher.most_queues)
-            self._survivors = owned.enter_context(Survivors(device, self.splats, rasterizer.stride, queues.wait))
-            tiles = memory.allocate(4 * prepared.tiles, "the tiles to sweep")
-            schedule = TileSchedule(options, [(self._numbers[k], tiles) for k, tiles in prepared.cached_view_tiles])
-            self._cached = owned.enter_context(
-                CachedSweep(prepared, launcher, queues, self._survivors, schedule, tiles, self._totals)
+            if not any(ready.shares for ready in resident):
+                self._queues = Queues(self.device, min(plan.queues or family.most_queues, len(resident)))
+            of_sets = [ledgers[id(ready.subset)] for ready in resident]
+            self._resident = ResidentSweep(
+                self._engine, of_sets, self._survivors, self._queues, options, self.fixed_point
             )
-            self._uncached = UncachedSweep(prepared, launcher, self._survivors, tiles)
+            owned.enter_context(self._resident)
+            self._streamed = StreamedSweep(self._engine, self._survivors, options, self.fixed_point)
+            owned.enter_context(self._streamed)
             self._owned = owned.pop_all()
-        self.cached_views = len(prepared.cached_view_tiles)
-        self.steering: Steering | None = None
-        if launcher.lists_tiles and options.only_by_tolerance and not prepared.uncached:
-            self.steering = Steering(
-                device,
-                self._cached,
-                self._survivors,
-                options.tolerance,
-                self._totals,
-                self.fixed_point.units,
-                self.splats,
-            )
+        self._measured = self._streamed_added = False
+        self.resident_views = len(self._engine.idle) + sum(len(ready.numbers) for ready in resident)
+
+    def _attach(
+        self, numbers: Sequence[int], subset: Subset, views: ViewSet, memory: Memory | None, target: cl.Buffer | None
+    ) -> PreparedSet:
+        # The device sorts the lists while the next view is made ready.
+        return PreparedSet(subset.rasterizer, numbers, views, memory, target, None if memory else self._pending)
+
+    def _begin_totals(self) -> None:
+        self.device.fill(self.totals, np.int64(0))
+        if self._spared is not None:
+            first = np.zeros((self.splats, 2), np.int64)
+            first[self._spared, 0] = _SPARED
+            with self.device.errors("cannot hold the removal effects to begin with"):
+                cl.enqueue_copy(self.device.queue, self.totals, first, is_blocking=True)
 
     @property
     def sweeps(self) -> float:
         """Work done so far, as a multiple of sweeping every tile of every view once."""
-        return (self._cached.tiles_swept + self._uncached.tiles_swept) / self._prepared.tiles
+        tiles = sum(tiles_of(self._cameras[number]) for number in self._engine.plan.numbers)
+        return (self._resident.tiles_swept + self._streamed.tiles_swept) / tiles
 
     @property
-    def projects(self) -> bool:
-        """Whether measurements project splats again; if not, the scene's parameters are not looked at any more."""
-        return bool(self._prepared.uncached) or self._prepared.geometry_is_shared
+    def steering(self) -> RemovalSweep | None:
+        """Itself, for a controller on the device; None if the host has to decide: where it is asked which tiles are
+        swept, or where streamed views are measured so often that nothing is gained."""
+        often = self._engine.streamed and not self._engine.plan.patience
+        return self if self._resident.device_lists and not often else None
 
     @property
     def alive(self) -> NDArray[np.bool_]:
         """(N,) which splats are left."""
         return self._survivors.alive
+
+    # ------------------------------------------------------------------------------ for a controller on the device
+
+    def measure_on_device(self) -> None:
+        """Bring :attr:`totals` up to date."""
+        streamed, resident = self._streamed, self._resident
+        resident.sweep()
+        if self._local:
+            if streamed.are_stale():
+                streamed.measure()
+            self._begin_totals()
+            for ledger in self._local:
+                ledger.add_to(self.totals)
+            self._streamed_added = False
+        elif streamed.are_stale():
+            if self._streamed_added:
+                self._with_streamed("subtract_totals")
+            self._streamed_added = False
+            streamed.measure()
+        if self._engine.streamed and not self._streamed_added:
+            self._with_streamed("add_totals")
+            self._streamed_added = True
+        self._measured = True
+
+    def _with_streamed(self, name: str) -> None:
+        kernel = self.device.shared_kernel("prune/add_totals.cl", name)
+        kernel.bind(totals=self.totals, more=self._streamed.totals, count=2 * self.splats)
+        kernel.launch((-(-2 * self.splats // _GROUP) * _GROUP,), (_GROUP,))
+
+    def remove_marked(self) -> None:
+        """Take the splats out that are marked JUST_REMOVED."""
+        self._resident.note_removal()
+        self._survivors.marked_by_device()
+
+    def mark(self, splats: Bits) -> None:
+        """Mark splats that a controller elsewhere has chosen, as its :meth:`just_marked` gives them.
+
+        :meth:`remove_marked` follows.
+        """
+        self._survivors.mark(splats)
+
+    def just_marked(self) -> Bits:
+        """The splats that are marked JUST_REMOVED, see :meth:`Survivors.just_marked`."""
+        return self._survivors.just_marked()
+
+    # ----------------------------------------------------------------------------------- for a controller on the host
 
     def measure(self) -> tuple[F64, F64]:
         """ΔMSE_k and I_k of all N splats, float64; the values of removed splats mean nothing.
@@ -133,56 +218,41 @@ class RemovalSweep(Owner):
         ΔMSE is the change of the mean squared error over all views, pixels and channels against the uncompressed
         scene's renders if that splat alone went; I the mean over views and pixels of T α.
         """
-        return self.fixed_point.values(self.measure_totals())
-
-    @property
-    def totals(self) -> cl.Buffer:
-        """The totals of the views that stay prepared, (N, 2) int64 in the device's memory."""
-        return self._totals
-
-    def measure_on_device(self) -> None:
-        """Bring :attr:`totals` up to date."""
-        self._cached.measure()
+        self.measure_on_device()
+        return self.fixed_point.values(self.device.download(self.totals, (self.splats, 2), np.int64))
 
     def measure_totals(self) -> NDArray[np.int64]:
         """The same as (N, 2) int64 in units of the fixed point: the sums over the views that are measured here."""
-        first_time = self._cached.measurements == 0
         self.measure_on_device()
-        totals = self._device.download(self._totals, (self.splats, 2), np.int64)
-        if self._prepared.uncached:
-            totals += self._uncached.measure(self.splats, first_time, self._original_sh)
-        return totals
+        return self.device.download(self.totals, (self.splats, 2), np.int64)
 
     def remove(self, splats: Indices) -> None:
         """Take splats, (n,) by number, out of all lists; note how much each tile loses."""
-        self._cached.settle()
+        self._see_targets()
+        self._resident.prepare_removal()
         self._survivors.remove(splats)
-        self._cached.note_removal()
+        self._resident.note_removal()
 
     def replace_sh(self, sh: FloatArray) -> None:
         """Continue with other colours, (N, M, 3) float32 of the same degree. The target pictures stay as they are."""
-        self._cached.settle()
-        before = self._rasterizer.sh
-        former = self._rasterizer.replace_sh(sh)
-        if self._original_sh is None:
-            self._original_sh = before
-            if former is not None:
-                self._memory.adopt(former)
-        elif former is not None:
-            self._device.free(former)
+        self._see_targets()
+        self._engine.source.replace_sh(sh)
         self.project_again()
+
+    def _see_targets(self) -> None:
+        """The target pictures are stored by the first measurement, before anything changes."""
+        if not self._measured:
+            self.measure_on_device()
 
     def project_again(self) -> None:
         """Continue with the colours that the rasterizer's scene has by now; so with others, if it has got others."""
-        self._cached.settle()
-        for views in self._prepared.cached:
-            if views.views.shapes is not None:
-                self._rasterizer.project(views.views)
+        self._resident.project_again()
         self.sweep_everything()
 
     def sweep_everything(self) -> None:
         """Have the next measurement sweep every tile, whatever has changed."""
-        self._cached.forget_sums()
+        self._resident.list_everything()
+        self._streamed.forget()
 
     def view_importances(self) -> Iterator[tuple[int, Indices, F64]]:
         """I_k(s) of the splats that are left, view by view.
@@ -198,33 +268,46 @@ class RemovalSweep(Owner):
         yield from self.known_importances()
 
     def sweep_changed(self) -> None:
-        """Measure whatever anything was removed from since it was last measured.
+        """Measure whatever anything was removed from since it was last measured, in the resident views.
 
         Raises:
             UsageError: nothing has been measured yet.
         """
-        if not self._cached.measurements:
+        if not self._measured:
             raise UsageError("importances are known after a measurement")
-        self._cached.sweep_changed()
+        self._resident.sweep_changed()
 
     def known_importances(self) -> Iterator[tuple[int, Indices, F64]]:
         """:meth:`view_importances` of the views that are measured here, right after :meth:`sweep_changed`."""
-        cached = {views.numbers: views for views in self._prepared.cached}
-        for numbers in sorted([*cached, *self._prepared.uncached], key=lambda numbers: numbers.start):
-            if numbers in cached:
-                yield from self._importances(cached[numbers])
-            else:
-                with self._uncached.swept_once(numbers) as views:
-                    yield from self._importances(views)
+        alive = self.alive
+        resident = {
+            number: (ready, place) for ready in self._engine.resident for place, number in enumerate(ready.numbers)
+        }
+        for number in self._engine.plan.numbers:
+            if number in resident:
+                ready, place = resident[number]
+                yield number, *self._importances(ready.subset, ready.work, place, alive)
+                continue
+            with nullcontext() if number in self._engine.idle else self._streamed.swept(number) as found:
+                if found is None:
+                    yield number, np.zeros(0, np.int64), np.zeros(0)
+                else:
+                    yield number, *self._importances(*found, 0, alive)
 
-    def _importances(self, prepared: PreparedSet) -> Iterator[tuple[int, Indices, F64]]:
-        """:meth:`view_importances` of the views of a set."""
-        alive = self._survivors.alive
-        for number, view, intersections, sums in prepared.read_sums():
-            weights = np.maximum(sums[:, 1], 0)  # negative: touches no pixel
-            total = np.bincount(intersections, weights=weights, minlength=self.splats)[: self.splats]
-            splats = np.flatnonzero((total > 0) & alive)
-            yield self._numbers[number], splats, total[splats] / view.pixels
+    def _importances(
+        self, subset: Subset, prepared: PreparedSet, place: int, alive: NDArray[np.bool_]
+    ) -> tuple[Indices, F64]:
+        """The splats that one view of a set sees, and their importances."""
+        view, intersections, sums = prepared.read_sums(place)
+        weights = np.maximum(sums[:, 1], 0)  # negative: touches no pixel
+        total = np.bincount(intersections, weights=weights, minlength=subset.count)[: subset.count]
+        seen = np.flatnonzero(total > 0)
+        splats = seen
+        if subset.numbers is not None:
+            named = self.device.download(subset.numbers, (subset.count,), np.uint32)
+            splats = named[seen].astype(np.int64)
+        left = alive[splats]
+        return splats[left], total[seen[left]] / view.pixels
 
     def close(self) -> None:
         """Give all device memory back."""

@@ -1,7 +1,9 @@
 """Removal effects whose views are measured by several: :class:`SharedRemoval` adds up what they find.
 
 All totals are integers, in units that follow from all views (:class:`potr_cl.stages.pruning.fixed_point.FixedPoint`).
-So it makes no difference to any bit who measures which view. What is decided is decided in one place, from the sums: by
+So it makes no difference to any bit who measures which view. The master's device adds up: what other devices of this
+process lend (:mod:`~potr_cl.stages.pruning.alive_packing`), or what has changed elsewhere since it was last told
+(:mod:`~potr_cl.stages.pruning.changed_totals`). What is decided is decided in one place, from the sums: by
 :mod:`potr_cl.stages.pruning.schedule`, or on the master's device by :mod:`potr_cl.stages.pruning.on_device`.
 """
 
@@ -10,7 +12,6 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -19,17 +20,15 @@ from numpy.typing import NDArray
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
-from potr_cl.opencl.memory import Memory, Owner, Scratch
-from potr_cl.opencl.narrow import Narrowing
+from potr_cl.opencl.memory import Memory, Owner, Scratch, Staging
 from potr_cl.opencl.relay import Lent, Relay
+from potr_cl.raster.scene_buffers import stride_of
 from potr_cl.stages.pruning.alive_packing import AlivePacking
-from potr_cl.stages.pruning.changed_totals import AddedChanges, numbers_of
+from potr_cl.stages.pruning.changed_totals import AddedChanges
 from potr_cl.stages.pruning.fixed_point import FixedPoint, zero_totals
 from potr_cl.stages.pruning.removal import F64, Indices, RemovalSweep
-from potr_cl.stages.pruning.steering import Steered, Steering
 from potr_cl.stages.pruning.survivors import Bits, Survivors
-from potr_cl.stages.pruning.view_by_view import ViewByView
-from potr_cl.workers.parts import Each, Parts, Pending
+from potr_cl.workers.parts import Each, Parts
 from potr_cl.workers.pool import Pool
 
 #: Splats a work-group of the kernel that adds totals.
@@ -41,7 +40,7 @@ class SharedRemoval(Owner):
 
     Args:
         device: the master's.
-        splats: N. stride: N padded.
+        splats: N.
         cameras: all views.
         own: measures the master's share of the views; None if it has none.
         others: parts, each a :class:`potr_cl.stages.pruning.part.RemovalPart`, that measure the rest.
@@ -51,7 +50,8 @@ class SharedRemoval(Owner):
             None: all parts have all.
 
     Attributes:
-        splats, steering: as of a :class:`~potr_cl.stages.pruning.removal.RemovalSweep`.
+        device, splats, totals, marks, units: as of a :class:`~potr_cl.stages.pruning.removal.RemovalSweep`.
+        steering: itself, if it steers; else None.
 
     Raises:
         DeviceError: the device has no room.
@@ -61,49 +61,129 @@ class SharedRemoval(Owner):
         self,
         device: Device,
         splats: int,
-        stride: int,
         cameras: Sequence[Camera],
-        own: RemovalSweep | ViewByView | None,
+        own: RemovalSweep | None,
         others: Parts,
         pool: Pool,
         steers: bool,
         numbers: Sequence[Indices] | None = None,
     ) -> None:
-        self.splats = splats
-        self._own, self._others, self._sparse, self._in_process = own, others, pool.sparse, pool.in_process
-        self._numbers = numbers
         assert numbers is None or pool.sparse
-        self._device = device
-        self._narrowing: Narrowing | None = None
+        self.device, self.splats, self._own, self._others, self._numbers = device, splats, own, others, numbers
         self._fixed_point = FixedPoint.of_views(cameras)
-        self._found: NDArray[np.int64] | None = None
-        self._alive = np.ones(splats, bool)
-        self.steering: Steered | None = None
+        self.units = self._fixed_point.units
+        self._survivors: Survivors | None = None
+        self._relay: Relay | None = None
+        self._added: AddedChanges | None = None
+        self._numbers_there: dict[int, tuple[int, cl.Buffer]] = {}
         with ExitStack() as owned:
-            if steers:
-                self.steering = owned.enter_context(_SharedSteering(self, device, stride))
+            memory, stride = owned.enter_context(Memory(device)), stride_of(splats)
+            self.totals: cl.Buffer = memory.upload(zero_totals(stride), "the removal effects")
+            self._more = owned.enter_context(Scratch(device, "the removal effects"))
+            self._staging = owned.enter_context(Staging(device))
+            if own is None:
+                self._survivors = owned.enter_context(Survivors(device, splats, stride, device.queue.finish))
+                self.marks: cl.Buffer = self._survivors.buffer
+            else:
+                self.marks = own.marks
+            self._add = device.kernel("prune/add_totals.cl", "add_totals")
+            if pool.sparse:
+                assert own is None, "changes are added to the totals, which therefore are those of the others alone"
+                self._added = owned.enter_context(AddedChanges(device))
+                for place, theirs in enumerate(numbers or ()):
+                    buffer = memory.upload(theirs.astype(np.uint32), "the splats of workers")
+                    self._numbers_there[place] = len(theirs), buffer
+            else:
+                self._relay = owned.enter_context(Relay(device))
+                self._alive = owned.enter_context(AlivePacking(device, splats, self.marks))
             self._owned = owned.pop_all()
+        self.steering: SharedRemoval | None = self if steers else None
+
+    @property
+    def _states(self) -> RemovalSweep | Survivors:
+        """Who knows which splats are left."""
+        found = self._survivors or self._own
+        assert found is not None
+        return found
 
     @property
     def alive(self) -> NDArray[np.bool_]:
         """(N,) which splats are left."""
-        # Where the number of splats is given, the host chooses though the device could.
-        return self._alive if self.steering is None else self._alive & self.steering.alive
+        return self._states.alive
+
+    # ------------------------------------------------------------------------------ for a controller on the device
+
+    def measure_on_device(self) -> None:
+        """Bring :attr:`totals` up to date."""
+        pending = self._others.begin("lend_totals" if self._added is None else "changes")
+        if self._own is not None:
+            self._own.measure_on_device()
+        if self._added is None:
+            self._fetch(pending.results())
+        else:
+            for place, changes in enumerate(pending.results()):
+                splats, numbers = self._numbers_there.get(place, (self.splats, None))
+                self._added.add(self.totals, changes, splats, numbers)
+        if self._own is not None:
+            self._add_to_totals(self._own.totals)
+
+    def _fetch(self, found: Sequence[Lent]) -> None:
+        """Have as totals the sum of what others lend."""
+        assert self._relay is not None
+        for number, more in enumerate(found):
+            packed = self._alive.are_packed(more)
+            if number == 0 and not packed:
+                self._relay.fetch(self.totals, more)
+                continue
+            self._more.reserve(more.nbytes)
+            self._relay.fetch(self._more.buffer, more)
+            if packed:
+                self._alive.unpack(self._more.buffer, self.totals, add=number > 0)
+            else:
+                self._add_to_totals(self._more.buffer)
+
+    def _add_to_totals(self, more: cl.Buffer) -> None:
+        self._add.bind(totals=self.totals, more=more, count=2 * self.splats)
+        self._add.launch((-(-2 * self.splats // _GROUP) * _GROUP,), (_GROUP,))
+
+    def remove_marked(self) -> None:
+        """Take the splats out that are marked JUST_REMOVED."""
+        # The others go on with it while the master's device does its own, and whoever tells them more waits for them.
+        self._tell(self._states.just_marked())
+        if self._own is not None:
+            self._own.remove_marked()
+        elif self._survivors is not None:
+            self._survivors.marked_by_device()
+            self._survivors.settle()
+        self._note()
+
+    def _tell(self, marked: Bits) -> None:
+        """Have the others remove splats, a bit each, without waiting for them."""
+        told: Bits | Each = marked
+        if self._numbers is not None:
+            meant = np.unpackbits(marked, count=self.splats, bitorder="little")
+            told = Each([np.packbits(meant[own], bitorder="little") for own in self._numbers])
+        self._others.begin("remove_marked", told)
+
+    def _note(self) -> None:
+        """What others lend is packed by the splats that are left from now on."""
+        if self._relay is not None:
+            self._alive.note()
+
+    # ----------------------------------------------------------------------------------- for a controller on the host
 
     def measure(self) -> tuple[F64, F64]:
         """ΔMSE_k and I_k of all N splats, float64; the values of removed splats mean nothing."""
-        pending = self.begin_measuring()
-        own = None if self._own is None else self._own.measure_totals()
-        totals = self.found_by_others(pending)
-        return self._fixed_point.values(totals if own is None else totals + own)
+        self.measure_on_device()
+        return self._fixed_point.values(self._staging.download(self.totals, (self.splats, 2), np.int64))
 
     def remove(self, splats: Indices) -> None:
         """Take splats out for good."""
-        pending = self._others.begin("remove", self._places(splats))
-        self._alive[splats] = False
-        if self._own is not None:
-            self._own.remove(splats)
-        pending.results()
+        gone = np.zeros(self.splats, bool)
+        gone[splats] = True
+        self._tell(np.packbits(gone, bitorder="little"))
+        self._states.remove(splats)
+        self._note()
 
     def replace_sh(self, sh: FloatArray) -> None:
         """Continue with other colours, (N, M, 3) float32 of the same degree. The target pictures stay as they are."""
@@ -129,154 +209,9 @@ class SharedRemoval(Owner):
         place = 0
         while (found := self._others.ask(part, "importances", place)) is not None:
             number, seen, importances = found
-            yield number, seen.astype(np.int64) if self._numbers is None else self._numbers_of(part)[seen], importances
+            yield number, seen.astype(np.int64) if self._numbers is None else self._numbers[part][seen], importances
             place += 1
-
-    def _numbers_of(self, part: int) -> Indices:
-        assert self._numbers is not None
-        return self._numbers[part]
-
-    def _places(self, splats: Indices) -> Indices | Each:
-        """What tells the parts about these splats."""
-        if self._numbers is None:
-            return splats
-        meant = np.zeros(self.splats, bool)
-        meant[splats] = True
-        return Each([np.flatnonzero(meant[own]) for own in self._numbers])
-
-    def tell_marked(self, marked: Bits) -> None:
-        """Have the others remove what a device has marked, without waiting for them."""
-        told: Bits | Each = marked
-        if self._numbers is not None:
-            meant = np.unpackbits(marked, count=self.splats, bitorder="little")
-            told = Each([np.packbits(meant[own], bitorder="little") for own in self._numbers])
-        self._others.begin("remove_marked", told)
-
-    def begin_measuring(self) -> Pending:
-        """Have the others measure."""
-        return self._others.begin("measure_changes" if self._sparse else "measure")
-
-    def found_by_others(self, pending: Pending) -> NDArray[np.int64]:
-        """(N, 2) int64, what they found; valid until the next call."""
-        if self._sparse:
-            if self._found is None:  # what the others have found; of removed splats anything
-                self._found = np.zeros((self.splats, 2), np.int64)
-            if self._narrowing is None:
-                self._narrowing = self._owned.enter_context(Narrowing(self._device))
-            for part, (told, changes) in enumerate(pending.results()):
-                splats = numbers_of(told)
-                splats = splats if self._numbers is None else self._numbers_of(part)[splats]
-                for column, more in enumerate(self._narrowing.widened(changes)):
-                    self._found[splats, column] += more
-            return self._found
-        totals: list[NDArray[np.int64]] = pending.results()
-        found = totals[0]
-        for more in totals[1:]:
-            found += more
-        return found
 
     def close(self) -> None:
         """Give the master's device memory back; the parts are the caller's."""
         self._owned.close()
-
-
-class _SharedSteering(Owner):
-    """A :class:`potr_cl.stages.pruning.steering.Steered` whose totals are the sums over all that measure."""
-
-    def __init__(self, shared: SharedRemoval, device: Device, stride: int) -> None:
-        self._shared = shared
-        self.device, self.splats, self.units = device, shared.splats, shared._fixed_point.units
-        own = None if shared._own is None else shared._own.steering
-        assert own is None or isinstance(own, (Steering, ViewByView))
-        self._own: Steering | ViewByView | None = own
-        self._memory = Memory(device)
-        self._marks: Survivors | None = None
-        self._relay = Relay(device) if shared._in_process else None
-        self._added: AddedChanges | None = None
-        self._numbers: dict[int, tuple[int, cl.Buffer]] = {}
-        with device.all_or_nothing():
-            self.totals: cl.Buffer = self._memory.upload(zero_totals(stride), "the removal effects")
-            self._more = Scratch(device, "the removal effects")
-            if own is None:
-                self._marks = Survivors(device, self.splats, stride, device.queue.finish)
-                self.marks: cl.Buffer = self._marks.buffer
-            else:
-                self.marks = own.marks
-            self._add = device.kernel("prune/add_totals.cl", "add_totals")
-            self._alive = None if self._relay is None else AlivePacking(device, self.splats, self.marks)
-            if shared._sparse:
-                assert own is None, "changes are added to the totals, which therefore are those of the others alone"
-                self._added = AddedChanges(device)
-                for origin, numbers in enumerate(shared._numbers or ()):
-                    buffer = self._memory.upload(numbers.astype(np.uint32), "the splats of workers")
-                    self._numbers[origin] = len(numbers), buffer
-
-    @property
-    def alive(self) -> NDArray[np.bool_]:
-        states: Any = self._marks or self._own
-        alive: NDArray[np.bool_] = states.alive
-        return alive
-
-    def measure_on_device(self) -> None:
-        shared = self._shared
-        how = "lend_totals" if self._relay is not None else "changes" if self._added is not None else "measure"
-        pending = shared._others.begin(how)
-        if self._own is not None:
-            self._own.measure_on_device()
-        if self._relay is not None:
-            self._fetch(pending.results())
-        elif self._added is not None:
-            for place, changes in enumerate(pending.results()):
-                splats, numbers = self._numbers.get(place, (self.splats, None))
-                self._added.add(self.totals, changes, splats, numbers)
-        else:
-            found = shared.found_by_others(pending)
-            with self.device.errors("failed while computing"):
-                cl.enqueue_copy(self.device.queue, self.totals, found, is_blocking=True)
-        if self._own is not None:
-            self._add_to_totals(self._own.totals)
-
-    def _fetch(self, found: Sequence[Lent]) -> None:
-        """Have as totals the sum of what others lend."""
-        assert self._relay is not None
-        assert self._alive is not None
-        for number, more in enumerate(found):
-            packed = self._alive.are_packed(more)
-            if number == 0 and not packed:
-                self._relay.fetch(self.totals, more)
-                continue
-            self._more.reserve(more.nbytes)
-            self._relay.fetch(self._more.buffer, more)
-            if packed:
-                self._alive.unpack(self._more.buffer, self.totals, add=number > 0)
-            else:
-                self._add_to_totals(self._more.buffer)
-
-    def _add_to_totals(self, more: cl.Buffer) -> None:
-        self._add.bind(totals=self.totals, more=more, count=2 * self.splats)
-        self._add.launch((-(-2 * self.splats // _GROUP) * _GROUP,), (_GROUP,))
-
-    def remove_marked(self) -> None:
-        marked = (self._marks or self._own).just_marked()  # type: ignore[union-attr]
-        # The others go on with it while the master's device does its own, and whoever tells them more waits for them.
-        self._shared.tell_marked(marked)
-        if self._own is not None:
-            self._own.remove_marked()
-        else:
-            assert self._marks is not None
-            self._marks.marked_by_device()
-            self._marks.settle()
-        if self._alive is not None:
-            self._alive.note()
-
-    def close(self) -> None:
-        if self._marks is not None:
-            self._marks.close()
-        if self._relay is not None:
-            self._relay.close()
-        if self._alive is not None:
-            self._alive.close()
-        if self._added is not None:
-            self._added.close()
-        self._more.close()
-        self._memory.close()

@@ -7,7 +7,6 @@ first sweep.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,28 +51,20 @@ class TileSchedule:
         stale[tiles] = 0 if self._options.tolerance >= 0 else np.inf
 
 
-@dataclass(frozen=True)
-class TileLists:
-    """Chosen tiles, set by set.
-
-    Attributes:
-        tiles: numbers of the tiles within their set.
-        starts, counts: where each set's part of ``tiles`` begins, and its length.
-    """
-
-    tiles: Indices
-    starts: list[int]
-    counts: list[int]
-
-
-def by_set(tiles: Indices, first_tiles: Sequence[int]) -> TileLists:
-    """Tiles that are numbered through all sets as lists of the sets.
+def by_set(tiles: Indices, firsts: Sequence[int]) -> tuple[NDArray[np.uint32], list[int]]:
+    """Tiles that are numbered through all sets as the list that sets are swept from.
 
     Args:
         tiles: their numbers, ascending.
-        first_tiles: of each set, ascending.
+        firsts: each set's first tile, ascending, and the end of the last one.
+
+    Returns:
+        (firsts[-1],) uint32, from each set's first tile on the numbers of its chosen tiles within it; and how many
+        these are, set by set.
     """
-    starts = np.append(np.searchsorted(tiles, first_tiles), len(tiles)).astype(np.int64)
+    starts = np.searchsorted(tiles, firsts)
     counts = np.diff(starts)
-    within = tiles - np.repeat(np.asarray(first_tiles, np.int64), counts)
-    return TileLists(within, starts[:-1].tolist(), counts.tolist())
+    listed = np.zeros(firsts[-1], np.uint32)
+    own = np.repeat(np.asarray(firsts[:-1], np.int64), counts)
+    listed[own + np.arange(len(tiles)) - np.repeat(starts[:-1], counts)] = tiles - own
+    return listed, counts.tolist()

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from enum import IntEnum
 
 import numpy as np
@@ -50,11 +49,11 @@ class Survivors(Owner):
     """
 
     def __init__(self, device: Device, splats: int, stride: int, wait: Callable[[], None]) -> None:
-        self._device = device
+        self.device = device
         self._splats = splats
         self._wait = wait
         self._states = np.full(stride, SplatState.ALIVE, np.uint8)
-        self._host_is_ahead = self._device_is_ahead = False
+        self._host_is_ahead = self.device_is_ahead = False
         self._memory = Memory(device)
         self.buffer = self._memory.upload(self._states, "the splats that are left")
 
@@ -81,52 +80,43 @@ class Survivors(Owner):
         """
         if self._host_is_ahead:
             self.settle()
-        with Memory(self._device) as memory:
+        with Memory(self.device) as memory:
             bits = memory.upload(splats, "the splats that go")
             self._launch("mark_bits", bits)
-            self._device.queue.finish()  # before the memory is given back
+            self.device.queue.finish()  # before the memory is given back
 
     def just_marked(self) -> Bits:
         """(N / 8, rounded up) uint8: the splats that are JUST_REMOVED on the device, a bit each, the lowest first."""
         nbytes = -(-self._splats // 8)
-        with Memory(self._device) as memory:
+        with Memory(self.device) as memory:
             bits = memory.allocate(nbytes, "the splats that go")
             self._launch("marked_bits", bits)
-            return self._device.download(bits, (nbytes,), np.uint8)
+            return self.device.download(bits, (nbytes,), np.uint8)
 
     def _launch(self, name: str, bits: cl.Buffer) -> None:
-        kernel = self._device.shared_kernel("prune/marks.cl", name)
+        kernel = self.device.shared_kernel("prune/marks.cl", name)
         kernel.bind(states=self.buffer, splats=self._splats, bits=bits)
         kernel.launch((-(-self._splats // (8 * _GROUP)) * _GROUP,), (_GROUP,))
 
     def marked_by_device(self) -> None:
         """Note that the device has changed states from ALIVE to JUST_REMOVED, and that the host does not know which."""
-        self._device_is_ahead = True
+        self.device_is_ahead = True
 
     def settle(self) -> None:
         """Make host and device agree on the splats that are left; none is JUST_REMOVED afterwards."""
         if self._host_is_ahead:
             self._host_is_ahead = False
             self._wait()
-        elif self._device_is_ahead:
-            self._device_is_ahead = False
-            self._states = self._device.download(self.buffer, self._states.shape, np.uint8)
+        elif self.device_is_ahead:
+            self.device_is_ahead = False
+            self._states = self.device.download(self.buffer, self._states.shape, np.uint8)
             self._states[self._states == SplatState.JUST_REMOVED] = SplatState.REMOVED
         else:
             return
         self._write(self._states)
 
-    @contextmanager
-    def none_removed(self) -> Iterator[None]:
-        """Inside the block, the device sees all splats as alive."""
-        self._write(np.full_like(self._states, SplatState.ALIVE))
-        try:
-            yield
-        finally:
-            self._write(self._states)
-
     def _write(self, states: NDArray[np.uint8]) -> None:
-        cl.enqueue_copy(self._device.queue, self.buffer, states, is_blocking=True)
+        cl.enqueue_copy(self.device.queue, self.buffer, states, is_blocking=True)
 
     def close(self) -> None:
         """Give the device's copy back."""

@@ -1,4 +1,4 @@
-"""Speed/accuracy trade-offs of a removal sweep, and the memory that it may take."""
+"""Speed/accuracy trade-offs of a removal sweep."""
 
 from __future__ import annotations
 
@@ -7,13 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from potr_cl.errors import UsageError
-from potr_cl.opencl.device import Device
 
 #: The least threshold: smaller transmittances lose digits in float32, and the sweep divides by them.
 _LEAST_THRESHOLD = 1e-30
-#: Part of the device's memory that the views may take unless the caller sets a budget. A CPU's is that of the host: the
-#: scene, its new colours and all other programs live there too.
-_SHARE, _SHARE_OF_HOST = 0.5, 0.3
 
 
 @dataclass(frozen=True)
@@ -25,7 +21,7 @@ class SweepOptions:
             0: whenever anything was removed from it; negative: always.
         turns: with n, a view is swept only in every n-th measurement after the first. Views that do not fit the memory
             budget are swept in each measurement.
-        memory: bytes of device memory that the views may take; None: :func:`default_memory`.
+        memory: bytes of device memory that the views may take; None: :func:`potr_cl.views.budget.default_memory`.
         transmittance_threshold: a pixel ends before its transmittance falls below this; None: where the rasterizer's
             rules end it. When a removal lets a pixel go on one splat longer, its colour jumps by up to the hundredfold
             of this.
@@ -56,9 +52,3 @@ class SweepOptions:
     def only_by_tolerance(self) -> bool:
         """Whether a tile's staleness alone decides when it is swept again: no turns."""
         return self.turns == 1
-
-
-def default_memory(device: Device) -> int:
-    """Bytes that the views may take: half of a GPU's memory, 0.3 of a CPU's, which is the host's memory."""
-    of_host = device.info.kind == "cpu" or device.info.integrated
-    return int(device.info.memory * (_SHARE_OF_HOST if of_host else _SHARE))

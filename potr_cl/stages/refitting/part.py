@@ -16,12 +16,11 @@ from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory
 from potr_cl.opencl.narrow import Narrowed
 from potr_cl.opencl.relay import Lent
-from potr_cl.raster.culling import Sights
+from potr_cl.raster.carried import Excerpt
 from potr_cl.raster.kept_scene import KeptScene, lying_on, whole_on_device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import RasterRules
 from potr_cl.raster.scene_buffers import SceneBuffers, stride_of
-from potr_cl.raster.view_shares import Excerpt
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.coming_scene import AnyScene, arrived, colourless
@@ -33,6 +32,7 @@ from potr_cl.stages.refitting.sparse_vector import SentVector, SparseVectors
 from potr_cl.stages.refitting.targets import RenderedTargets, Targets
 from potr_cl.stages.refitting.vector_space import Layout
 from potr_cl.stages.refitting.visible_targets import VisibleTargets
+from potr_cl.views.visibility import Visibility
 from potr_cl.workers.pool import Part
 
 
@@ -93,7 +93,7 @@ class ColourPart(Part):
         source: Scene | KeptScene | PicturesAhead | Excerpt,
         cameras: Sequence[Camera],
         numbers: Sequence[int],
-        sights: Sights | None = None,
+        sights: Visibility | None = None,
     ) -> None:
         self._device = device
         with ExitStack() as owned:

@@ -14,13 +14,13 @@ from potr_cl.host.threads import in_background
 from potr_cl.model.camera import Camera
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
-from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.stages.refitting.targets import RenderedTargets, Targets
 from potr_cl.stages.refitting.targets import nbytes as bytes_of
 from potr_cl.stages.refitting.visible_targets import VisibleTargets
+from potr_cl.views.visibility import Visibility
 
 #: They take no more than this part of a device's memory: for a moment they lie there twice.
 _PART = 1 / 16
@@ -48,7 +48,7 @@ class PicturesAhead(Owner):
         background: tuple[float, float, float],
         cameras: Sequence[Camera],
         numbers: Mapping[Device, Sequence[int]],
-        sights: Sights | None = None,
+        sights: Visibility | None = None,
     ) -> None:
         self.source = source
         self._begun: dict[Device, Future[_Pictures | None]] = {
@@ -139,7 +139,7 @@ def _rendered(
     background: tuple[float, float, float],
     cameras: Sequence[Camera],
     numbers: Sequence[int],
-    sights: Sights | None,
+    sights: Visibility | None,
 ) -> _Pictures | None:
     """Some views' pictures on a device; None: it has not much room, or the scene does not lie there."""
     if sum(bytes_of(cameras[number]) for number in numbers) > _PART * device.info.memory:

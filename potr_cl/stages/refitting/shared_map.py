@@ -17,10 +17,8 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.memory import Owner
 from potr_cl.opencl.narrow import Narrowed
 from potr_cl.opencl.relay import Lent
-from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rules import RasterRules
-from potr_cl.raster.view_shares import ViewShares
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.colour_map import parts_of
 from potr_cl.stages.refitting.coming_scene import AnyScene, arrived
@@ -29,6 +27,8 @@ from potr_cl.stages.refitting.packing import Packing
 from potr_cl.stages.refitting.part import ColourPart, Gradient, unpacked
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.stages.refitting.sparse_vector import SentVector, SparseVectors
+from potr_cl.views.shares import ViewShares
+from potr_cl.views.visibility import Visibility
 from potr_cl.workers.dealing import Shares, shares
 from potr_cl.workers.parts import Each, Parts, Pending
 from potr_cl.workers.pool import Pool, Shared
@@ -190,7 +190,7 @@ def colour_parts(
         scene = replace(here, sh=np.ascontiguousarray(here.sh[:, :1]))
     with ExitStack() as stack:
         shape = stack.enter_context(pool.shared(scene))
-        pictured: list[tuple[Shared, Sights | None]]
+        pictured: list[tuple[Shared, Visibility | None]]
         if isinstance(source, ViewShares):
             pictured = [(stack.enter_context(pool.shared(each.excerpt)), each.sights) for each in source.shares]
         else:

@@ -9,15 +9,15 @@ import pyopencl as cl
 
 from potr_cl.model.camera import Camera
 from potr_cl.opencl.memory import Memory, Owner
-from potr_cl.raster.culling import Sights
 from potr_cl.raster.scene_buffers import SceneBuffers
-from potr_cl.raster.seen_rasterizer import SeenRasterizer
+from potr_cl.views.pictures import SeenRasterizer
+from potr_cl.views.visibility import Visibility
 
 
 class VisibleTargets(Owner):
     """What :class:`potr_cl.stages.refitting.targets.RenderedTargets` is, for a scene of which no view sees much.
 
-    The pictures are the same bits, see :class:`potr_cl.raster.seen_rasterizer.SeenRasterizer`.
+    The pictures are the same bits, see :class:`potr_cl.views.pictures.SeenRasterizer`.
 
     Args:
         whole: the scene, on a GPU; it stays the caller's.
@@ -30,7 +30,7 @@ class VisibleTargets(Owner):
     """
 
     def __init__(
-        self, whole: SceneBuffers, cameras: Sequence[Camera], sights: Sights, background: tuple[float, float, float]
+        self, whole: SceneBuffers, cameras: Sequence[Camera], sights: Visibility, background: tuple[float, float, float]
     ) -> None:
         self._cameras = list(cameras)
         with ExitStack() as owned:

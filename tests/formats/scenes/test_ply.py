@@ -440,7 +440,7 @@ def test_made_up_headers(tokens: list[bytes], body: bytes, tmp_path_factory: pyt
 @pytest.mark.slow
 @warnings_are_errors
 @given(draw=st.data())
-@settings(max_examples=5_000, deadline=None)
+@settings(max_examples=1_500, deadline=None)
 def test_many_mutated_files(
     draw: st.DataObject, fuzz_seeds: list[bytes], tmp_path_factory: pytest.TempPathFactory
 ) -> None:

@@ -1,4 +1,9 @@
-"""Views in parts that see much of the same of a scene: :func:`parts_of_views`. Pure NumPy."""
+"""What views may draw of a scene (:class:`Visibility`), and whether it pays to ask. Pure NumPy.
+
+Splats lie in groups, and a view may draw a group if it reaches into the picture: too many rather than too few. One
+question has one threshold here, whoever asks it: how large must a scene be (:data:`LEAST_SPLATS`), and how little of it
+must a view see (:data:`MOST_SEEN`), for a view to be looked at with what it may draw rather than with the whole scene.
+"""
 
 from __future__ import annotations
 
@@ -14,29 +19,23 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.morton import morton_order
 from potr_cl.model.scene import Scene
 from potr_cl.model.splat_groups import Indices, SplatGroups
+from potr_cl.raster.rules import INRIA
+from potr_cl.views.groups import ViewGroup
 
-#: A part's views see so many times as many splats together as three quarters of the views each at most, or this part of
-#: the scene. The others, which see more alone, are one part.
+#: A cluster's views see so many times as many splats together as three quarters of the views each at most, or this part
+#: of the scene. The others, which see more alone, are one cluster.
 _SPREAD, _QUANTILE, _LEAST_PART = 1.25, 0.75, 1 / 16
+#: A device projects a smaller scene whole, in less time than the host takes to find its groups and what views may draw.
+LEAST_SPLATS = 1 << 21
+#: Where a view sees more than this part of the scene, its own splats, copied or named by their numbers, take about as
+#: much memory and time as all.
+MOST_SEEN = 1 / 2
 #: Few of the splats, one in so many, and so many views tell about which part of a scene views see.
 _SAMPLED, _VIEWS = 64, 48
 
 
 @dataclass(frozen=True)
-class ViewPart:
-    """Some views and what they may draw.
-
-    Attributes:
-        numbers: of the views, ascending.
-        splats: their numbers in the scene, ascending.
-    """
-
-    numbers: list[int]
-    splats: Indices
-
-
-@dataclass(frozen=True)
-class Sights:
+class Visibility:
     """What views may draw of a scene.
 
     Attributes:
@@ -49,8 +48,12 @@ class Sights:
 
     @staticmethod
     def of(
-        scene: Scene, cameras: Sequence[Camera], near: float, groups: SplatGroups | None = None, run: Run = map
-    ) -> Sights:
+        scene: Scene,
+        cameras: Sequence[Camera],
+        near: float = INRIA.near,
+        groups: SplatGroups | None = None,
+        run: Run = map,
+    ) -> Visibility:
         """What some views may draw.
 
         Args:
@@ -61,9 +64,9 @@ class Sights:
             run: shares the work out.
         """
         groups = groups or SplatGroups.of(scene, run=run)
-        return Sights(groups, groups.visible_by(cameras, near, run))
+        return Visibility(groups, groups.visible_by(cameras, near, run))
 
-    def lasting(self) -> Sights:
+    def lasting(self) -> Visibility:
         """The same without the groups' order, four bytes a splat, which nobody asks for but who shares groups out."""
         return replace(self, groups=replace(self.groups, order=self.groups.order[:0].copy()))
 
@@ -109,7 +112,7 @@ class Sights:
             dealt.append(sorted(own))
         return dealt
 
-    def of_views(self, numbers: Sequence[int]) -> tuple[Indices, Sights]:
+    def of_views(self, numbers: Sequence[int]) -> tuple[Indices, Visibility]:
         """What some views may draw, as a scene of its own.
 
         Returns:
@@ -117,9 +120,9 @@ class Sights:
         """
         own = self._seen_by(numbers)
         splats, groups = self.groups.only(own)
-        return splats, Sights(groups, self.seen[:, own])
+        return splats, Visibility(groups, self.seen[:, own])
 
-    def parts(self, numbers: Sequence[int] | None = None) -> list[ViewPart]:
+    def clusters(self, numbers: Sequence[int] | None = None) -> list[ViewGroup]:
         """All views, dealt out to parts that see much of the same, so that the splats of all parts are few.
 
         Args:
@@ -143,7 +146,11 @@ class Sights:
                 dealt.append([number])
                 together = seen[number]
         dealt.append(order[totals[order] > most].tolist())
-        return [ViewPart(sorted(own), groups.splats(self._seen_by(own))) for own in dealt if own]
+        return [self._cluster(sorted(own)) for own in dealt if own]
+
+    def _cluster(self, numbers: Sequence[int]) -> ViewGroup:
+        splats = self.groups.splats(self._seen_by(numbers))
+        return ViewGroup(tuple(numbers), len(splats), among=splats)
 
     def _seen_by(self, numbers: Sequence[int]) -> NDArray[np.bool_]:
         """(G,) the groups that some views see together, at least one: a scene has splats."""
@@ -153,18 +160,8 @@ class Sights:
         return seen
 
 
-def parts_of_views(scene: Scene, cameras: Sequence[Camera], near: float) -> list[ViewPart]:
-    """The :meth:`Sights.parts` of some views of a scene, with :meth:`Sights.of`'s arguments."""
-    return Sights.of(scene, cameras, near).parts()
-
-
-def work(parts: Sequence[ViewPart]) -> int:
-    """Splats that all views project, each those of its part."""
-    return sum(len(part.numbers) * len(part.splats) for part in parts)
-
-
-def part_seen(scene: Scene, cameras: Sequence[Camera], near: float) -> float:
-    """Which part of a scene a view may draw on the average, told from few of both; 1 where there is no view.
+def seen_part(scene: Scene, cameras: Sequence[Camera], near: float = INRIA.near) -> float:
+    """Which part of a scene a view may draw on the average, told from few of both; 1 for a small scene.
 
     The boxes of few splats are smaller, so views seem to see a little less than they do.
 
@@ -173,9 +170,31 @@ def part_seen(scene: Scene, cameras: Sequence[Camera], near: float) -> float:
         cameras: the views.
         near: as in the rasterizer's rules.
     """
-    if not cameras:
+    if len(scene) < LEAST_SPLATS or not cameras:
         return 1.0
     some = [cameras[number] for number in range(0, len(cameras), -(-len(cameras) // _VIEWS))]
     few = scene.uncoloured().subset(np.arange(0, len(scene), _SAMPLED))
     groups = SplatGroups.of(few, max(splat_groups.LARGEST // _SAMPLED, 1))
     return float((groups.visible_by(some, near) @ groups.counts).mean() / len(few))
+
+
+def groups_of_large(scene: Scene, run: Run = map) -> SplatGroups | None:
+    """The groups of a scene's splats, if it is so large that they are worth their time; ``run`` shares the work out."""
+    return SplatGroups.of(scene, run=run) if len(scene) >= LEAST_SPLATS else None
+
+
+def visibility_of_large(
+    scene: Scene, cameras: Sequence[Camera], groups: SplatGroups | None = None, run: Run = map
+) -> Visibility | None:
+    """What the views may draw; None where they had better share one scene.
+
+    Args:
+        scene: clean.
+        cameras: the views.
+        groups: of the scene, where they are known.
+        run: shares the work out.
+    """
+    if len(scene) < LEAST_SPLATS or not cameras:
+        return None
+    visibility = Visibility.of(scene, cameras, INRIA.near, groups, run)
+    return visibility if visibility.totals.sum() <= MOST_SEEN * len(scene) * len(cameras) else None

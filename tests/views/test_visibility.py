@@ -11,9 +11,10 @@ from potr_cl.model import splat_groups
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.model.splat_groups import SplatGroups
-from potr_cl.raster.culling import part_seen, parts_of_views, work
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import GSPLAT, INRIA, RasterRules
+from potr_cl.views import visibility
+from potr_cl.views.visibility import Visibility, seen_part, work
 from tests.devices import FAMILIES, open_device
 from tests.reference.captures import looking
 from tests.reference.scenes import random_scene
@@ -91,6 +92,7 @@ def test_far_from_the_origin(device):
         assert np.isin(splats, groups.splats(groups.visible(camera, INRIA.near))).all()
 
 
+@pytest.mark.slow
 def test_a_real_scene(device, plush_excerpt, plush_excerpt_cameras):
     groups = SplatGroups.of(plush_excerpt, 16)
     close = [dataclasses.replace(c, fx=4 * c.fx, fy=4 * c.fy) for c in plush_excerpt_cameras]
@@ -115,7 +117,7 @@ def test_parts_have_all_views_and_what_they_see(monkeypatch):
     monkeypatch.setattr(splat_groups, "LARGEST", 64)
     cameras = wide_and_narrow(scene, 40, 7, (0.05, 0.1))
     groups = SplatGroups.of(scene)
-    parts = parts_of_views(scene, cameras, INRIA.near)
+    parts = Visibility.of(scene, cameras).clusters()
     assert sorted(number for part in parts for number in part.numbers) == list(range(40))
     for part in parts:
         assert part.numbers == sorted(part.numbers)
@@ -126,11 +128,12 @@ def test_parts_have_all_views_and_what_they_see(monkeypatch):
     assert work(parts) < len(scene) * len(cameras)
 
 
-def test_what_views_see_is_told_from_few_splats():
+def test_what_views_see_is_told_from_few_splats(monkeypatch):
     """About as much as they do; and nothing is left out where no view says so."""
+    monkeypatch.setattr(visibility, "LEAST_SPLATS", 1)
     scene = clusters(6)
     cameras = wide_and_narrow(scene, 12, 7, (0.05, 1.0))
     groups = SplatGroups.of(scene, 1)
     seen = groups.visible_by(cameras, INRIA.near).mean()
-    assert part_seen(scene, cameras, INRIA.near) == pytest.approx(seen, rel=0.3)
-    assert part_seen(scene, [], INRIA.near) == 1
+    assert seen_part(scene, cameras, INRIA.near) == pytest.approx(seen, rel=0.3)
+    assert seen_part(scene, [], INRIA.near) == 1

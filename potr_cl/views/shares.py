@@ -6,42 +6,14 @@ the others keep their order.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.model.splat_groups import Indices
-from potr_cl.raster.culling import Sights
-
-
-@dataclass(frozen=True)
-class Excerpt:
-    """Some splats of a scene. They are gathered on their way to another process, where they arrive as a scene.
-
-    Attributes:
-        scene: the scene.
-        splats: (n,) int64, their numbers there, ascending.
-    """
-
-    scene: Scene
-    splats: Indices
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of these splats."""
-        return self.scene.nbytes * len(self.splats) // max(len(self.scene), 1)
-
-    def gathered(self) -> Scene:
-        """A scene of them."""
-        return self.scene.subset(self.splats)
-
-    def __reduce__(self) -> tuple[Callable[[Scene], Scene], tuple[Scene]]:
-        return _as_it_is, (self.gathered(),)
-
-
-def _as_it_is(scene: Scene) -> Scene:
-    return scene
+from potr_cl.raster.carried import Excerpt
+from potr_cl.views.visibility import Visibility
 
 
 @dataclass(frozen=True)
@@ -58,7 +30,7 @@ class ViewShare:
     numbers: list[int]
     splats: Indices
     excerpt: Excerpt
-    sights: Sights
+    sights: Visibility
 
 
 @dataclass(frozen=True)
@@ -78,7 +50,7 @@ class ViewShares:
     @staticmethod
     def of(
         views: Sequence[Camera],
-        sights: Sights,
+        sights: Visibility,
         speeds: Sequence[float],
         source: Scene,
         numbers: Indices,

@@ -16,16 +16,14 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.model.splat_groups import SplatGroups
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner, Reused
-from potr_cl.raster.culling import part_seen
 from potr_cl.raster.kept_scene import fits_whole, whole_on_device
 from potr_cl.raster.picked_splats import NO_SPLAT, PickedSplats, Picker, Picks
 from potr_cl.raster.preparing_memory import PreparingMemory
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.raster.scene_buffers import SPLAT_GROUP, Drawable, SceneBuffers, gathered
+from potr_cl.views import visibility
 
-#: Smaller scenes are projected whole before their groups are found, and so are scenes of which a view sees more.
-_LEAST_SPLATS, _MOST_SEEN = 1 << 21, 1 / 2
 #: To find the groups takes about as long as a GPU takes to project the whole scene into so many views.
 _VIEWS = 48
 #: On a CPU it takes longer to gather a view's splats than to project all, but less memory: so it is done where the
@@ -262,12 +260,12 @@ def groups_worth_it(
         large: whether it takes too much of the device's memory, or of what a user allows, to be there.
         known: its groups, where somebody has found that views see little of it.
     """
-    if device.info.kind == "cpu" or device.info.integrated:
+    if device.info.shares_host_memory:
         if there or not (large or scene.nbytes > _PART * device.info.memory):
             return None
     elif known is None and len(cameras) < _VIEWS and (there or fits_whole(device, scene)):
         return None
-    if known is not None or len(scene) < _LEAST_SPLATS or part_seen(scene, cameras, near) > _MOST_SEEN:
+    if known is not None or visibility.seen_part(scene, cameras, near) > visibility.MOST_SEEN:
         return known
     with thread_pool() as pool:
         return SplatGroups.of(scene, run=pool.map)

@@ -1,0 +1,207 @@
+"""Sweeps of the resident views: a tile in which little has changed since its last sweep keeps its sums.
+
+The totals hold what each tile added at its last sweep; sweeping a tile again replaces its part exactly, because all
+sums are integers. GPU kernels list the tiles to sweep themselves, right after a removal, and the host learns only how
+many they are; for CPU kernels, and where views take turns, the host chooses when it comes to the sweep
+(:class:`~potr_cl.stages.pruning.staleness.TileSchedule`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+
+from potr_cl.opencl.memory import Memory, Owner
+from potr_cl.stages.pruning.fixed_point import FixedPoint
+from potr_cl.stages.pruning.launcher import SetKernels, SweepLauncher, launcher_for, launchers
+from potr_cl.stages.pruning.ledger import Ledger
+from potr_cl.stages.pruning.prepared_set import PreparedSet
+from potr_cl.stages.pruning.queues import Queues
+from potr_cl.stages.pruning.staleness import TileSchedule, by_set
+from potr_cl.stages.pruning.survivors import Survivors
+from potr_cl.stages.pruning.sweep_buffers import SweepBuffers
+from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.views.engine import ViewEngine
+
+
+class ResidentSweep(Owner):
+    """Keeps the resident views' part of all totals up to date.
+
+    Args:
+        engine: of the views.
+        ledgers: of each resident set.
+        survivors: the splats that are left.
+        queues: on which sets are swept beside each other.
+        options: which tiles are swept again. fixed_point: the totals' units.
+
+    Attributes:
+        device_lists: whether kernels list the tiles.
+        tiles_swept: so far.
+    """
+
+    def __init__(
+        self,
+        engine: ViewEngine[PreparedSet],
+        ledgers: Sequence[Ledger],
+        survivors: Survivors,
+        queues: Queues,
+        options: SweepOptions,
+        fixed_point: FixedPoint,
+    ) -> None:
+        self._engine, self._ledgers, self._survivors = engine, ledgers, survivors
+        self._queues, self._options, self._device = queues, options, engine.device
+        self._sets = sets = engine.resident
+        self.device_lists = launchers(self._device).lists_tiles and options.only_by_tolerance
+        self.tiles_swept = self._measurements = 0
+        self._firsts = np.cumsum([0, *(ready.views.tiles for ready in sets)]).tolist()
+        self._counts: list[int] | None = None  # listed tiles of each set; None: the host has yet to choose
+        self._targets_known = False
+        tiles = [
+            (number, view.tiles)
+            for ready in sets
+            for number, view in zip(ready.numbers, ready.views.views, strict=True)
+        ]  # fmt: skip
+        self._schedule = TileSchedule(options, tiles)
+        self._kernels: list[SetKernels] = []
+        self._memory = memory = Memory(self._device)
+        if sets:
+            with self._device.all_or_nothing():
+                self._tiles = memory.allocate(4 * self._firsts[-1], "the tiles to sweep")
+                self._stale = memory.allocate(4 * self._firsts[-1], "the tiles' staleness")
+                self._listed = memory.allocate(4 * len(sets), "the numbers of tiles to sweep")
+                launcher: SweepLauncher | None = None
+                for place, (ready, ledger) in enumerate(zip(sets, ledgers, strict=True)):
+                    if launcher is None or ready.subset is not sets[place - 1].subset:
+                        launcher = launcher_for(ready.subset.rasterizer, options, fixed_point)
+                    ready.work.first_tile = self._firsts[place]
+                    buffers = SweepBuffers(
+                        ledger.marks, self._tiles, self._stale, self._listed, ledger.totals, ledger.numbers
+                    )
+                    bound = launcher.bind(ready.work, ready.geometry, buffers, first_time=True, place=place)
+                    self._kernels.append(bound)
+            self.list_everything()
+
+    def sweep(self) -> None:
+        """Measure the tiles that are listed."""
+        if self._counts is None:
+            self._survivors.settle()
+            self._take_marks()
+            self._choose(self._schedule.choose(self._measurements, self._staleness()))
+        self._measurements += 1
+        self._sweep_listed()
+
+    def sweep_changed(self) -> None:
+        """Measure every tile that has lost anything since its last sweep."""
+        if self.device_lists:
+            self.note_removal(0.0)
+        else:
+            self._settle()
+            self._choose(self._schedule.changed(self._staleness()))
+        self._sweep_listed()
+
+    def prepare_removal(self) -> None:
+        """To be called before splats are marked as removed by the host."""
+        if not self.device_lists:
+            self._settle()
+
+    def note_removal(self, tolerance: float | None = None) -> None:
+        """Find out how much each tile has lost of what was marked as JUST_REMOVED.
+
+        Args:
+            tolerance: list the tiles that are staler than this; None: as the options say.
+        """
+        if not self._sets:
+            return
+        if not self.device_lists:
+            self._take_marks()
+            for kernels, queue in self._queues.dealt(self._kernels):
+                kernels.note_removal(queue)
+            self._counts = None
+            return
+        self._sweep_listed()
+        above = self._options.tolerance if tolerance is None else tolerance
+        self._device.fill(self._listed, np.uint32(0))
+        for kernels, queue in self._queues.dealt(self._kernels):
+            kernels.note_removal(queue, list_above=above)
+        self._queues.wait()
+        self._counts = self._device.download(self._listed, (len(self._sets),), np.uint32).tolist()
+
+    def list_everything(self) -> None:
+        """Have the next measurement sweep every tile."""
+        if not self._sets:
+            return
+        self._settle()
+        counts = [ready.views.tiles for ready in self._sets]
+        if self.device_lists:
+            self._write(self._tiles, np.concatenate([np.arange(count, dtype=np.uint32) for count in counts]))
+            self._counts = counts
+        self._device.fill(self._stale, np.float32(0 if self.device_lists else np.inf))
+
+    def project_again(self) -> None:
+        """Have all sets show the colours that the source has by now."""
+        self._settle()
+        for ready in self._sets:
+            source = self._engine.source
+            source.recolour(ready.subset)
+            if not ready.shares:
+                source.project(ready.subset, ready.views)
+                if self._engine.plan.copies_rest:
+                    source.rest(ready.subset)
+        self._engine.source.forget_scratch()
+
+    # ---------------------------------------------------------------------------------------------------------------
+
+    def _settle(self) -> None:
+        """Sweep what the device has listed, and have host and device agree on the splats that are left."""
+        if self._counts is not None and self._targets_known:
+            self._sweep_listed()
+        self._survivors.settle()
+        self._take_marks()
+
+    def _take_marks(self) -> None:
+        for ledger in self._ledgers:
+            ledger.take_marks()
+
+    def _staleness(self) -> NDArray[np.float32]:
+        if not self._sets:
+            return np.zeros(0, np.float32)
+        return self._device.download(self._stale, (self._firsts[-1],), np.float32)
+
+    def _choose(self, tiles: NDArray[np.int64]) -> None:
+        """List tiles of all sets, numbered through, ascending."""
+        listed, self._counts = by_set(tiles, self._firsts)
+        if len(tiles):
+            self._write(self._tiles, listed)
+            stale = self._staleness()
+            self._schedule.note_swept(stale, tiles)
+            self._write(self._stale, stale)
+
+    def _write(self, buffer: cl.Buffer, values: NDArray[Any]) -> None:
+        with self._device.errors("failed while computing"):
+            cl.enqueue_copy(self._device.queue, buffer, values, is_blocking=True)
+
+    def _sweep_listed(self) -> None:
+        counts, self._counts = self._counts or [], [0] * len(self._sets) if self.device_lists else None
+        work = [(count, place) for place, count in enumerate(counts) if count]
+        if work:
+            # The longest first, so that nothing long begins at the end.
+            work.sort(key=lambda each: -each[0])
+            for (count, place), queue in self._queues.dealt(work):
+                self._engine.project(self._sets[place])
+                self._kernels[place].sweep(self._firsts[place], count, queue)
+            self.tiles_swept += sum(counts)
+            self._queues.wait()
+            for ready in self._sets:
+                if ready.shares and self._engine.plan.copies_rest:
+                    self._engine.source.rest(ready.subset)
+        if not self._targets_known and self._measurements:
+            for kernels in self._kernels:
+                kernels.target_is_known()
+            self._targets_known = True
+
+    def close(self) -> None:
+        self._memory.close()

@@ -1,0 +1,194 @@
+"""Sweeps of the streamed views: prepared, swept and forgotten, whenever they are measured: :class:`StreamedSweep`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from typing import TypeAlias
+
+import numpy as np
+import pyopencl as cl
+
+from potr_cl.errors import DeviceMemoryError
+from potr_cl.host import mapped
+from potr_cl.model.scene import FloatArray
+from potr_cl.opencl.memory import Memory, Owner, Scratch
+from potr_cl.stages.pruning.fixed_point import FixedPoint
+from potr_cl.stages.pruning.launcher import SetKernels, SweepLauncher, launcher_for
+from potr_cl.stages.pruning.ledger import Ledger, shared_kernel
+from potr_cl.stages.pruning.prepared_set import PreparedSet
+from potr_cl.stages.pruning.survivors import SplatState, Survivors
+from potr_cl.stages.pruning.sweep_buffers import SweepBuffers
+from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.views.budget import target_bytes
+from potr_cl.views.engine import Ready, ViewEngine
+from potr_cl.views.groups import ViewGroup
+from potr_cl.views.subsets import Left, Subset
+
+#: Splats that a work-group of the kernel `lost` looks at, and its work-items.
+_LOST_CHUNK, _GROUP = 4096, 64
+
+_Set: TypeAlias = "tuple[int, ...]"
+
+
+class StreamedSweep(Owner):
+    """Measures the views of which nothing stays but the pictures that they are compared with.
+
+    Args:
+        engine: of the views.
+        survivors: the splats that are left.
+        options, fixed_point: of the sweeps.
+
+    Attributes:
+        totals: (N, 2) int64, their part of the totals.
+        tiles_swept: so far.
+    """
+
+    def __init__(
+        self, engine: ViewEngine[PreparedSet], survivors: Survivors, options: SweepOptions, fixed_point: FixedPoint
+    ) -> None:
+        self._engine, self._survivors, self._options, self._fixed_point = engine, survivors, options, fixed_point
+        self._device = device = engine.device
+        self.tiles_swept = 0
+        #: Whether the totals are right but for what was removed since.
+        self._known = False
+        self._on_host: dict[_Set, FloatArray] = {}
+        self._on_device: dict[_Set, cl.Buffer] = {}
+        #: Whether all have been measured, so that pictures are compared with.
+        self._measured = False
+        self._single = {number: group for group in engine.plan.groups for number in group.numbers}
+        self._memory = Memory(device)
+        self._scratch = [Scratch(device, what) for what in ("tiles", "staleness", "effects", "counters")]
+        self._tiles, self._stale, self._unwanted, self._listed = self._scratch
+        if engine.streamed:
+            with device.all_or_nothing():
+                self.totals = self._memory.allocate(16 * engine.source.stride, "the effects in streamed views")
+                self._words_lost = self._memory.allocate(8, "the importance that has gone")
+            self._make_room_for_targets()
+
+    def _make_room_for_targets(self) -> None:
+        """Pictures stay on the device while there is room; the others go to the host."""
+        room = self._engine.plan.budget.of_pictures(self._engine.streamed)
+        for group in self._engine.streamed:
+            for numbers in self._engine.sets(group):
+                nbytes = sum(target_bytes(self._engine.cameras[number]) for number in numbers)
+                if nbytes <= room:
+                    with suppress(DeviceMemoryError):
+                        self._on_device[numbers] = self._memory.allocate(nbytes, "the target images")
+                        room -= nbytes
+
+    @property
+    def numbers(self) -> dict[int, ViewGroup]:
+        """The group of each view."""
+        return {number: group for group in self._engine.streamed for number in group.numbers}
+
+    def forget(self) -> None:
+        """Have the next measurement measure all of them."""
+        self._known = False
+
+    def are_stale(self) -> bool:
+        """Whether they have lost more than they may since they were measured: a part of their area, on average."""
+        views = len(self.numbers)
+        limit = self._engine.plan.patience * self._options.tolerance
+        if not self._known or limit <= 0:
+            return bool(views)
+        device, splats, words = self._device, self._engine.source.splats, self._words_lost
+        device.fill(words, np.int64(0))
+        lost = shared_kernel(device, "lost")
+        lost.bind(states=self._survivors.buffer, totals=self.totals, splats=splats, importance=words)
+        lost.launch((-(-splats // _LOST_CHUNK) * _GROUP,), (_GROUP,))
+        importance = int(device.download(words, (1,), np.int64)[0])
+        part = views / len(self._engine.cameras)
+        return importance * self._fixed_point.units[1] / part > limit
+
+    def measure(self) -> None:
+        """Bring their totals up to date."""
+        engine = self._engine
+        self._device.fill(self.totals, np.uint32(0))
+        for group in engine.streamed:
+            sets = engine.sets(group)
+            with engine.stream(group, self._left) as subset:
+                if subset is None:
+                    continue
+                with Ledger(self._survivors, self.totals, subset) as ledger:
+                    for numbers in sets:
+                        with engine.prepared(numbers, subset, self._on_device.get(numbers)) as ready:
+                            self._measure(ready, ledger)
+                            self.tiles_swept += ready.views.tiles
+                    ledger.add_to(self.totals)
+                    self._finish()
+        engine.source.forget_scratch()
+        self._known = self._measured = True
+
+    def _measure(self, ready: Ready[PreparedSet], ledger: Ledger) -> None:
+        numbers, target = tuple(ready.numbers), ready.work.target
+        if numbers in self._on_host:
+            with self._device.errors("cannot hold the target images"):
+                cl.enqueue_copy(self._device.queue, target, self._on_host[numbers], is_blocking=True)
+        buffers = self._buffers(ready, ledger)
+        kernels = self._launcher(ready).bind(ready.work, ready.geometry, buffers, first_time=not self._measured)
+        self._sweep(kernels, ready)
+        if not self._measured and numbers not in self._on_device:
+            kept = mapped.array((ready.views.pixels, 3), np.float32, "target pictures")
+            with self._device.errors("failed while computing"):
+                cl.enqueue_copy(self._device.queue, kept, target, is_blocking=True)
+            self._on_host[numbers] = kept
+
+    def _sweep(self, kernels: SetKernels, ready: Ready[PreparedSet]) -> None:
+        if self._engine.source.selects:
+            kernels.sweep(0, ready.views.tiles)
+        else:
+            kernels.sweep_all()
+        self._finish()
+
+    @contextmanager
+    def swept(self, number: int) -> Iterator[tuple[Subset, PreparedSet] | None]:
+        """One view and its sums, with the splats that are left, inside the block; None: it shows none of them."""
+        group = replace(self._single[number], numbers=(number,))
+        with self._engine.stream(group, self._left) as subset:
+            if subset is None:
+                yield None
+                return
+            with (
+                Ledger(self._survivors, self.totals, subset) as ledger,
+                self._engine.prepared((number,), subset) as ready,
+            ):
+                buffers = self._buffers(ready, ledger, wanted=False)
+                kernels = self._launcher(ready).bind(ready.work, ready.geometry, buffers, first_time=True)
+                self._sweep(kernels, ready)
+                yield subset, ready.work
+
+    @property
+    def _left(self) -> Left:
+        mask = self._survivors.alive if self._engine.source.copies else None
+        return Left(self._survivors.buffer, SplatState.ALIVE, mask)
+
+    def _launcher(self, ready: Ready[PreparedSet]) -> SweepLauncher:
+        return launcher_for(ready.subset.rasterizer, self._options, self._fixed_point)
+
+    def _buffers(self, ready: Ready[PreparedSet], ledger: Ledger, wanted: bool = True) -> SweepBuffers:
+        """What the kernels of a set work on; not ``wanted``: its effects go nowhere."""
+        tiles = ready.views.tiles
+        self._stale.reserve(4 * tiles)
+        self._listed.reserve(4)
+        if self._tiles.reserve(4 * tiles):  # all of them: nobody writes to it
+            with self._device.errors("failed while computing"):
+                everything = np.arange(tiles, dtype=np.uint32)
+                cl.enqueue_copy(self._device.queue, self._tiles.buffer, everything, is_blocking=True)
+        totals, numbers = ledger.totals, ledger.numbers
+        if not wanted:
+            self._unwanted.reserve(16 * ready.subset.rasterizer.stride)
+            totals = self._unwanted.buffer
+            if self._engine.source.selects:
+                numbers = None
+        shared = (self._tiles.buffer, self._stale.buffer, self._listed.buffer)
+        return SweepBuffers(ledger.marks, *shared, totals, numbers)
+
+    def _finish(self) -> None:
+        with self._device.errors("failed while computing"):
+            self._device.queue.finish()
+
+    def close(self) -> None:
+        for owner in (*self._scratch, self._memory):
+            owner.close()

@@ -1,0 +1,21 @@
+"""Views, each with some splats, resident or made again: the heart of the stages that look at views.
+
+Follow it in this order:
+
+1. visibility.py: what views may draw of a scene, and whether that pays. Pure NumPy.
+2. groups.py and plan.py: views that are looked at with the same splats, and the four ways to group all views. A plan
+   is data: to look at views in another way, write another function there.
+3. budget.py: how much memory there is, and which groups of a plan stay on the device. *Who decides what is resident?*
+4. subsets.py: where a group's splats come from: all, named by numbers, or copied.
+5. engine.py: brings the groups of a plan in; keeps those that fit, and streams the others. *What happens to a view that
+   does not fit?*
+
+A stage is a *use*: it says what it makes of a set of prepared views, and adds up exact integers by the splats' numbers
+in the scene, so that plans, devices and computers give the same bits. Pruning is one (stages/pruning/removal.py).
+Others come onto it like this. A fit or a re-fit gives :class:`~potr_cl.views.engine.ViewEngine` an ``attach`` that
+takes a set's own buffers, binds its kernels for ``engine.resident``, and walks ``engine.streamed`` by
+``engine.stream(group, None)`` and ``engine.prepared(numbers, subset)``. Judging makes its pictures in the same walk
+with a plan of which nothing stays. Several devices make a plan each, of the numbers of their own views.
+
+shares.py deals views and splats out to computers. pictures.py renders large scenes.
+"""

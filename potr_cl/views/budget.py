@@ -1,0 +1,163 @@
+"""Who decides what stays on the device: the memory that views may fill, and which groups of a plan get it.
+
+A :class:`Budget` is asked for each group, in the plan's order, how many bytes it may take (:meth:`Budget.room`), and is
+told what it has taken (:meth:`Budget.took`). A group with less room than it takes is streamed: made again whenever it
+is looked at. Views of which only a part fits (:class:`Shared`) keep their lists first, see
+:mod:`potr_cl.raster.view_cache`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Protocol
+
+from potr_cl.model.camera import Camera
+from potr_cl.opencl.device import Device
+from potr_cl.raster.view_set import TILE
+from potr_cl.views.groups import ViewGroup, work
+
+#: Part of the device's memory that the views may take unless the caller sets a budget. A CPU's is that of the host: the
+#: scene, its new colours and all other programs live there too.
+_SHARE, _SHARE_OF_HOST = 0.5, 0.3
+#: Bytes that a view whose splats are named by their numbers is expected to take, for each splat: shape, colour, number,
+#: and two and a half tile intersections. A third of the views has fewer intersections.
+_NAMED, _LEAST = 87, 2 / 3
+#: Of the memory, what streamed views may take while they are there, where splats are named by numbers.
+STREAMED_NAMED = 1 / 5
+#: Bytes of a resident view with a copy of what it draws: of each splat (shape, colour, totals, states, two numbers) and
+#: of each intersection (splat, sub-tiles, sums). While it is made, of each splat: its scene, and lists to be sorted.
+_COPIED, _INTERSECTION, _MAKING = 84, 16, 320
+#: Of the memory, what streamed views may take where splats are copied; and bytes of each of their splats.
+STREAMED_COPIED, COPIED_SPLAT = 1 / 4, 460
+#: The clusters' scenes stay on the device if they take no more than this part of the memory.
+SCENES = 1 / 2
+#: Bytes that a view takes for each splat of its cluster while it is measured, or prepared to be kept: room for one is
+#: set aside, and no more than this part of the memory.
+_IN_HAND, _MOST_IN_HAND = 120, 1 / 4
+
+
+def default_memory(device: Device) -> int:
+    """Bytes that the views may take: half of a GPU's memory, 0.3 of a CPU's, which is the host's memory."""
+    return int(device.info.memory * (_SHARE_OF_HOST if device.info.shares_host_memory else _SHARE))
+
+
+def target_bytes(camera: Camera) -> int:
+    """What a view's picture takes."""
+    return 12 * camera.width * camera.height
+
+
+def tiles_of(camera: Camera) -> int:
+    """How many tiles a view has."""
+    return -(-camera.width // TILE) * -(-camera.height // TILE)
+
+
+def drawn_bytes(splats: int, intersections: int, camera: Camera) -> int:
+    """What a view takes that has a copy of what it draws."""
+    return _COPIED * splats + _INTERSECTION * intersections + target_bytes(camera)
+
+
+class Budget(Protocol):
+    """What groups may take, one after the other."""
+
+    def room(self, group: ViewGroup) -> float:
+        """Bytes that the next group may take; negative: it need not be tried."""
+        ...
+
+    def took(self, group: ViewGroup, nbytes: int) -> None:
+        """Note what it has taken, on the device; 0: nothing of it stays."""
+
+    def of_pictures(self, groups: Sequence[ViewGroup]) -> int:
+        """Bytes that the pictures of streamed views may take which they are compared with."""
+        return 0
+
+
+class Shared(Budget):
+    """One room for clusters of views, whose own scenes count too; each gets its part of what is left.
+
+    Args:
+        memory: in all.
+        clusters: of the views, in their order; one that has all splats: it has no scene of its own.
+        splat: bytes of a splat in a scene.
+
+    Attributes:
+        scenes_rest: whether the clusters' scenes are on the device only where they are needed.
+    """
+
+    def __init__(self, memory: int, clusters: Sequence[ViewGroup], splat: int = 0) -> None:
+        sizes = [each.count * splat for each in clusters]
+        self.scenes_rest = sum(sizes) > SCENES * memory
+        self._left = max(memory - (max(sizes) if self.scenes_rest else sum(sizes)), 0)
+        if splat:
+            most = max(each.count for each in clusters)
+            self._left -= min(_IN_HAND * most, int(_MOST_IN_HAND * self._left))
+        self._to_come = list(clusters)
+
+    def room(self, group: ViewGroup) -> float:
+        return int(self._left * work([group]) / max(work(self._to_come), 1)) if len(self._to_come) > 1 else self._left
+
+    def took(self, group: ViewGroup, nbytes: int) -> None:
+        self._to_come.remove(group)
+        self._left = max(self._left - nbytes, 0)
+
+
+class Named(Budget):
+    """A room for single views whose splats are named by their numbers; pictures of streamed ones may have the rest.
+
+    Args:
+        memory: in all.
+        groups: the views, in their order.
+        cameras: all views.
+        totals: bytes of what they measure together.
+
+    Attributes:
+        streamed: bytes that streamed views may take while they are there.
+    """
+
+    def __init__(self, memory: int, groups: Sequence[ViewGroup], cameras: Sequence[Camera], totals: int) -> None:
+        self._left, self.streamed = memory, int(STREAMED_NAMED * memory)
+        self._targets = {number: target_bytes(cameras[number]) for each in groups for number in each.numbers}
+        # For the targets of all views that do not stay room is left, unless all will stay.
+        self._reserved = 0
+        if _NAMED * sum(each.count for each in groups) + sum(self._targets.values()) > memory:
+            self._left -= self.streamed + totals
+            self._reserved = sum(self._targets.values())
+
+    def room(self, group: ViewGroup) -> float:
+        target = self._target(group)
+        self._reserved = max(self._reserved - target, 0)
+        room = self._left - self._reserved
+        return -1 if _LEAST * _NAMED * group.count + target > room else room
+
+    def took(self, group: ViewGroup, nbytes: int) -> None:
+        self._left -= nbytes or self._target(group)
+
+    def of_pictures(self, groups: Sequence[ViewGroup]) -> int:
+        return self._left + sum(map(self._target, groups))
+
+    def _target(self, group: ViewGroup) -> int:
+        return sum(self._targets[number] for number in group.numbers)
+
+
+class Foretold(Budget):
+    """A room for single views that are known to take so much (:attr:`ViewGroup.nbytes`), widest first.
+
+    Args:
+        memory: in all.
+
+    Attributes:
+        streamed: bytes that streamed views may take while they are there.
+    """
+
+    def __init__(self, memory: int) -> None:
+        self.streamed = int(STREAMED_COPIED * memory)
+        self._left = memory - self.streamed
+
+    def room(self, group: ViewGroup) -> float:
+        # They take most while they are made, and most again each time if they are not kept.
+        left = self._left - group.nbytes
+        return math.inf if left >= 0 and _MAKING * group.count <= left + self.streamed else -1
+
+    def took(self, group: ViewGroup, nbytes: int) -> None:
+        if nbytes:
+            self._left -= group.nbytes
