@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,6 @@ from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.outputs.output import Rounded
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.stages.guarded import as_important
 from potr_cl.stages.refitting.colour_refit import ColourRefit, HelpFrom
 from potr_cl.stages.refitting.coming_scene import ComingScene
@@ -28,8 +27,7 @@ from potr_cl.stages.refitting.placement import placed
 from potr_cl.stages.refitting.refit import active_coefficients, chosen_coefficients, refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
 from potr_cl.stages.refitting.shared_map import colour_shares
-from potr_cl.stages.refitting.targets import GroundTruthTargets, RememberedTargets, RenderedTargets, Targets
-from potr_cl.stages.refitting.visible_targets import VisibleTargets
+from potr_cl.stages.refitting.targets import GroundTruthTargets, RememberedTargets, Targets, targets_of
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
 
 #: A scene that takes more than this part of the memory that is given makes room for the re-fit.
@@ -238,7 +236,7 @@ def _pictures_ahead(state: State, bench: Workbench) -> Iterator[PicturesAhead | 
 def _pictures_of_goal(state: State, bench: Workbench, ahead: PicturesAhead | None) -> Iterator[Targets]:
     """The pictures that colours are re-fitted to; where the re-fit needs its room, they are rendered before."""
     device, views = bench.opened, state.views
-    little = placed(device, len(state.scene), state.scene.sh.shape[1], bench.memory) is not None
+    little = placed(device, len(state.scene), state.scene.sh.shape[1], bench.memory).slice is not None
     little = little or (bench.memory is not None and state.source.nbytes > _LARGE * bench.memory)
     with _rendered(state, state.goal, bench) as targets:
         if ahead is not None:
@@ -251,21 +249,10 @@ def _pictures_of_goal(state: State, bench: Workbench, ahead: PicturesAhead | Non
         yield remembered
 
 
-@contextmanager
-def _rendered(state: State, scene: Scene, bench: Workbench) -> Iterator[Targets]:
+def _rendered(state: State, scene: Scene, bench: Workbench) -> AbstractContextManager[Targets]:
     """The pictures of a scene in a state's views, which are rendered when they are asked for."""
-    device, drawable = bench.opened, bench.drawable(scene)
-    if (
-        state.sights is not None
-        and scene is state.source
-        and isinstance(drawable, SceneBuffers)
-        and device.family == "gpu"
-    ):
-        with VisibleTargets(drawable, state.views, state.sights, bench.background) as visible:
-            yield visible
-        return
-    with Rasterizer(device, drawable, background=bench.background) as rasterizer:
-        yield RenderedTargets(rasterizer, state.views)
+    sights = state.sights if scene is state.source else None
+    return targets_of(bench.opened, bench.drawable(scene), state.views, bench.background, sights)
 
 
 @dataclass(frozen=True)

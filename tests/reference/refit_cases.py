@@ -14,7 +14,7 @@ from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.refitting.blocks import SplatBlocks
-from potr_cl.stages.refitting.coefficients import Coefficients
+from potr_cl.stages.refitting.coefficients import Coefficients, Vector
 from potr_cl.stages.refitting.colour_refit import ColourRefit
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
@@ -53,6 +53,21 @@ class Case:
         self.rasterizer.close()
 
 
+def as_rows(vectors: Coefficients, x: Vector) -> Array:
+    """(N, M, 3) in Y, Co, Cg, a vector."""
+    return vectors.read(x).reshape(-1, 3, vectors.layout.splats).transpose(2, 0, 1).astype(np.float64)
+
+
+def unpacked(blocks: SplatBlocks) -> Array:
+    """(N, M, M) the splats' own blocks."""
+    packed = blocks.packed()
+    sh_count = blocks.diagonals().shape[1]
+    found = np.empty((packed.shape[1], sh_count, sh_count))
+    rows, columns = np.triu_indices(sh_count)
+    found[:, rows, columns] = found[:, columns, rows] = packed.T
+    return found
+
+
 class Linearised:
     """The map at a scene's own colours, cut where they are.
 
@@ -66,27 +81,23 @@ class Linearised:
     def __init__(self, case: Case, targets: Targets | None = None, memory: int | None = None) -> None:
         self._refit = ColourRefit(case.device, case.scene, case.cameras, background=case.background, memory=memory)
         vectors, colour_map = self._refit.coefficients, self._refit.colour_map
-        assert isinstance(vectors, Coefficients)
         self._at, result = vectors.vector(), vectors.vector()
         vectors.write_sh(self._at, case.scene.sh)
         vectors.zero(result)
-        with SplatBlocks(vectors) as blocks:
-            blocks.zero()
-            self.error = colour_map.gradient(self._at, targets or case.targets, result, blocks)
-            self.blocks: Array = blocks.read().astype(np.float64)
-        self.gradient: Array = vectors.read(result).astype(np.float64)
-        self.room = colour_map.room
+        blocks = SplatBlocks(vectors)
+        self.error = colour_map.gradient(self._at, targets or case.targets, result, blocks)
+        self.blocks: Array = unpacked(blocks)
+        self.gradient: Array = as_rows(vectors, result)
+        self.room = colour_map.own.room
 
     def normal(self, direction: Array, part: int | None = None) -> Array:
         """A transposed W A times a direction, by a part of the views or by all."""
         vectors = self._refit.coefficients
-        assert isinstance(vectors, Coefficients)
         x, result = vectors.vector(), vectors.vector()
-        vectors.write(x, direction)
+        vectors.write(x, direction.transpose(1, 2, 0).reshape(-1, len(direction)))
         vectors.zero(result)
         self._refit.colour_map.normal(x, self._at, result, part=part)
-        product: Array = vectors.read(result).astype(np.float64)
-        return product
+        return as_rows(vectors, result)
 
     def __enter__(self) -> Linearised:
         return self

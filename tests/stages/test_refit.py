@@ -17,10 +17,11 @@ from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.colour_refit import ColourRefit
 from potr_cl.stages.refitting.coming_scene import ComingScene
-from potr_cl.stages.refitting.launcher import launcher_for
+from potr_cl.stages.refitting.layout import Layout
+from potr_cl.stages.refitting.own_views import OwnViews
 from potr_cl.stages.refitting.refit import active_coefficients, refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
-from potr_cl.stages.refitting.vector_space import Layout
+from potr_cl.stages.refitting.sweep import Sweep
 from tests.devices import KERNELS, open_device
 from tests.reference.refit import LENGTHS, selection, to_rgb, to_ycocg
 from tests.reference.refit_cases import Case, Linearised, Pictures
@@ -95,7 +96,7 @@ def test_the_normal_matrix(device, degree):
 @pytest.mark.parametrize("views", [63, 64, 71])
 def test_a_part_of_many_views_stands_for_all(device, views, monkeypatch):
     """Every second view, however many a launch does; where they are few, all of them."""
-    monkeypatch.setattr("potr_cl.stages.refitting.colour_map.ENOUGH", 32)
+    monkeypatch.setattr("potr_cl.stages.refitting.own_views.ENOUGH", 32)
     scene = visible_scene(40, 1, seed=views)
     cameras = ring_of_cameras(views, size=12)
     direction = np.random.default_rng(views).normal(size=scene.sh.shape)
@@ -378,7 +379,7 @@ def test_views_that_are_not_kept_share_their_memory(case, monkeypatch):
         monkeypatch.setattr(case.device, "allocate", noted)
         again = linear.normal(direction)
     assert np.array_equal(first, again)
-    assert set(taken) <= {"the SH coefficients"}, "the vectors of this test"
+    assert set(taken) <= {"SH coefficients"}, "the vectors of this test"
 
 
 def test_nobody_waits_for_a_device_that_others_read_from(case, monkeypatch):
@@ -404,18 +405,18 @@ def test_nobody_waits_for_a_device_that_others_read_from(case, monkeypatch):
         return download(*args)
 
     rasterizer = Rasterizer(device, case.scene)
-    launcher = launcher_for(device, INRIA)
-    layout = Layout(len(case.scene), rasterizer.stride, case.scene.sh.shape[1], launcher.lanes)
+    sweep = Sweep(device, INRIA)
+    layout = Layout(len(case.scene), rasterizer.stride, case.scene.sh.shape[1], sweep.lanes)
     with (
         rasterizer,
         Coefficients(device, layout) as vectors,
-        ColourMap(launcher, rasterizer, vectors, case.cameras, helpers=others) as colour_map,
+        OwnViews(sweep, rasterizer, vectors, case.cameras) as own,
     ):
         x, result = vectors.vector(), vectors.vector()
         vectors.write_sh(x, case.scene.sh)
         vectors.zero(result)
         monkeypatch.setattr(device, "download", noted)
-        error = colour_map.gradient(x, case.targets, result)
+        error = ColourMap(vectors, own, others).gradient(x, case.targets, result)
     with Linearised(case) as linear:
         assert error == linear.error
     assert waited

@@ -16,7 +16,7 @@ from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.refitting.rounding import TURNS, Round, Rounding, Steps
 from tests.devices import KERNELS, open_device
 from tests.reference.refit import LENGTHS, to_rgb, to_ycocg
-from tests.reference.refit_cases import Case
+from tests.reference.refit_cases import Case, as_rows, unpacked
 from tests.reference.rounding import rounded_in_turn
 from tests.reference.scenes import ring_of_cameras, tilted_camera, visible_scene
 
@@ -49,16 +49,16 @@ class Rounded:
             vectors.keep_active(x)
             vectors.zero(result)
             steps = Steps.of(grid, vectors.layout.stride)
-            with SplatBlocks(vectors) as blocks, Rounding(vectors, steps) as rounding:
-                blocks.zero()
+            blocks = SplatBlocks(vectors)
+            with Rounding(vectors, steps) as rounding:
                 refit.colour_map.gradient(x, case.targets, result, blocks)
                 if noise:
-                    found = np.random.default_rng(0).normal(0, noise, blocks.buffer.size // 4).astype(np.float32)
-                    cl.enqueue_copy(case.device.queue, blocks.buffer, found, is_blocking=True)
-                self.before = vectors.read(x).astype(np.float64)
+                    found = np.random.default_rng(0).normal(0, noise, blocks.array.size // 4).astype(np.float32)
+                    cl.enqueue_copy(case.device.queue, blocks.array, found, is_blocking=True)
+                self.before = as_rows(vectors, x)
                 rounding.round(x, blocks, this, worth)
-                self.blocks = blocks.read().astype(np.float64)
-            self.after, self.active = vectors.read(x).astype(np.float64), refit.active()
+                self.blocks = unpacked(blocks)
+            self.after, self.active = as_rows(vectors, x), refit.active()
 
 
 def in_turn(grid: ColourGrid, turn: int) -> np.ndarray:

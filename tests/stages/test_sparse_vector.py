@@ -10,8 +10,8 @@ import pytest
 
 from potr_cl.raster.scene_buffers import stride_of
 from potr_cl.stages.refitting.coefficients import Coefficients
-from potr_cl.stages.refitting.sparse_vector import SparseVector, SparseVectors
-from potr_cl.stages.refitting.vector_space import Layout
+from potr_cl.stages.refitting.exchange import Exchange, SparseVector
+from potr_cl.stages.refitting.layout import Layout
 from tests.devices import KERNELS, open_device
 
 
@@ -30,18 +30,18 @@ def test_vectors_arrive_as_they_were(kernels, part):
             x, y = here.vector(), there.vector()
             for coefficients, vector in ((here, x), (there, y)):
                 coefficients.zero(vector)
-            here.write_columns(x, columns)
-            there.write_columns(y, np.full_like(columns, 7))
-            taking, giving = (stack.enter_context(SparseVectors(each)) for each in (here, there))
-            sent = taking.take(x)
+            here.write(x, columns)
+            there.write(y, np.full_like(columns, 7))
+            taking, giving = (stack.enter_context(Exchange(each)) for each in (here, there))
+            sent = taking.send_vector(x)
             if part < 1:
                 assert isinstance(sent, SparseVector)
                 assert sent.nbytes == 8 * splats + 4 * np.count_nonzero(columns.view(np.uint32))
             assert sent.nbytes <= columns.nbytes
-            giving.give(y, sent)
+            giving.take_vector(y, sent)
             found = device.download(y, (layout.columns, layout.stride), np.float32)
             assert np.array_equal(found[:, :splats].view(np.uint32), columns.view(np.uint32))
             if isinstance(sent, SparseVector):
-                with pytest.raises(ValueError, match="coefficients, where"):
-                    giving.give(y, dataclasses.replace(sent, values=sent.values[1:]))
+                with pytest.raises(ValueError, match="coefficients, where there should be"):
+                    giving.take_vector(y, dataclasses.replace(sent, values=sent.values[1:]))
         assert device.allocated == 0

@@ -99,7 +99,7 @@ def test_steps_by_a_part_of_the_views_give_the_same_bytes(plush_excerpt, plush_e
     cameras = few(plush_excerpt_cameras)
     options = OPTIONS.changed(prune={"iterations": 2}, compact=False)
     every = encode(plush_excerpt, cameras, options, device=open_device(family)).data
-    monkeypatch.setattr("potr_cl.stages.refitting.colour_map.ENOUGH", 2)
+    monkeypatch.setattr("potr_cl.stages.refitting.own_views.ENOUGH", 2)
     expected = encode(plush_excerpt, cameras, options, device=open_device(family)).data
     assert expected != every
     devices = [open_device(family) for _ in range(4)]

@@ -67,13 +67,13 @@ from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions
 from potr_cl.stages.pruning.survivors import Survivors
 from potr_cl.stages.pruning.sweep_options import SweepOptions
-from potr_cl.stages.refitting import coefficients, reached, sliced_coefficients
+from potr_cl.stages.refitting import coefficients, reached, sliced_arrays
 from potr_cl.stages.refitting.coefficients import Coefficients
-from potr_cl.stages.refitting.packing import Packing
+from potr_cl.stages.refitting.exchange import Exchange
+from potr_cl.stages.refitting.layout import Layout
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.refitting.targets import RenderedTargets
-from potr_cl.stages.refitting.vector_space import Layout
 from potr_cl.views.visibility import Visibility
 from tests.reference import raster as reference
 from tests.reference.scenes import plain_splats, random_splats, straight_camera, tilted_camera
@@ -241,15 +241,15 @@ def packing(device: Device) -> None:
     """What travels between devices that share a re-fit."""
     scene = random_splats(300, 2, seed=5)
     layout = Layout(300, 320, scene.sh.shape[1], 1)
-    with Memory(device) as memory, Coefficients(device, layout) as vectors, Packing(vectors) as packs:
+    with Memory(device) as memory, Coefficients(device, layout) as vectors, Exchange(vectors) as packs:
         vectors.activate(np.random.default_rng(1).random(scene.sh.shape) < 0.5)
-        packs.take_flags()
-        packs.give_flags(packs.flags())
+        packs.settle()
+        packs.take_flags(packs.flags())
         x = vectors.vector()
-        vectors.write(x, scene.sh)
-        packs.set_floats(x, packs.floats(x))
+        vectors.write(x, scene.sh.transpose(1, 2, 0).reshape(layout.columns, -1))
+        packs.take_floats(x, packs.send_floats(x))
         sums = memory.upload(np.ones((layout.columns, layout.stride), np.int64), "sums")
-        packs.add_sums(sums, packs.sums(sums))
+        packs.add_sums(sums, packs.send_sums(sums))
         packs.add_rows(sums, 1, packs.rows(sums, 0, 1))
 
 
@@ -386,7 +386,7 @@ def simulate(family: str, width: int, names: list[str], told: Path) -> None:
         patches.enter_context(patch.object(Device, "kernel", made))
         patches.enter_context(patch.object(Device, "launch", launched))
         patches.enter_context(patch.object(Device, "free", lambda _, buffer: freed.append(buffer)))
-        for module in (coefficients, sliced_coefficients):
+        for module in (coefficients, sliced_arrays):
             patches.enter_context(patch.object(module, "DOT_ITEMS", _DOT_ITEMS))
         print("STEP probes", file=sys.stderr, flush=True)
         device = Device(simulated, family=family, build_options=["-DNO_PREFETCH"])  # type: ignore[arg-type]

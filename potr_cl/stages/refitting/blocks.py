@@ -10,105 +10,86 @@ import numpy as np
 import pyopencl as cl
 
 from potr_cl.model.scene import FloatArray
-from potr_cl.opencl.memory import Memory, Owner
-from potr_cl.stages.refitting.coefficients import Coefficients
-from potr_cl.stages.refitting.vector_space import Ridge
+from potr_cl.raster.scene_buffers import SPLAT_GROUP
+from potr_cl.stages.refitting.coefficients import Coefficients, Vector
+from potr_cl.stages.refitting.layout import Ridge
 
 _SOURCE = "refit/blocks.cl"
 
 
-class SplatBlocks(Owner):
+class SplatBlocks:
     """A symmetric block a splat, cl/refit/blocks.cl.
 
     Args:
-        coefficients: whose vectors and flags they go with.
+        coefficients: whose vectors and flags they go with; they are given back with these.
+        splats: whose integers are on the device at a time; None: all.
 
     Attributes:
-        buffer: (M (M + 1) / 2, stride) float32, packed upper triangles; a sweep adds to it.
+        array: (M (M + 1) / 2, stride) float32, packed upper triangles.
+        ranges: the splats whose blocks are added up together.
 
     Raises:
-        DeviceError: the device has no room, or the kernels cannot be built.
+        PotrError: the host has no room for them.
+        DeviceError: the device has none, or the kernels cannot be built.
     """
 
-    def __init__(self, coefficients: Coefficients) -> None:
+    def __init__(self, coefficients: Coefficients, splats: int | None = None) -> None:
         self._coefficients = coefficients
         device, layout = coefficients.device, coefficients.layout
         self._precondition, self._select_active = (
             device.shared_kernel(_SOURCE, name, **layout.macros) for name in ("precondition", "select_active")
         )
-        self._triangle = layout.sh_count * (layout.sh_count + 1) // 2
-        self._memory = Memory(device)
-        self.buffer = self._memory.allocate(4 * self._triangle * layout.stride, "the splats' normal equations")
+        self.array = coefficients.array(layout.triangle, "the splats' normal equations")
+        some = layout.stride
+        if splats is not None and not coefficients.whole:
+            some = min(max(splats // SPLAT_GROUP, 1) * SPLAT_GROUP, some)
+        self.ranges = [range(first, min(first + some, layout.stride)) for first in range(0, layout.stride, some)]
 
-    @property
-    def ranges(self) -> list[range]:
-        """The splats whose blocks a sweep adds up together: all."""
-        return [range(self._coefficients.layout.stride)]
-
-    def add_fixed(self, splats: range, sums: cl.Buffer, unit: float) -> None:
-        """Enqueue: blocks += unit times integers, which become 0.
+    def set_fixed(self, splats: range, sums: cl.Buffer, unit: float) -> None:
+        """blocks = unit times integers, which become 0.
 
         Args:
             splats: whose blocks, one of :attr:`ranges`.
             sums: (M (M + 1) / 2, len(splats)) int64.
             unit: in single precision.
         """
-        self._coefficients.add_fixed_some(self.buffer, sums, 0, self._triangle * len(splats), unit)
-
-    def zero(self) -> None:
-        """Have all blocks 0."""
-        self._coefficients.zero(self.buffer)
-
-    def read(self) -> FloatArray:
-        """(N, M, M) float32, symmetric."""
-        layout = self._coefficients.layout
-        packed = self._coefficients.device.download(self.buffer, (self._triangle, layout.stride), np.float32)
-        blocks = np.empty((layout.splats, layout.sh_count, layout.sh_count), np.float32)
-        rows, columns = np.triu_indices(layout.sh_count)
-        blocks[:, rows, columns] = blocks[:, columns, rows] = packed[:, : layout.splats].T
-        return blocks
+        self._coefficients.set_sums(self.array, sums, unit, splats)
 
     def packed(self) -> FloatArray:
         """(M (M + 1) / 2, N) float32, the upper triangles row by row."""
-        layout = self._coefficients.layout
-        return self._coefficients.device.download(self.buffer, (self._triangle, layout.stride), np.float32)[
-            :, : layout.splats
-        ]
+        return self._coefficients.read(self.array)
 
     def diagonals(self) -> FloatArray:
         """(N, M) float32, what stands on the blocks' diagonals."""
         layout = self._coefficients.layout
-        rows, columns = np.triu_indices(layout.sh_count)
         diagonals = np.empty((layout.splats, layout.sh_count), np.float32)
-        for m, place in enumerate(np.flatnonzero(rows == columns)):
-            diagonals[:, m] = self._element(int(place))
+        for m in range(layout.sh_count):
+            diagonals[:, m] = self._row(m * layout.sh_count - m * (m - 1) // 2)
         return diagonals
 
     def constants(self) -> FloatArray:
         """(N,) float32, what stands on the blocks' diagonals for the constant coefficient."""
-        return self._element(0)
+        return self._row(0).copy()
 
-    def _element(self, place: int) -> FloatArray:
-        layout = self._coefficients.layout
-        column: FloatArray = self._coefficients.device.download(
-            self.buffer, (layout.splats,), np.float32, 4 * layout.stride * place
-        )
-        return column
+    def _row(self, number: int) -> FloatArray:
+        row: FloatArray = self._coefficients.read(self.array, range(number, number + 1))[0]
+        return row
 
-    def precondition(self, residual: cl.Buffer, ridge: Ridge, result: cl.Buffer) -> None:
+    def precondition(self, residual: Vector, ridge: Ridge, result: Vector) -> None:
         """result = (block + ridge)⁻¹ residual on each splat's active coefficients, 0 on the others."""
-        layout = self._coefficients.layout
-        self._precondition.bind(
-            residual=residual,
-            blocks=self.buffer,
-            active=self._coefficients.active,
-            stride=layout.stride,
-            result=result,
-            **ridge.scalars,
-        )
-        layout.over_splats(self._precondition)
+        active = self._coefficients.active
+        for part in self._coefficients.slices((residual, active, self.array), (result,)):
+            self._precondition.bind(
+                residual=part[residual],
+                blocks=part[self.array],
+                active=part[active],
+                stride=part.stride,
+                result=part[result],
+                **ridge.scalars,
+            )
+            part.run(self._precondition)
 
-    def give_up(self, x: cl.Buffer, prior: float, least: float) -> None:
+    def give_up(self, x: Vector, prior: float, least: float) -> None:
         """Set AC coefficients that cost less than ``least`` to 0 and make them inactive.
 
         In each channel, the coefficient whose loss costs least goes first, and the others make up for it; then the next
@@ -119,17 +100,14 @@ class SplatBlocks(Owner):
             prior: added to the blocks' diagonals.
             least: weighted squared error.
         """
-        layout = self._coefficients.layout
-        self._select_active.bind(
-            coefficients=x,
-            blocks=self.buffer,
-            active=self._coefficients.active,
-            stride=layout.stride,
-            prior=np.float32(prior),
-            least=np.float32(least),
-        )
-        layout.over_splats(self._select_active)
-
-    def close(self) -> None:
-        """Give the device's memory back."""
-        self._memory.close()
+        active = self._coefficients.active
+        for part in self._coefficients.slices((x, active, self.array), (x, active)):
+            self._select_active.bind(
+                coefficients=part[x],
+                blocks=part[self.array],
+                active=part[active],
+                stride=part.stride,
+                prior=np.float32(prior),
+                least=np.float32(least),
+            )
+            part.run(self._select_active)

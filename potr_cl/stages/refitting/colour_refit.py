@@ -23,19 +23,21 @@ from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.raster.scene_buffers import stride_of
-from potr_cl.stages.refitting.coefficients import Coefficients
+from potr_cl.stages.refitting.blocks import SplatBlocks
+from potr_cl.stages.refitting.coefficients import Coefficients, Vector
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.coming_scene import AnyScene, ComingScene, arrived, colourless
-from potr_cl.stages.refitting.launcher import launcher_for
+from potr_cl.stages.refitting.layout import Layout, Ridge
+from potr_cl.stages.refitting.own_views import OwnViews
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
-from potr_cl.stages.refitting.placement import blocks_of, left_for_views, placed, rounding_of, vectors_of
-from potr_cl.stages.refitting.reached import reached_splats
+from potr_cl.stages.refitting.placement import Place, placed
+from potr_cl.stages.refitting.reached import Reach, reached_splats
 from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
-from potr_cl.stages.refitting.rounding import ROUNDS, Steps
+from potr_cl.stages.refitting.rounding import ROUNDS, Rounding, Steps
 from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts, colour_shares
 from potr_cl.stages.refitting.solver import ColourSolver, Descent, Selection, Solved
+from potr_cl.stages.refitting.sweep import Sweep
 from potr_cl.stages.refitting.targets import Targets
-from potr_cl.stages.refitting.vector_space import Layout, Ridge, Vector
 from potr_cl.views.shares import ViewShares
 from potr_cl.workers.dealing import Shares
 from potr_cl.workers.pool import Pool
@@ -107,53 +109,44 @@ class ColourRefit(Owner):
         if not cameras:
             raise UsageError("a re-fit needs at least one view")
         with ExitStack() as owned:
-            own, others = None, None
-            if help_from is not None:
-                share = help_from.shares(len(cameras))
-                if share.others:
-                    own = share.own
-                    others = owned.enter_context(
-                        colour_parts(
-                            help_from.pool, share, scene, rules, background, help_from.source, cameras, memory
-                        )
-                    )  # fmt: skip
-            launcher = launcher_for(device, rules)
-            layout = Layout(len(scene), stride_of(len(scene)), scene.sh.shape[1], launcher.lanes)
+            own: Sequence[int] = range(len(cameras))
+            others = None
+            if help_from is not None and (share := help_from.shares(len(cameras))).others:
+                own, pool = share.own, help_from.pool
+                others = owned.enter_context(
+                    colour_parts(pool, share, scene, rules, background, help_from.source, cameras, memory)
+                )
+            sweep = Sweep(device, rules)
+            layout = Layout(len(scene), stride_of(len(scene)), scene.sh.shape[1], sweep.lanes)
             # The vectors come first: prepared views can do with less memory, and only take longer then.
-            place = placed(device, layout.splats, layout.sh_count, memory, slices) if others is None else None
-            if place is None and others is None:
-                memory = left_for_views(layout.splats, layout.sh_count, memory)
-            reach = None
-            if place is not None:
-                scene = arrived(scene)  # the host has no room for vectors beside what rounds the geometry
-                rasterizer = owned.enter_context(Rasterizer(device, colourless(scene), rules))
-                reach = reached_splats(rasterizer, cameras, range(len(cameras)), memory)
-                if reach is not None:
-                    place = placed(device, layout.splats, layout.sh_count, memory, slices, reach) or place
-                memory = place.views
-            self.coefficients = owned.enter_context(vectors_of(device, layout, place))
-            blocks = blocks_of(self.coefficients, place)
-            owned.callback(blocks.close)
+            size = layout.splats, layout.sh_count
+            place = Place(memory) if others is not None else placed(device, *size, memory, slices)
+
+            def looked_at(room: int | None) -> tuple[Rasterizer, Reach | None]:
+                rasterizer = owned.enter_context(Rasterizer(device, colourless(arrived(scene)), rules))
+                return rasterizer, reached_splats(rasterizer, cameras, own, room)
+
+            looked = None
+            if place.slice is not None:  # the host has no room for vectors beside what rounds the geometry
+                looked = looked_at(memory)
+                scene = arrived(scene)
+                if looked[1] is not None:
+                    place = placed(device, *size, memory, slices, looked[1])
+            self.coefficients = owned.enter_context(Coefficients(device, layout, place.slice, place.resident))
+            blocks = SplatBlocks(self.coefficients, place.blocks)
             self._solver = ColourSolver(self.coefficients, blocks)
             self._written: FloatArray | None = None  # colours that the start of the next solution has already
             if isinstance(scene, ComingScene):
                 self.coefficients.write_sh(self._solver.x, scene.sh)
                 self._written = scene.sh
             helpers = None
-            if help_from is not None and others is not None:
-                assert isinstance(self.coefficients, Coefficients)
-                in_process = help_from.pool.in_process
-                helpers = owned.enter_context(SharedViews(self.coefficients, others, in_process))
-            here = arrived(scene)
-            if place is None:
-                rasterizer = owned.enter_context(Rasterizer(device, colourless(here), rules))
-                reach = reached_splats(rasterizer, cameras, range(len(cameras)) if own is None else own, memory)
-            self.colour_map = owned.enter_context(
-                ColourMap(
-                    launcher, rasterizer, self.coefficients, cameras, background, memory, own, helpers,
-                    reach,
-                )
-            )  # fmt: skip
+            if others is not None:
+                helpers = owned.enter_context(SharedViews(self.coefficients, others, pool.in_process))
+            rasterizer, reach = looked or looked_at(place.views)
+            views = owned.enter_context(
+                OwnViews(sweep, rasterizer, self.coefficients, cameras, background, place.views, own, reach)
+            )
+            self.colour_map = ColourMap(self.coefficients, views, helpers)
             if others is not None:
                 owned.callback(others.begin_to_close)
             self._unrounded: Vector | None = None
@@ -282,15 +275,15 @@ class ColourRefit(Owner):
         self.coefficients.copy(self._unrounded, solver.x)
         ridge = Ridge(options.lam, options.chroma_factor, options.prior)
         worth = _WORTH * options.drop * self.colour_map.total_weight
-        with rounding_of(self.coefficients, solver.blocks, steps_of_splats) as round_some:
+        with Rounding(self.coefficients, steps_of_splats) as rounding:
             *first, last = ROUNDS
             for each in first:
-                round_some(solver.x, each, worth)
+                rounding.round(solver.x, solver.blocks, each, worth)
                 gone_on = solver.go_on(self.colour_map, targets, Descent(each.steps, 0.0, ridge, part=0))
                 steps += gone_on.steps
                 errors.append(gone_on.start)
             after_first()
-            round_some(solver.x, last, worth)
+            rounding.round(solver.x, solver.blocks, last, worth)
             solved = solver.solve(self.colour_map, targets, Descent(last.steps, 0.0, ridge, part=1), constant=True)
         return Solved((errors[0], solved.errors[1]), steps + solved.steps, solved.start)
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Protocol
 
-from potr_cl.stages.refitting.vector_space import Vector
+from potr_cl.stages.refitting.coefficients import Vector
 
 #: Steps end where the residual's square, as the preconditioner measures it, has shrunk by this: single precision has no
 #: more digits, and what is left of them leads astray.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pyopencl as cl
+from numpy.typing import NDArray
 
 from potr_cl.opencl.kernel import Kernel
 from potr_cl.opencl.memory import Owner, Scratch
@@ -11,7 +12,7 @@ from potr_cl.stages.refitting.coefficients import Coefficients
 
 _SOURCE = "refit/packing.cl"
 #: Work-items of a work-group.
-_GROUP = 64
+GROUP = 64
 #: Splats whose coefficients a work-item counts one after the other.
 _RUN = 64
 _WHAT = "the coefficients' places"
@@ -25,6 +26,7 @@ class PackedRow(Owner):
         flags: (2, stride) uint32 on their device, as :attr:`Coefficients.active`.
 
     Attributes:
+        flags: as given.
         count: coefficients whose flags were set when :meth:`settle` was called last.
 
     Raises:
@@ -32,18 +34,17 @@ class PackedRow(Owner):
     """
 
     def __init__(self, coefficients: Coefficients, flags: cl.Buffer) -> None:
-        self._device, self._layout, self._flags = coefficients.device, coefficients.layout, flags
-        self._kernels = {
-            name: packing_kernel(coefficients, name)
-            for name in (
-                "count_active",
-                "place_active",
-                "pack_floats",
-                "unpack_floats",
-                "pack_sums",
-                "add_sums",
-            )
-        }
+        self._device, self._layout, self.flags = coefficients.device, coefficients.layout, flags
+        names = (
+            "mark_nonzero",
+            "count_active",
+            "place_active",
+            "pack_floats",
+            "unpack_floats",
+            "pack_sums",
+            "add_sums",
+        )
+        self._kernels = {name: packing_kernel(coefficients, name) for name in names}
         self._places, self._starts = Scratch(self._device, _WHAT), Scratch(self._device, _WHAT)
         self.count = 0
 
@@ -59,6 +60,25 @@ class PackedRow(Owner):
         with self._device.errors("failed while computing"):
             cl.enqueue_copy(self._device.queue, self._starts.buffer, ends - counts, is_blocking=True)
         self._launch_runs("place_active", starts=self._starts.buffer, places=self._places.buffer)
+
+    def set_flags(self, flags: NDArray[np.uint32]) -> None:
+        """Pack by these, (2, N), from now on."""
+        with self._device.errors("failed while computing"):
+            cl.enqueue_copy(self._device.queue, self.flags, self.padded(flags), is_blocking=True)
+        self.settle()
+
+    def padded(self, flags: NDArray[np.uint32]) -> NDArray[np.uint32]:
+        """(2, stride), flags of N splats as they lie on the device."""
+        words = np.zeros((2, self._layout.stride), np.uint32)
+        words[:, : flags.shape[1]] = flags
+        return words
+
+    def mark_nonzero(self, x: cl.Buffer) -> None:
+        """Pack by what is not 0 in a vector from now on."""
+        kernel, splats = self._kernels["mark_nonzero"], self._layout.splats
+        kernel.bind(columns=x, stride=self._layout.stride, splats=splats, flags=self.flags)
+        kernel.launch((-(-splats // GROUP) * GROUP,), (GROUP,))
+        self.settle()
 
     def pack_floats(self, x: cl.Buffer, packed: cl.Buffer) -> None:
         """Enqueue: a vector's coefficients to the row, (count,) float32."""
@@ -78,20 +98,20 @@ class PackedRow(Owner):
 
     def _launch_runs(self, name: str, **buffers: cl.Buffer) -> None:
         kernel, splats = self._kernels[name], self._layout.splats
-        kernel.bind(active=self._flags, stride=self._layout.stride, splats=splats, **buffers)
-        kernel.launch((-(-splats // (_RUN * _GROUP)) * _GROUP,), (_GROUP,))
+        kernel.bind(active=self.flags, stride=self._layout.stride, splats=splats, **buffers)
+        kernel.launch((-(-splats // (_RUN * GROUP)) * GROUP,), (GROUP,))
 
     def _launch(self, name: str, columns: cl.Buffer, packed: cl.Buffer) -> None:
         kernel, splats = self._kernels[name], self._layout.splats
         kernel.bind(
             columns=columns,
-            active=self._flags,
+            active=self.flags,
             stride=self._layout.stride,
             splats=splats,
             places=self._places.buffer,
             packed=packed,
         )
-        kernel.launch((-(-splats // _GROUP) * _GROUP,), (_GROUP,))
+        kernel.launch((-(-splats // GROUP) * GROUP,), (GROUP,))
 
     def close(self) -> None:
         """Give the device's memory back."""

@@ -20,18 +20,16 @@ from potr_cl.raster.carried import Excerpt
 from potr_cl.raster.kept_scene import KeptScene, lying_on, whole_on_device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import RasterRules
-from potr_cl.raster.scene_buffers import SceneBuffers, stride_of
+from potr_cl.raster.scene_buffers import stride_of
 from potr_cl.stages.refitting.coefficients import Coefficients
-from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.coming_scene import AnyScene, arrived, colourless
-from potr_cl.stages.refitting.launcher import launcher_for
-from potr_cl.stages.refitting.packing import Packing
+from potr_cl.stages.refitting.exchange import Exchange, SentVector
+from potr_cl.stages.refitting.layout import Layout
+from potr_cl.stages.refitting.own_views import OwnViews
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.stages.refitting.reached import reached_splats
-from potr_cl.stages.refitting.sparse_vector import SentVector, SparseVectors
-from potr_cl.stages.refitting.targets import RenderedTargets, Targets
-from potr_cl.stages.refitting.vector_space import Layout
-from potr_cl.stages.refitting.visible_targets import VisibleTargets
+from potr_cl.stages.refitting.sweep import Sweep
+from potr_cl.stages.refitting.targets import Targets, targets_of
 from potr_cl.views.visibility import Visibility
 from potr_cl.workers.pool import Part
 
@@ -64,7 +62,7 @@ class Gradient:
 
 
 class ColourPart(Part):
-    """Some of the views; see :class:`potr_cl.stages.refitting.colour_map.ColourMap`.
+    """Some of the views; see :class:`potr_cl.stages.refitting.own_views.OwnViews`.
 
     Args:
         device: to compute on.
@@ -97,40 +95,34 @@ class ColourPart(Part):
     ) -> None:
         self._device = device
         with ExitStack() as owned:
-            launcher = launcher_for(device, rules)
-            layout = Layout(len(scene), stride_of(len(scene)), sh_count, launcher.lanes)
+            sweep = Sweep(device, rules)
+            layout = Layout(len(scene), stride_of(len(scene)), sh_count, sweep.lanes)
             self._coefficients = owned.enter_context(Coefficients(device, layout))
-            self._packing = owned.enter_context(Packing(self._coefficients))
+            self._exchange = owned.enter_context(Exchange(self._coefficients))
             self._x, self._direction = self._coefficients.vector(), self._coefficients.vector()
             self._coefficients.zero(self._x)
-            self._vectors: SparseVectors | None = None
             ahead, kept = (source, source.source) if isinstance(source, PicturesAhead) else (None, source)
             pictured = owned.enter_context(lying_on(device, kept))
             if sights is not None:
                 pictured = owned.enter_context(whole_on_device(device, pictured))
-            of_source: Targets
-            if sights is not None and isinstance(pictured, SceneBuffers) and device.family == "gpu":
-                of_source = owned.enter_context(VisibleTargets(pictured, cameras, sights, background))
-            else:
-                rendering = owned.enter_context(Rasterizer(device, pictured, background=background))
-                of_source = RenderedTargets(rendering, cameras)
+            of_source = owned.enter_context(targets_of(device, pictured, cameras, background, sights))
             here = arrived(scene)
             rasterizer = owned.enter_context(Rasterizer(device, colourless(here), rules))
             self._reach = reach = reached_splats(rasterizer, cameras, numbers, memory)
-            self._map = owned.enter_context(
-                ColourMap(launcher, rasterizer, self._coefficients, cameras, background, memory, numbers, reach=reach)
+            self._views = owned.enter_context(
+                OwnViews(sweep, rasterizer, self._coefficients, cameras, background, memory, numbers, reach=reach)
             )
             self._targets: Targets = of_source
             if ahead is not None:
                 self._targets = ahead.before(device, self._targets)
-            self._map.prepare(self._targets)
+            self._views.prepare(self._targets)
             self._blocks = owned.enter_context(Memory(device))
             self._block_sums: cl.Buffer | None = None
             self._owned = owned.pop_all()
 
     def gradient(
         self,
-        x: SentVector | Lent,
+        x: SentVector,
         flags: NDArray[np.uint32] | Lent,
         blocks: bool,
         constant: bool,
@@ -147,16 +139,12 @@ class ColourPart(Part):
         """
         self._forget_blocks()
         layout = self._coefficients.layout
-        self._packing.give_flags(flags)
-        if isinstance(x, Lent):
-            self._packing.fetch(self._x, x)
-        else:
-            if self._vectors is None:
-                self._vectors = self._owned.enter_context(SparseVectors(self._coefficients))
-            self._vectors.give(self._x, x)
+        self._exchange.take_flags(flags)
+        self._exchange.take_vector(self._x, x)
         if blocks:
-            triangle = layout.sh_count * (layout.sh_count + 1) // 2
-            self._block_sums = self._blocks.allocate(8 * triangle * layout.stride, "the splats' normal equations")
+            self._block_sums = self._blocks.allocate(
+                8 * layout.triangle * layout.stride, "the splats' normal equations"
+            )
             self._coefficients.zero(self._block_sums)
         drawn = None
         with Memory(self._device) as memory:
@@ -164,14 +152,14 @@ class ColourPart(Part):
             if tell_drawn and self._reach is None:
                 marks = memory.allocate(layout.stride, "the splats that views draw")
                 self._device.fill(marks, np.uint8(0))
-            self._map.sum_gradient(self._x, self._targets, self._block_sums, constant, marks)
+            self._views.gradient(self._x, self._targets, self._block_sums, constant, marks)
             if tell_drawn:
                 drawn = self._drawn(marks)
-        if isinstance(x, Lent):
-            sums = self._packing.lend_sums(self._map.sums)
-            lent = None if self._block_sums is None else Lent(self._device, self._block_sums, self._block_sums.size)
-            return Gradient(self._map.found_errors(), sums, lent)
-        return Gradient(self._map.found_errors(), self._packing.sums(self._map.sums), drawn=drawn)
+        lent = None
+        if self._block_sums is not None and self._exchange.lends:
+            lent = Lent(self._device, self._block_sums, self._block_sums.size)
+        sums = self._exchange.send_sums(self._views.sums)
+        return Gradient(self._views.found_errors(), sums, lent, drawn)
 
     def leave_out(self, drawn: NDArray[np.uint8]) -> None:
         """Have no coefficient active of splats that these views do not draw.
@@ -179,7 +167,7 @@ class ColourPart(Part):
         Args:
             drawn: (N / 8, rounded up) uint8, those that they draw, as of :attr:`Gradient.drawn`.
         """
-        self._packing.give_flags(self._packing.flags() * unpacked(drawn, self._coefficients.layout.splats))
+        self._exchange.take_flags(self._exchange.flags() * unpacked(drawn, self._coefficients.layout.splats))
 
     def _drawn(self, marks: cl.Buffer | None) -> NDArray[np.uint8]:
         """A bit for each splat that is marked, or that any view reaches."""
@@ -200,7 +188,7 @@ class ColourPart(Part):
             (rows, stride) int64, of packed upper triangles.
         """
         assert self._block_sums is not None, "the gradient was without blocks"
-        return self._packing.rows(self._block_sums, first, rows)
+        return self._exchange.rows(self._block_sums, first, rows)
 
     def _forget_blocks(self) -> None:
         self._blocks.close()
@@ -221,11 +209,9 @@ class ColourPart(Part):
             (active coefficients,) int64.
         """
         self._forget_blocks()
-        self._packing.set_floats(self._direction, direction)
-        self._map.sum_normal(self._direction, self._x, unit, constant, part)
-        if isinstance(direction, Lent):
-            return self._packing.lend_sums(self._map.sums)
-        return self._packing.sums(self._map.sums)
+        self._exchange.take_floats(self._direction, direction)
+        self._views.normal(self._direction, self._x, unit, constant, part)
+        return self._exchange.send_sums(self._views.sums)
 
     def close(self) -> None:
         """Give all device memory back."""

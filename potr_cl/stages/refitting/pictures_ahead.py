@@ -15,11 +15,9 @@ from potr_cl.model.camera import Camera
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.kept_scene import KeptScene
-from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers
-from potr_cl.stages.refitting.targets import RenderedTargets, Targets
+from potr_cl.stages.refitting.targets import Targets, targets_of
 from potr_cl.stages.refitting.targets import nbytes as bytes_of
-from potr_cl.stages.refitting.visible_targets import VisibleTargets
 from potr_cl.views.visibility import Visibility
 
 #: They take no more than this part of a device's memory: for a moment they lie there twice.
@@ -149,11 +147,7 @@ def _rendered(
         return None
     with suppress(DeviceMemoryError), device.all_or_nothing():
         pictures = _Pictures(device, cameras, numbers)
-        if sights is not None:
-            with VisibleTargets(scene, cameras, sights, background) as visible:
-                visible.into(numbers, pictures.buffer)
-            return pictures
-        with Rasterizer(device, scene, background=background) as rasterizer:
-            RenderedTargets(rasterizer, cameras).into(numbers, pictures.buffer)
+        with targets_of(device, scene, cameras, background, sights) as targets:
+            targets.into(numbers, pictures.buffer)
         return pictures
     return None

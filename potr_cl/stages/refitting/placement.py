@@ -8,18 +8,10 @@ the sums. Further vectors stay on the device as far as there is room, those that
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 from potr_cl.opencl.device import Device
-from potr_cl.stages.refitting.blocks import SplatBlocks
-from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.reached import Reach
-from potr_cl.stages.refitting.rounding import Round, Rounding, SlicedRounding, Steps
-from potr_cl.stages.refitting.sliced_blocks import SlicedBlocks
-from potr_cl.stages.refitting.sliced_coefficients import SlicedCoefficients
-from potr_cl.stages.refitting.vector_space import Layout, Vector, VectorSpace
 
 #: Vectors of a solution: six of the solver and what it was before it was rounded.
 _VECTORS = 7
@@ -48,19 +40,19 @@ _COEFFICIENTS = 3
 
 @dataclass(frozen=True)
 class Place:
-    """How a re-fit does with little memory on the device.
+    """How a re-fit does with the device's memory.
 
     Attributes:
-        slice: splats whose coefficients go through the device together.
+        views: bytes that prepared views and targets may take; None: a part of what is free.
+        slice: splats whose coefficients go through the device together; None: all, and vectors and blocks lie there.
         blocks: splats whose blocks are added up together.
-        views: bytes that prepared views and targets may take.
-        resident: vectors that lie on the device.
+        resident: with slices, vectors that lie on the device even so.
     """
 
-    slice: int
-    blocks: int
-    views: int
-    resident: int = _FEWEST
+    views: int | None
+    slice: int | None = None
+    blocks: int | None = None
+    resident: int = 0
 
 
 def placed(
@@ -70,8 +62,8 @@ def placed(
     memory: int | None,
     slices: int | None = None,
     reach: Reach | None = None,
-) -> Place | None:
-    """How a re-fit has its vectors on the host; None: they lie on the device.
+) -> Place:
+    """Where a re-fit's vectors lie.
 
     Args:
         device: to compute on.
@@ -82,11 +74,11 @@ def placed(
         reach: of the views, if each has splats of its own.
     """
     vector, triangle = 12 * sh_count, sh_count * (sh_count + 1) // 2
-    one_piece = _one_piece(splats, sh_count)
+    one_piece = splats * (_VECTORS * vector + 2 * vector + 12 * triangle)
     free = max(device.info.memory - device.allocated, 0)
     fits = one_piece <= max(_OF_FREE * free if memory is None else min(_OF_GIVEN * memory, _OF_FREE * free), _ANYWAY)
     if slices is None and fits:
-        return None
+        return Place(memory if memory is None or one_piece <= _ANYWAY else max(memory - one_piece, 0))
     total = free if memory is None else min(memory, free)
     of_slice = 2 * vector + 4 * triangle + 8
     some = slices or min(max(int(_SLICE * total / of_slice), _LEAST_SLICE), _MOST_SLICE)
@@ -103,72 +95,10 @@ def placed(
         others = 0
         if resident <= _COEFFICIENTS:
             resident, others = max(resident - 1, _FEWEST), 1
-        return Place(some, blocks, max(int(left - (resident + others) * splats * vector), 0), resident)
+        return Place(max(int(left - (resident + others) * splats * vector), 0), some, blocks, resident)
     room = int(((_OF_HOST if of_host else _OF_VECTORS) * total / max(splats, 1) - _SWEEP) / vector) - 3
     besides = splats * (3 * vector + _SWEEP) + some * of_slice + 8 * triangle * min(blocks, splats)
     # Of few splats a slice, which has so many at least, takes more than its share.
     room = min(room, int((total - besides) / max(splats * vector, 1)))
     resident = min(max(room, _FEWEST), _MOST) if slices is None else _FEWEST
-    return Place(some, blocks, max(int(total - besides - splats * resident * vector), 0), resident)
-
-
-def left_for_views(splats: int, sh_count: int, memory: int | None) -> int | None:
-    """Bytes of the device's memory that views may take, where the vectors lie there in one piece.
-
-    Args:
-        splats, sh_count, memory: as of :func:`placed`, which found that they fit.
-    """
-    one_piece = _one_piece(splats, sh_count)
-    return memory if memory is None or one_piece <= _ANYWAY else max(memory - one_piece, 0)
-
-
-def _one_piece(splats: int, sh_count: int) -> int:
-    """Bytes of all vectors, sums and blocks."""
-    vector, triangle = 12 * sh_count, sh_count * (sh_count + 1) // 2
-    return splats * (_VECTORS * vector + 2 * vector + 12 * triangle)
-
-
-def vectors_of(device: Device, layout: Layout, place: Place | None) -> VectorSpace:
-    """Where a re-fit's vectors lie.
-
-    Raises:
-        PotrError: the host has no room for them.
-        DeviceError: the device has none.
-    """
-    return (
-        Coefficients(device, layout)
-        if place is None
-        else SlicedCoefficients(device, layout, place.slice, place.resident)
-    )
-
-
-def blocks_of(vectors: VectorSpace, place: Place | None) -> SplatBlocks | SlicedBlocks:
-    """The splats' own blocks, where the vectors lie; raises what :func:`vectors_of` does."""
-    if isinstance(vectors, SlicedCoefficients):
-        return SlicedBlocks(vectors, vectors.layout.stride if place is None else place.blocks)
-    assert isinstance(vectors, Coefficients)
-    return SplatBlocks(vectors)
-
-
-@contextmanager
-def rounding_of(
-    vectors: VectorSpace, blocks: SplatBlocks | SlicedBlocks, steps: Steps
-) -> Iterator[Callable[[Vector, Round, float], None]]:
-    """The rounding of vectors where they lie, to the splats' steps, as long as the context lasts.
-
-    Yields:
-        What rounds: called with a vector, what of it is due, and the squared error that it is worth to save an AC
-        coefficient, as :meth:`potr_cl.stages.refitting.rounding.Rounding.round`.
-
-    Raises:
-        DeviceError: the device has no room, or the kernels cannot be built.
-    """
-    if isinstance(vectors, SlicedCoefficients) and isinstance(blocks, SlicedBlocks):
-        in_slices, its_blocks = SlicedRounding(vectors, steps), blocks
-        yield lambda x, this, worth: in_slices.round(x, its_blocks, this, worth)
-        return
-    assert isinstance(vectors, Coefficients)
-    assert isinstance(blocks, SplatBlocks)
-    on_device = blocks
-    with Rounding(vectors, steps) as rounding:
-        yield lambda x, this, worth: rounding.round(x, on_device, this, worth)
+    return Place(max(int(total - besides - splats * resident * vector), 0), some, blocks, resident)

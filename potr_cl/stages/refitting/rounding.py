@@ -15,18 +15,14 @@ VCEG-AH21, 2008), with an error that counts what the others of the splat make up
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.stages.refitting.blocks import SplatBlocks
-from potr_cl.stages.refitting.coefficients import Coefficients
-from potr_cl.stages.refitting.sliced_blocks import SlicedBlocks
-from potr_cl.stages.refitting.sliced_coefficients import AnyVector, SlicedCoefficients
+from potr_cl.stages.refitting.coefficients import Coefficients, Vector
 
 _SOURCE = "refit/rounding.cl"
 #: Splats are due in so many turns: every fourth one in the order of the file in turn 0, the next ones in turn 1, …
@@ -75,19 +71,9 @@ class Steps:
         constant[: len(grid.constant)], others[: len(grid.others)] = grid.constant, grid.others
         return Steps(turns, constant, others)
 
-    def part(self, splats: range, stride: int) -> Steps:
-        """Those of some splats, padded."""
-
-        def padded(values: NDArray[Any], by: float) -> NDArray[Any]:
-            some = np.full(stride, by, values.dtype)
-            some[: len(splats)] = values[splats.start : splats.stop]
-            return some
-
-        return Steps(padded(self.turns, _NEVER), padded(self.constant, 1), padded(self.others, 1))
-
 
 class Rounding(Owner):
-    """The steps of one scene's colours, on the device.
+    """The steps of one scene's colours.
 
     Args:
         coefficients: whose vectors are rounded.
@@ -104,16 +90,13 @@ class Rounding(Owner):
             device.shared_kernel(_SOURCE, name, **layout.macros) for name in ("round_ac", "round_constant")
         )
         self._memory = Memory(device)
-        try:
-            self._turns = self._memory.upload(steps.turns, "the turns of splats")
-            self._constant, self._others = (
-                self._memory.upload(each, "the steps of colours") for each in (steps.constant, steps.others)
+        with device.all_or_nothing():
+            self._turns, self._constant, self._others = (
+                coefficients.holding(self._memory, each, "the steps of colours")
+                for each in (steps.turns, steps.constant, steps.others)
             )
-        except BaseException:
-            self.close()
-            raise
 
-    def round(self, x: cl.Buffer, blocks: SplatBlocks, this: Round, worth: float) -> None:
+    def round(self, x: Vector, blocks: SplatBlocks, this: Round, worth: float) -> None:
         """Round some of the active coefficients, and make them inactive.
 
         Args:
@@ -122,47 +105,21 @@ class Rounding(Owner):
             this: which ones.
             worth: weighted squared error that it is worth to save an AC coefficient.
         """
-        layout = self._coefficients.layout
-        active, stride = self._coefficients.active, layout.stride
-        self._round_ac.bind(
-            coefficients=x,
-            blocks=blocks.buffer,
-            active=active,
-            turns=self._turns,
-            steps=self._others,
-            stride=stride,
-            turn=this.others,
-            to_zero=np.float32(worth),
-        )
-        layout.over_splats(self._round_ac)
-        self._round_constant.bind(
-            coefficients=x, active=active, turns=self._turns, steps=self._constant, stride=stride, turn=this.constant
-        )
-        layout.over_splats(self._round_constant)
+        active, turns = self._coefficients.active, self._turns
+        read = (x, active, blocks.array, turns, self._constant, self._others)
+        for part in self._coefficients.slices(read, (x, active)):
+            own = {"coefficients": part[x], "active": part[active], "turns": part[turns], "stride": part.stride}
+            self._round_ac.bind(
+                **own,
+                blocks=part[blocks.array],
+                steps=part[self._others],
+                turn=this.others,
+                to_zero=np.float32(worth),
+            )
+            part.run(self._round_ac)
+            self._round_constant.bind(**own, steps=part[self._constant], turn=this.constant)
+            part.run(self._round_constant)
 
     def close(self) -> None:
         """Give the device's memory back."""
         self._memory.close()
-
-
-class SlicedRounding:
-    """What :class:`Rounding` is, where vectors lie on the host.
-
-    Args:
-        coefficients: whose vectors are rounded.
-        steps: of the splats.
-    """
-
-    def __init__(self, coefficients: SlicedCoefficients, steps: Steps) -> None:
-        self._coefficients, self._steps = coefficients, steps
-
-    def round(self, x: AnyVector, blocks: SlicedBlocks, this: Round, worth: float) -> None:
-        """See :meth:`Rounding.round`."""
-        own = self._coefficients.own
-
-        def one(part: range, some: cl.Buffer) -> None:
-            with Rounding(own, self._steps.part(part, own.layout.stride)) as rounding:
-                rounding.round(some, blocks.give(part), this, worth)
-                own.device.queue.finish()  # before the steps' memory is given back
-
-        self._coefficients.each(x, one)

@@ -20,13 +20,12 @@ from potr_cl.opencl.relay import Lent
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rules import RasterRules
 from potr_cl.stages.refitting.coefficients import Coefficients
-from potr_cl.stages.refitting.colour_map import parts_of
 from potr_cl.stages.refitting.coming_scene import AnyScene, arrived
 from potr_cl.stages.refitting.drawn_rows import DrawnRows
-from potr_cl.stages.refitting.packing import Packing
+from potr_cl.stages.refitting.exchange import Exchange
+from potr_cl.stages.refitting.own_views import parts_of
 from potr_cl.stages.refitting.part import ColourPart, Gradient, unpacked
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
-from potr_cl.stages.refitting.sparse_vector import SentVector, SparseVectors
 from potr_cl.views.shares import ViewShares
 from potr_cl.views.visibility import Visibility
 from potr_cl.workers.dealing import Shares, shares
@@ -55,8 +54,7 @@ class SharedViews(Owner):
     def __init__(self, coefficients: Coefficients, others: Parts, in_process: bool) -> None:
         self._coefficients, self._others, self._in_process = coefficients, others, in_process
         self._x: Lent | None = None
-        self._packing = Packing(coefficients)
-        self._vectors = None if in_process else SparseVectors(coefficients)
+        self._exchange = Exchange(coefficients, in_process)
         self._pending: Pending | None = None
         # Which splats the others' views draw, the first gradient tells; for one alone nothing is left out.
         self._ask_drawn = not in_process and len(others) > 1
@@ -65,32 +63,20 @@ class SharedViews(Owner):
     def begin_gradient(self, x: cl.Buffer, blocks: bool, constant: bool) -> None:
         """Have them begin with a gradient at x."""
         flags: Lent | Each | NDArray[np.uint32]
-        flags = self._packing.lend_flags() if self._in_process else self._packing.flags()
-        if self._drawn is not None:
-            assert isinstance(flags, np.ndarray)
-            flags = Each(self._drawn.take_flags(flags))
-        args = (self._sent(x), flags, blocks, constant, self._ask_drawn)
-        self._pending = self._others.begin("gradient", *args, anew=True)
-        self._packing.take_flags()
-
-    def _sent(self, x: cl.Buffer) -> Lent | SentVector:
-        if self._vectors is not None:
-            return self._vectors.take(x)
-        layout = self._coefficients.layout
-        self._x = Lent(self._coefficients.device, x, 4 * layout.columns * layout.stride)
-        return self._x
+        flags = (
+            self._exchange.send_flags() if self._drawn is None else Each(self._drawn.take_flags(self._exchange.flags()))
+        )
+        sent = self._exchange.send_vector(x)
+        self._x = sent if isinstance(sent, Lent) else None
+        self._pending = self._others.begin("gradient", sent, flags, blocks, constant, self._ask_drawn, anew=True)
+        self._exchange.settle()
 
     def begin_normal(self, direction: cl.Buffer, at: cl.Buffer, unit: float, constant: bool, part: int | None) -> None:
         """Have them begin with a product of the normal matrix."""
         if self._x is not None:
             self._x.lend(at)  # a part that is made again asks for it; where it was before it may have changed
         packed: Lent | Each | FloatArray
-        if self._in_process:
-            packed = self._packing.lend_floats(direction)
-        elif self._drawn is not None:
-            packed = Each(self._drawn.floats(direction))
-        else:
-            packed = self._packing.floats(direction)
+        packed = self._exchange.send_floats(direction) if self._drawn is None else Each(self._drawn.floats(direction))
         self._pending = self._others.begin("normal", packed, unit, constant, part, logged=False)
 
     def add(self, sums: cl.Buffer, blocks: cl.Buffer | None) -> dict[int, float]:
@@ -106,7 +92,7 @@ class SharedViews(Owner):
                 assert isinstance(found, Narrowed)
                 self._drawn.add_sums(sums, place, found)
             else:
-                self._packing.add_sums(sums, found)
+                self._exchange.add_sums(sums, found)
         if self._ask_drawn:
             self._ask_drawn = False
             self._note_drawn(results)
@@ -115,7 +101,7 @@ class SharedViews(Owner):
         elif blocks is not None:
             for place, found in enumerate(results):
                 if found.blocks is not None and found.blocks.nbytes == blocks.size:
-                    self._packing.add_lent(blocks, found.blocks)
+                    self._exchange.add_lent(blocks, found.blocks)
                 else:
                     self._add_blocks(blocks, place)
         return errors
@@ -128,7 +114,7 @@ class SharedViews(Owner):
             drawn[place] = unpacked(found.drawn, self._coefficients.layout.splats)
         if DrawnRows.are_worth_it(drawn):
             with suppress(DeviceMemoryError):  # a device without room for that many rows goes on with one for all
-                self._drawn = DrawnRows(self._coefficients, self._packing, drawn)
+                self._drawn = DrawnRows(self._coefficients, self._exchange, drawn)
         if self._drawn is not None:
             bits = [np.packbits(drawn[part], bitorder="little") for part in range(len(drawn))]
             self._others.tell("leave_out", Each(bits))
@@ -145,15 +131,13 @@ class SharedViews(Owner):
             else:
                 found = [self._others.ask(place, "block_rows", first, count)]
             for more in found:
-                self._packing.add_rows(blocks, first, more)
+                self._exchange.add_rows(blocks, first, more)
 
     def close(self) -> None:
         """Give the master's device memory back; the parts are the caller's."""
         if self._drawn is not None:
             self._drawn.close()
-        self._packing.close()
-        if self._vectors is not None:
-            self._vectors.close()
+        self._exchange.close()
 
 
 def colour_shares(pool: Pool, views: int) -> Shares:

@@ -20,11 +20,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from potr_cl.stages.refitting.blocks import SplatBlocks
+from potr_cl.stages.refitting.coefficients import Coefficients, Vector
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.conjugate_gradients import ConjugateGradients
-from potr_cl.stages.refitting.sliced_blocks import SlicedBlocks
+from potr_cl.stages.refitting.layout import Ridge
 from potr_cl.stages.refitting.targets import Targets
-from potr_cl.stages.refitting.vector_space import Ridge, Vector, VectorSpace
 
 #: Half steps tried when a solution is worse than its start because colours were cut at 0 on the way.
 _HALVINGS = 4
@@ -38,7 +38,7 @@ class Descent:
         steps: the most conjugate-gradient steps.
         gain: stop when a step takes less than this part off the objective.
         ridge: what holds the coefficients down or near their start.
-        part: of the views (:attr:`ColourMap.parts`) by which the normal equations are made, for a way that need not be
+        part: of the views (:attr:`OwnViews.parts`) by which the normal equations are made, for a way that need not be
             exact because another one follows, or leads less far; None: of all.
     """
 
@@ -98,8 +98,8 @@ class _NormalEquations:
     """
 
     colour_map: ColourMap
-    coefficients: VectorSpace
-    blocks: SplatBlocks | SlicedBlocks
+    coefficients: Coefficients
+    blocks: SplatBlocks
     ridge: Ridge
     at: Vector
     constant: bool
@@ -137,7 +137,7 @@ class ColourSolver:
         DeviceError: the device has no room, or the kernels cannot be built.
     """
 
-    def __init__(self, coefficients: VectorSpace, blocks: SplatBlocks | SlicedBlocks) -> None:
+    def __init__(self, coefficients: Coefficients, blocks: SplatBlocks) -> None:
         self._coefficients = coefficients
         # Conjugate gradients have the ranks between.
         self.x, self._start, self._residual = (coefficients.vector(rank) for rank in (3, 5, 2))
@@ -173,8 +173,6 @@ class ColourSolver:
             DeviceError: the device failed.
         """
         problem = _Problem(colour_map, targets, constant)
-        if not constant:
-            self.blocks.zero()
         self._coefficients.copy(self._start, self.x)
         ridge = (selection.descent if selection else descent).ridge
         first = self._linearise(problem, ridge, None if constant else self.blocks)
@@ -216,7 +214,7 @@ class ColourSolver:
         start = state.error / colour_map.total_weight
         return Solved((start, math.nan), steps, start)
 
-    def _linearise(self, problem: _Problem, ridge: Ridge, blocks: SplatBlocks | SlicedBlocks | None = None) -> _State:
+    def _linearise(self, problem: _Problem, ridge: Ridge, blocks: SplatBlocks | None = None) -> _State:
         """Settle which colours are cut, and make the residual: minus half the objective's gradient at x."""
         vectors, residual = self._coefficients, self._residual
         change, pulled = self._gradients.direction, self._gradients.product

@@ -1,9 +1,10 @@
-"""The pictures that the re-fit should come near to: :class:`Targets`, where they come from, and which are kept."""
+"""The pictures that a re-fit or a fit should come near to, and where they come from: :class:`Targets`."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
 from typing import Protocol
 
 import numpy as np
@@ -16,6 +17,9 @@ from potr_cl.opencl.device import Device
 from potr_cl.opencl.ferry import Cargo, Ferry
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
+from potr_cl.views.pictures import SeenRasterizer
+from potr_cl.views.visibility import Visibility
 
 
 class Targets(Protocol):
@@ -49,6 +53,60 @@ class RenderedTargets:
     def into(self, numbers: Sequence[int], buffer: cl.Buffer) -> None:
         """See :meth:`Targets.into`."""
         self._rasterizer.render_into([self._cameras[number] for number in numbers], buffer)
+
+
+class VisibleTargets(Owner):
+    """The same of a large scene, each picture rendered with what its view may draw: they are the same bits.
+
+    Args:
+        whole: the scene, on a GPU; it stays the caller's.
+        cameras: the views.
+        sights: what each of them may draw.
+        background: R, G, B behind the scene.
+
+    Raises:
+        DeviceError: the device has no room for the numbers of the splats' groups.
+    """
+
+    def __init__(
+        self, whole: SceneBuffers, cameras: Sequence[Camera], sights: Visibility, background: tuple[float, float, float]
+    ) -> None:
+        self._cameras = list(cameras)
+        with ExitStack() as owned:
+            self._pictures = owned.enter_context(
+                SeenRasterizer(whole.device, whole, sights.groups, background=background)
+            )
+            self._picks = self._pictures.picks(owned.enter_context(Memory(whole.device)), sights.seen)
+            self._owned = owned.pop_all()
+
+    def into(self, numbers: Sequence[int], buffer: cl.Buffer) -> None:
+        """See :meth:`Targets.into`."""
+        self._pictures.draw(self._picks, numbers, [self._cameras[number] for number in numbers], buffer)
+
+    def close(self) -> None:
+        """Give all device memory back."""
+        self._owned.close()
+
+
+@contextmanager
+def targets_of(
+    device: Device,
+    scene: Drawable,
+    cameras: Sequence[Camera],
+    background: tuple[float, float, float],
+    sights: Visibility | None = None,
+) -> Iterator[Targets]:
+    """A scene's pictures, with what each view may draw where that is known and the scene lies on a GPU.
+
+    Raises:
+        DeviceError: the scene does not fit the device.
+    """
+    if sights is not None and isinstance(scene, SceneBuffers) and device.family == "gpu":
+        with VisibleTargets(scene, cameras, sights, background) as visible:
+            yield visible
+        return
+    with Rasterizer(device, scene, background=background) as rasterizer:
+        yield RenderedTargets(rasterizer, cameras)
 
 
 #: Bytes of pictures that are rendered together to be remembered.
@@ -149,92 +207,3 @@ class GroundTruthTargets:
             with self._device.errors("failed to take a photograph"):
                 cl.enqueue_copy(self._device.queue, buffer, picture, dst_offset=start, is_blocking=True)
             start += picture.nbytes
-
-
-class Budget(Protocol):
-    """Bytes of device memory that several share."""
-
-    #: What is left.
-    room: float
-
-
-class TargetCache(Owner):
-    """Target pictures on the device. Those that fit the memory budget are kept after their first use.
-
-    Args:
-        device: whose memory it is.
-        cameras: the views.
-        launches: the numbers of the views that are asked for together.
-        budget: that the pictures which are kept are taken from.
-        numbers: of these cameras among the views that targets know.
-
-    Raises:
-        DeviceMemoryError: the device has no room for those of one launch.
-    """
-
-    def __init__(
-        self,
-        device: Device,
-        cameras: Sequence[Camera],
-        launches: Sequence[range],
-        budget: Budget,
-        numbers: Sequence[int],
-    ) -> None:
-        self._numbers = numbers
-        self._nbytes = {launch: sum(nbytes(cameras[number]) for number in launch) for launch in launches}
-        self._budget = budget
-        self._memory = Memory(device)
-        self._others = self._memory.allocate(max(self._nbytes.values(), default=0), "the target images")
-        self._kept: dict[range, cl.Buffer] = {}
-        self._kept_of: Targets | None = None
-
-    def fill(self, targets: Targets) -> None:
-        """Have those pictures of these targets that are kept."""
-        self._keep_only(targets)
-        for launch, size in self._nbytes.items():
-            if launch not in self._kept and size <= self._budget.room:
-                self.pictures(targets, launch)
-
-    def pictures(self, targets: Targets, numbers: range) -> cl.Buffer:
-        """(pixels, 3) float32, what the views of a launch should show, one behind the other.
-
-        They are valid until the next call. Other targets than at the last call take the place of what was kept.
-        """
-        self._keep_only(targets)
-        if numbers in self._kept:
-            return self._kept[numbers]
-        size = self._nbytes[numbers]
-        if size > self._budget.room:
-            targets.into(self._among_all(numbers), self._others)
-            return self._others
-        buffer = self._memory.allocate(size, "the target images")
-        self._budget.room -= buffer.size
-        self._kept[numbers] = buffer
-        try:
-            targets.into(self._among_all(numbers), buffer)
-        except BaseException:
-            self._drop(numbers)
-            raise
-        return buffer
-
-    def _keep_only(self, targets: Targets) -> None:
-        if targets is not self._kept_of:
-            self._forget()
-            self._kept_of = targets
-
-    def _among_all(self, numbers: range) -> list[int]:
-        return [self._numbers[number] for number in numbers]
-
-    def _drop(self, numbers: range) -> None:
-        buffer = self._kept.pop(numbers)
-        self._budget.room += buffer.size
-        self._memory.free(buffer)
-
-    def _forget(self) -> None:
-        for numbers in list(self._kept):
-            self._drop(numbers)
-
-    def close(self) -> None:
-        """Give all device memory back."""
-        self._forget()
-        self._memory.close()

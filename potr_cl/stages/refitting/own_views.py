@@ -1,0 +1,287 @@
+"""The views that one worker does of a re-fit, and what they add to coefficients: :class:`OwnViews`.
+
+One sweep over the tiles of every view (cl/refit/refit_cpu.cl, refit_gpu.cl) leads from the splats' colours
+(cl/refit/view_colours.cl) to the pixels' values, and from those back to sums for each splat, which are gathered into
+coefficients (cl/refit/gather.cl). W weighs pixels so that all views count the same whatever their size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl as cl
+
+from potr_cl.model.camera import Camera
+from potr_cl.opencl.memory import Memory, Owner
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.view_set import TABLE_ENTRY, ViewSet
+from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
+from potr_cl.stages.refitting.coefficients import Coefficients, Vector
+from potr_cl.stages.refitting.fixed_point import gathered_scale
+from potr_cl.stages.refitting.kept_pictures import KeptPictures
+from potr_cl.stages.refitting.reached import Reach
+from potr_cl.stages.refitting.sweep import Sweep
+from potr_cl.stages.refitting.targets import Targets, nbytes
+from potr_cl.stages.refitting.view_errors import ViewErrors
+from potr_cl.stages.refitting.view_groups import Ready, ViewGroups
+from potr_cl.stages.refitting.view_kernels import Picks, SweptSums, ViewKernels
+
+#: Bytes a splat and view of a sweep's own buffers: the colours' change and the sums.
+_CHANGE, _TOTALS = 16, 32
+#: Views are divided into so many parts, every second one in each, where each has as many as are enough: with 62 in
+#: each, steps by one part lost 0.01 dB on a captured scene, and 0.03 on its pictures a third as wide.
+_PARTS, ENOUGH = 2, 80
+
+
+class OwnViews(Owner):
+    """Some of the views of a scene, with pixels weighed by W.
+
+    Args:
+        sweep: over views' tiles.
+        rasterizer: of the scene's geometry and opacities; its colours are never looked at. It stays the caller's.
+        coefficients: whose vectors are looked at.
+        cameras: all views that count, all the same whatever their size.
+        background: R, G, B behind the splats.
+        memory: bytes of device memory that prepared views and targets may take; None: two fifths of
+            what is free, or a quarter where that is the host's memory.
+        numbers: of the views that are done here, ascending; None: all.
+        reach: of these, where each has splats of its own; None: they share all splats.
+
+    Attributes:
+        count: of all views.
+        parts: into how many parts views are divided, each of which shows about the same as all of them: one part where
+            they are few.
+        one: what is 1 in :attr:`sums`, and in those of the splats' own blocks.
+        sums: (3 M, stride) int64 in the device's memory, what the views have added to coefficients.
+
+    Raises:
+        DeviceError: a view does not fit the device, or the kernels cannot be built.
+    """
+
+    def __init__(
+        self,
+        sweep: Sweep,
+        rasterizer: Rasterizer,
+        coefficients: Coefficients,
+        cameras: Sequence[Camera],
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        memory: int | None = None,
+        numbers: Sequence[int] | None = None,
+        reach: Reach | None = None,
+    ) -> None:
+        self._device = device = coefficients.device
+        layout = coefficients.layout
+        self._coefficients, self._background, self._sweep = coefficients, background, sweep
+        self.one = gathered_scale(cameras, [_weight(camera) for camera in cameras])
+        fixed_points = sweep.fixed_point_scales(cameras)
+        self.count = len(cameras)
+        self.parts = parts_of(len(cameras))
+        own_numbers = range(len(cameras)) if numbers is None else numbers
+        seen = {} if reach is None else {number: len(splats) for number, splats in reach.of.items()}
+        # Launches, and what is gathered together, are of one part. Views of a launch have about as many splats.
+        self._numbers = sorted(own_numbers, key=lambda each: (each % self.parts, -seen.get(each, 0), each))
+        of_parts = [sum(number % self.parts == part for number in own_numbers) for part in range(self.parts)]
+        breaks = np.cumsum(of_parts).tolist()
+        cameras = [cameras[number] for number in self._numbers]
+        weights = [_weight(camera) for camera in cameras]
+        self._fixed_points = [fixed_points[number] for number in self._numbers]
+        self._memory = Memory(device)
+        self._owned: list[Owner] = [self._memory]
+        try:
+            # To render a picture takes many times as long as to project a view, and it takes less room.
+            pictures = sum(nbytes(camera) for camera in cameras)
+            splats = None if reach is None else [reach.of[number] for number in self._numbers]
+            self._views = ViewGroups(
+                rasterizer, cameras, splats, sweep.most_views, _CHANGE + _TOTALS, memory, breaks, pictures
+            )
+            self._owned.append(self._views)
+            groups = self._views.groups
+            most = max(map(len, groups), default=0)
+            together = min(sweep.gathered, max(len(groups), 1)) if most == 1 and reach is None else 1
+            self._gathered: list[list[list[range]]] = [
+                [some[first : first + together] for first in range(0, len(some), together)]
+                for some in (
+                    [group for group in groups if self._numbers[group[0]] % self.parts == part]
+                    for part in range(self.parts)
+                )
+            ]
+            at_once = together * max((len(group) * self._views.stride(group) for group in groups), default=0)
+            self._change = self._memory.allocate(_CHANGE * at_once, "the colours' change")
+            self._totals = self._memory.allocate(_TOTALS * at_once, "the re-fit's sums")
+            #: Which channels of views' own splats are free: a byte a splat and view, which stays as the views may not.
+            self._free: dict[range, cl.Buffer] = {}
+            if reach is not None:
+                for group in groups:
+                    size = len(group) * self._views.stride(group)
+                    self._free[group] = self._memory.allocate(size, "the channels that are cut")
+            self._slots = [
+                _Slot(*(_part(of, slot, together) for of in (self._change, self._totals))) for slot in range(together)
+            ]
+            self._tables = self._memory.allocate(TABLE_ENTRY * most * together, "the views")
+            coefficients.zero(self._totals)
+            self.sums = self._memory.allocate(8 * layout.columns * layout.stride, "the sums over views")
+            coefficients.zero(self.sums)
+            self._errors = ViewErrors(device, cameras, weights, self._numbers, groups)
+            self._owned.append(self._errors)
+            pairs = zip(weights, self._fixed_points, strict=True)
+            scales = np.array([self.one * weight / fixed_point for weight, fixed_point in pairs], np.float32)
+            scales = self._memory.upload(scales, "the views' scales")
+            self._kernels = ViewKernels(device, layout, rasterizer.parameters.means, scales)
+            self._targets = KeptPictures(device, cameras, self._views.budget, self._numbers, groups)
+            self._owned.append(self._targets)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def room(self) -> float:
+        """Bytes of the memory for prepared views and targets that are left."""
+        return self._views.budget.room
+
+    def prepare(self, targets: Targets) -> None:
+        """Have the pictures of this device's views that are kept there, before the first gradient asks for them.
+
+        Raises:
+            DeviceError: the device failed. What the targets raise.
+        """
+        self._targets.fill(targets, self._views.groups)
+
+    def gradient(
+        self,
+        x: cl.Buffer,
+        targets: Targets,
+        blocks: cl.Buffer | None,
+        constant: bool = False,
+        drawn: cl.Buffer | None = None,
+    ) -> None:
+        """Enqueue :meth:`potr_cl.stages.refitting.colour_map.ColourMap.gradient` of these views.
+
+        Args:
+            x, targets, constant: as there.
+            blocks: (M (M + 1) / 2, n) int64, the same of the first n splats' own blocks; None: they are not wanted.
+            drawn: (stride,) uint8, becomes 1 for each splat that any of these views draws; not where each view has
+                splats of its own. None: it is not wanted.
+        """
+
+        def sweep(group: range, ready: Ready, slot: _Slot) -> None:
+            views = ready.views
+            self._kernels.colour(views, self._picks(group, ready), x, views.colours)
+            pictures = self._targets.of(targets, group)
+            self._enqueue_sweep(group, views, views.colours, pictures, blocks is not None, slot)
+            if drawn is not None:
+                self._kernels.mark_drawn(views, drawn)
+            # Which of them are cut, the gathering asks.
+            nbytes = _CHANGE * views.stride * len(group)
+            cl.enqueue_copy(self._device.queue, slot.change, views.colours, byte_count=nbytes)
+            self._errors.keep(group)
+
+        self._add_up(sweep, constant=constant, blocks=blocks)
+
+    def found_errors(self) -> dict[int, float]:
+        """The squared error by W of each of these views after :meth:`gradient`, by number."""
+        return self._errors.found()
+
+    def blocks(self, blocks: cl.Buffer, first: int) -> None:
+        """Enqueue the blocks' part of :meth:`gradient` alone, of the splats from one on."""
+        self._coefficients.zero(self._change)  # black, and no channel is free
+
+        def sweep(group: range, ready: Ready, slot: _Slot) -> None:
+            self._enqueue_sweep(group, ready.views, slot.change, None, True, slot)
+
+        self._add_up(sweep, blocks=blocks, first_block=first)
+
+    def normal(
+        self, direction: cl.Buffer, at: Vector, unit: float, constant: bool = False, part: int | None = None
+    ) -> None:
+        """Enqueue :meth:`potr_cl.stages.refitting.colour_map.ColourMap.normal` of these views.
+
+        Args:
+            direction, at, constant, part: as there; the direction on the device.
+            unit: the direction is multiplied by this.
+        """
+
+        def sweep(group: range, ready: Ready, slot: _Slot) -> None:
+            views, picks = ready.views, self._picks(group, ready)
+            if ready.anew and picks is None:  # which colours are cut is not known any more
+                self._kernels.colour(views, picks, self._coefficients.on_device(at, 1), views.colours)
+            self._kernels.colour(views, picks, direction, slot.change, unit, constant)
+            self._enqueue_sweep(group, views, slot.change, None, False, slot)
+
+        self._add_up(sweep, part, constant)
+
+    def _add_up(
+        self,
+        sweep: Callable[[range, Ready, _Slot], None],
+        part: int | None = None,
+        constant: bool = False,
+        blocks: cl.Buffer | None = None,
+        first_block: int = 0,
+    ) -> None:
+        """Enqueue what adds the sums of views to :attr:`sums`, and to blocks.
+
+        Args:
+            sweep: enqueues a group's sweep, given where its sums go.
+            part: of the views; None: all.
+            constant, blocks, first_block: as of :meth:`ViewKernels.gather`.
+        """
+        for groups in self._gathered if part is None else [self._gathered[part]]:
+            for gathered in groups:
+                for slot, group in zip(self._slots, gathered, strict=False):
+                    with self._views.ready(group) as ready:
+                        sweep(group, ready, slot)
+                        start, size = TABLE_ENTRY * (group.start - gathered[0].start), TABLE_ENTRY * len(group)
+                        cl.enqueue_copy(
+                            self._device.queue, self._tables, ready.views.table, byte_count=size, dst_offset=start
+                        )
+                views = range(gathered[0].start, gathered[-1].stop)
+                stride = self._views.stride(gathered[0])
+                found = SweptSums(self._totals, self._change, stride, ready.picks, self._tables, views)
+                self._kernels.gather(found, self.sums, constant, blocks, first_block)
+
+    def _picks(self, group: range, ready: Ready) -> Picks | None:
+        return None if ready.picks is None else Picks(ready.picks, self._free[group])
+
+    def _enqueue_sweep(
+        self, group: range, views: ViewSet, colours: cl.Buffer, target: cl.Buffer | None, weights: bool, slot: _Slot
+    ) -> None:
+        """Enqueue a group's sweep; without a target colours are a change, and black is behind them."""
+        background = (0.0, 0.0, 0.0) if target is None else self._background
+        scale = self._fixed_points[group.start]
+        self._sweep.run(views, colours, background, target, scale, self._errors.latest, slot.totals, weights)
+
+    def close(self) -> None:
+        """Give all device memory back."""
+        self._slots = []  # parts of buffers, which would keep these
+        for owner in reversed(self._owned):
+            owner.close()
+
+
+@dataclass(frozen=True)
+class _Slot:
+    """Where a launch that is gathered together with others has its own buffers.
+
+    Attributes:
+        change: (views, stride, 4) float32, what the launch's views composite, or its w.
+        totals: (views, stride, 4) int64.
+    """
+
+    change: cl.Buffer
+    totals: cl.Buffer
+
+
+def parts_of(views: int) -> int:
+    """Into how many parts so many views are divided; view k is in part k modulo this."""
+    return _PARTS if views >= _PARTS * ENOUGH else 1
+
+
+def _part(buffer: cl.Buffer, number: int, parts: int) -> cl.Buffer:
+    """One of some equal parts of a buffer."""
+    nbytes = buffer.size // parts
+    return buffer if parts == 1 else buffer.get_sub_region(number * nbytes, nbytes)
+
+
+def _weight(camera: Camera) -> float:
+    """What a pixel of a view counts."""
+    return REFERENCE_PIXELS / (camera.width * camera.height)

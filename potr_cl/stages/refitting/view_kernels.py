@@ -1,0 +1,186 @@
+"""From coefficients to the splats' colours in views, and from what a sweep leaves there back: :class:`ViewKernels`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.kernel import Kernel
+from potr_cl.raster.view_set import ViewSet
+from potr_cl.stages.refitting.layout import Layout
+
+#: Work-items of a work-group.
+_GROUP = 64
+#: Views that a work-item gives colours one after the other, the coefficients in its registers.
+_TOGETHER = 8
+
+
+@dataclass(frozen=True)
+class Picks:
+    """Views' own splats.
+
+    Attributes:
+        numbers: (views, stride) uint32, their numbers.
+        free: (views, stride) uint8, which channels were not cut when the views' colours were made.
+    """
+
+    numbers: cl.Buffer
+    free: cl.Buffer
+
+
+@dataclass(frozen=True)
+class SweptSums:
+    """What sweeps have left for some views that follow each other.
+
+    Attributes:
+        totals: (views, stride, 4) int64; 0 once they are gathered.
+        free: (views, stride, 4) float32, whose last element tells which channels are not cut.
+        stride: room for the splats of each view.
+        picks: (views, stride) uint32, the splats' numbers; None: all views have all, in their order.
+        tables: of the views, ``SetView`` in cl/include/view_set.clh.
+        views: their numbers among those that have scales.
+    """
+
+    totals: cl.Buffer
+    free: cl.Buffer
+    stride: int
+    picks: cl.Buffer | None
+    tables: cl.Buffer
+    views: range
+
+
+class ViewKernels:
+    """The kernels of one layout.
+
+    Args:
+        device: to compute on.
+        layout: of the coefficients.
+        means: (3, stride) float32, the splats' centres on the device.
+        scales: float32, by what each view's sums are multiplied on their way to the coefficients.
+
+    Raises:
+        DeviceError: the kernels cannot be built.
+    """
+
+    def __init__(self, device: Device, layout: Layout, means: cl.Buffer, scales: cl.Buffer) -> None:
+        self._device, self._layout, self._means, self._scales = device, layout, means, scales
+
+    def colour(
+        self,
+        views: ViewSet,
+        picks: Picks | None,
+        x: cl.Buffer,
+        result: cl.Buffer,
+        unit: float | None = None,
+        constant: bool = False,
+    ) -> None:
+        """Enqueue the views' colours, or what ``unit`` times a direction adds to them where none is cut at 0.
+
+        Args:
+            views: with their colours at the coefficients, if a direction is looked along and they have all splats.
+            picks: the views' own splats; None: they have all.
+            x: (3 M, stride of the layout) float32, the coefficients or the direction.
+            result: (views, stride, 4) float32.
+            unit: of the direction; None: x are coefficients.
+            constant: the direction's other coefficients are 0.
+        """
+        kernel = self._device.shared_kernel(
+            "refit/view_colours.cl", "view_colours", PICKED=int(picks is not None), **self._layout.some(constant)
+        )
+        kernel.bind(
+            coefficients=x,
+            means=self._means,
+            stride=self._layout.stride,
+            apart=views.stride,
+            numbers=views.table if picks is None else picks.numbers,
+            views=views.table,
+            view_count=len(views.views),
+            direction=unit is not None,
+            unit=np.float32(1.0 if unit is None else unit),
+            free=views.colours,
+            free_picks=views.table if picks is None else picks.free,
+            colours=result,
+        )
+        together = _TOGETHER if picks is None else 1
+        self._layout.over_splats(kernel, -(-len(views.views) // together), stride=views.stride)
+
+    def mark_drawn(self, views: ViewSet, drawn: cl.Buffer) -> None:
+        """Enqueue: (stride,) uint8 become 1 for each splat that any of some views draws, which have all splats."""
+        kernel = self._device.shared_kernel("refit/drawn.cl", "mark_drawn")
+        for number, view in enumerate(views.views):
+            kernel.bind(
+                views=views.table,
+                number=number,
+                offsets=views.offsets,
+                intersections=views.intersections,
+                marks=drawn,
+            )
+            kernel.launch((-(-view.tiles // _GROUP) * _GROUP,), (_GROUP,))
+
+    def gather(
+        self,
+        found: SweptSums,
+        sums: cl.Buffer,
+        constant: bool = False,
+        blocks: cl.Buffer | None = None,
+        first_block: int = 0,
+    ) -> None:
+        """Enqueue: sums += what views add to coefficients, blocks += what they add to the splats' own blocks.
+
+        Args:
+            found: of the views; for blocks, the sums of squared weights are there too.
+            sums: (3 M, stride) int64.
+            constant: only those of the constant coefficients; not together with blocks.
+            blocks: (M (M + 1) / 2, n) int64, of n splats; None: they are not wanted.
+            first_block: number of the first of them.
+        """
+        layout = self._layout
+        if blocks is None:
+            self._gather(found, sums, constant)
+            return
+        own = {"first_block": first_block, "block_stride": blocks.size // (8 * layout.triangle), "blocks": blocks}
+        if layout.lanes > 1:
+            self._gather(found, sums, False, own)
+            return
+        # A work-item of a GPU would write a whole block for each view: its blocks have a kernel of their own.
+        kernel = self._kernel("gather_blocks", found, WEIGHTS=0, SOME_BLOCKS=0, **layout.macros)
+        items = own["block_stride"] if found.picks is None else found.stride
+        for arguments in self._arguments(found):
+            kernel.bind(**arguments, **own)
+            kernel.launch((-(-items // _GROUP) * _GROUP, (layout.sh_count + 1) // 2), (_GROUP, 1))
+        self._gather(found, sums, False)
+
+    def _gather(self, found: SweptSums, sums: cl.Buffer, constant: bool, blocks: dict[str, Any] | None = None) -> None:
+        layout = self._layout
+        own = blocks or {"first_block": 0, "block_stride": layout.stride, "blocks": sums}
+        weights, some = int(blocks is not None), int(own["block_stride"] < layout.stride)
+        kernel = self._kernel("gather", found, WEIGHTS=weights, SOME_BLOCKS=some, **layout.some(constant))
+        for arguments in self._arguments(found):
+            kernel.bind(**arguments, **own, free=found.free, result=sums)
+            layout.over_splats(kernel, stride=found.stride)
+
+    def _kernel(self, name: str, found: SweptSums, **macros: int) -> Kernel:
+        return self._device.shared_kernel("refit/gather.cl", name, PICKED=int(found.picks is not None), **macros)
+
+    def _arguments(self, found: SweptSums) -> list[dict[str, Any]]:
+        """For views that may add to splats at the same time: all, where a work-item has the same splat in all."""
+        count = len(found.views)
+        return [
+            {
+                "totals": found.totals,
+                "means": self._means,
+                "stride": self._layout.stride,
+                "apart": found.stride,
+                "numbers": found.tables if found.picks is None else found.picks,
+                "views": found.tables,
+                "first_view": some.start,
+                "view_count": len(some),
+                "scales": self._scales,
+                "first_scale": found.views.start,
+            }
+            for some in ([range(count)] if found.picks is None else [range(n, n + 1) for n in range(count)])
+        ]

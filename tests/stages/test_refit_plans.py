@@ -1,0 +1,442 @@
+"""A re-fit finds the same bits wherever its vectors lie, whichever splats its views have, and whoever does them."""
+
+from __future__ import annotations
+
+import dataclasses
+from contextlib import ExitStack
+
+import numpy as np
+import pytest
+
+from potr_cl.errors import DeviceMemoryError, UsageError
+from potr_cl.opencl.device import Device
+from potr_cl.outputs.colour_grid import ColourGrid
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.stages import refit as refit_stage
+from potr_cl.stages.refitting import own_views, placement, reached
+from potr_cl.stages.refitting.colour_refit import ColourRefit, HelpFrom
+from potr_cl.stages.refitting.reached import reached_splats
+from potr_cl.stages.refitting.refit import refit_colours
+from potr_cl.stages.refitting.refit_options import RefitOptions
+from potr_cl.stages.refitting.view_groups import ViewGroups
+from potr_cl.workers.host import HostPool
+from tests.cases.elsewhere import ElsewherePool
+from tests.cases.streets import street
+from tests.devices import KERNELS, open_device
+from tests.reference.refit_cases import Case, Linearised
+from tests.reference.scenes import ring_of_cameras, visible_scene
+
+#: Slices of 256 splats, the fewest that there can be.
+SLICES = 256
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """How a re-fit goes.
+
+    Attributes:
+        slices: splats of a slice of vectors on the host; None: they lie on the device.
+        resident: vectors that lie there even so.
+        picked: each view has the splats that it reaches, and no others.
+        memory: bytes for views.
+        workers: who share the views out.
+        elsewhere: these know nothing but what they are sent, and the master does no views.
+    """
+
+    slices: int | None = None
+    resident: int = 1
+    picked: bool = False
+    memory: int | None = None
+    workers: int = 1
+    elsewhere: bool = False
+
+
+PLANS = {
+    "no view kept": Plan(memory=0),
+    "slices": Plan(SLICES, 0),
+    "slices, three vectors on the device": Plan(SLICES, 3),
+    "slices, all vectors on the device, no view kept": Plan(SLICES, 7, memory=0),
+    "own splats": Plan(picked=True),
+    "own splats, some views kept": Plan(picked=True, memory=300_000),
+    "own splats, slices": Plan(SLICES, picked=True),
+    "two devices": Plan(workers=2),
+    "two devices, own splats": Plan(workers=2, picked=True),
+    "a cluster of three": Plan(workers=4, elsewhere=True),
+    "a cluster of three, own splats, no view kept": Plan(workers=4, elsewhere=True, picked=True, memory=0),
+}
+#: What becomes of the solution: left as it is, rounded in rounds, or by somebody who asks what coefficients are worth.
+WAYS = ("solve", "colour_grid", "fix_ac")
+
+
+@pytest.fixture(scope="module", params=KERNELS)
+def device(request):
+    device = open_device(request.param)
+    yield device
+    assert device.allocated == 0, "a re-fit did not give all its memory back"
+
+
+@pytest.fixture
+def picked(monkeypatch):
+    """Have views pick their splats, and note which views did."""
+    made: list[ViewGroups] = []
+
+    class Noting(ViewGroups):
+        def __init__(self, *args: object) -> None:
+            if args[2] is not None:
+                made.append(self)
+            super().__init__(*args)  # type: ignore[arg-type]
+
+    def switch(on: bool) -> list[ViewGroups]:
+        monkeypatch.setattr(reached, "LEAST_SPLATS", 1 if on else 1 << 60)
+        monkeypatch.setattr(reached, "WORTH_IT", 1.0)
+        made.clear()
+        return made
+
+    monkeypatch.setattr(own_views, "ViewGroups", Noting)
+    return switch
+
+
+def crowded(splats: int = 400, degree: int = 1):
+    """A street of which some splats stand behind others that nothing is seen through; views of two sizes."""
+    scene, cameras = street(4, splats)
+    logits = np.where(np.arange(len(scene)) % 2, 6, -1).astype(np.float32)
+    rng = np.random.default_rng(3)
+    sh = rng.normal(0, 0.3, (len(scene), (degree + 1) ** 2, 3)).astype(np.float32)
+    cameras[1] = dataclasses.replace(cameras[1], width=50, height=90)
+    return dataclasses.replace(scene, log_scales=scene.log_scales + 0.5, opacity_logits=logits, sh=sh), cameras
+
+
+def crowded_case(device, degree: int = 1, splats: int = 400):
+    scene, cameras = crowded(splats, degree)
+    other = dataclasses.replace(scene, sh=scene.sh[::-1].copy())
+    return Case(device, scene, other, cameras, background=(0.2, 0.1, 0.0)), other
+
+
+def case_of(device, degree: int = 3, count: int = 700) -> Case:
+    return Case(device, visible_scene(count, degree), visible_scene(200, 2, seed=7), ring_of_cameras(5, size=40))
+
+
+def grid_of(count: int) -> ColourGrid:
+    rng = np.random.default_rng(0)
+    steps = (0.1 * 2.0 ** rng.uniform(-1, 1, (2, count))).astype(np.float32)
+    return ColourGrid(steps[0], steps[1], rng.permutation(count))
+
+
+def same(one, other) -> bool:
+    return np.array_equal(one.sh, other.sh) and one.errors == other.errors and one.steps == other.steps
+
+
+def coarse(sh, refit):
+    return np.concatenate([sh[:, :1], np.round(sh[:, 1:] * 10 + refit.worth()[:, 1:, None]) / 10], axis=1)
+
+
+def fitted(device, plan: Plan, way: str):
+    """By two parts of the views."""
+    case, other = crowded_case(device)
+    rounding = {
+        "colour_grid": {"colour_grid": lambda effects: grid_of(len(case.scene))},
+        "fix_ac": {"fix_ac": coarse},
+        "solve": {},
+    }[way]
+    options = RefitOptions(steps=4, gain=0, drop=1e-7, selection_lam=0.3, slices=plan.slices, memory=plan.memory)
+    active = np.random.default_rng(1).random(case.scene.sh.shape) < 0.8
+    with case, ExitStack() as stack:
+        help_from = None
+        if plan.workers > 1:
+            devices = [device, *(open_device(device.family) for _ in range(plan.workers - 1))]
+            kind = ElsewherePool if plan.elsewhere else HostPool
+            help_from = HelpFrom(stack.enter_context(kind(devices)), other)
+        return refit_colours(
+            device, case.scene, case.cameras, case.targets, options, active, case.background,
+            help_from=help_from, **rounding,
+        )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def plain(device):
+    """Solutions with everything on one device, and all splats in each view."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(own_views, "ENOUGH", 4)
+        return {way: fitted(device, Plan(), way) for way in WAYS}
+
+
+@pytest.mark.parametrize(
+    ("plan", "way"),
+    [
+        pytest.param(plan, way, id=f"{name}, {way}", marks=() if way == WAYS[place % 3] else pytest.mark.slow)
+        for place, (name, plan) in enumerate(PLANS.items())
+        for way in WAYS
+    ],
+)
+def test_the_same_solution(device, plain, picked, plan, way, monkeypatch):
+    monkeypatch.setattr(own_views, "ENOUGH", 4)
+    monkeypatch.setattr(placement, "_FEWEST", plan.resident)
+    made = picked(plan.picked)
+    found = fitted(device, plan, way)
+    assert bool(made) == plan.picked
+    assert same(found, plain[way])
+    assert found.steps > 3
+
+
+@pytest.mark.parametrize("degree", [0, 2, 3])
+def test_of_every_degree(device, degree):
+    options = {"steps": 6, "gain": 0.0, "drop": 1e-7, "selection_lam": 0.3}
+    with case_of(device, degree) as case:
+        whole, sliced = (case.solve(RefitOptions(**options, slices=slices)) for slices in (None, SLICES))
+    assert same(sliced, whole)
+
+
+@pytest.mark.one_runtime
+@pytest.mark.parametrize("count", [1, 256, 257])
+def test_any_number_of_splats(device, count):
+    with case_of(device, 1, count) as case:
+        whole, sliced = (case.solve(RefitOptions(steps=3, gain=0.0, slices=slices)) for slices in (None, SLICES))
+    assert same(sliced, whole)
+
+
+def test_a_solution_that_is_taken_back(device):
+    """More than the start could be worse: then the choice is made anew, among all coefficients."""
+    with case_of(device, 1) as case:
+        case.scene.sh[:, 0] -= 2
+        options = {"steps": 3, "gain": 0.0, "drop": 1e-3}
+        whole, sliced = (case.solve(RefitOptions(**options, slices=slices)) for slices in (None, SLICES))
+    assert same(sliced, whole)
+
+
+def test_what_is_known_of_coefficients(device):
+    with case_of(device, 2) as case:
+        known = []
+        for slices in (None, SLICES):
+            with ColourRefit(device, case.scene, case.cameras, slices=slices) as refit:
+                refit.solve(case.scene.sh, case.targets, RefitOptions(steps=2, drop=1e-7))
+                known.append([refit.worth(), refit.worth_of_constants(), refit.blocks(), refit.active()])
+    for whole, sliced in zip(*known, strict=True):
+        assert np.array_equal(whole, sliced)
+
+
+@pytest.mark.one_family
+@pytest.mark.one_runtime
+@pytest.mark.parametrize("own", [False, True], ids=["the host's memory", "memory of its own"])
+def test_little_memory_is_enough(device, own, monkeypatch):
+    """Vectors that are too large for the memory that is given do not come to the device: most of them are not there."""
+    monkeypatch.setattr(placement, "_ANYWAY", 0)
+    kind = {"kind": "gpu", "integrated": False} if own else {"kind": "cpu"}
+    device = Device(dataclasses.replace(device.info, **kind), family=device.family)
+    count = 20_000
+    one_piece = 3400 * count
+    peaks = []
+    with case_of(device, 3, count) as case:
+        free = device.allocated
+        for memory in (None, one_piece // 2):
+            with ColourRefit(device, case.scene, case.cameras, memory=memory) as refit:
+                result = refit.solve(case.scene.sh, case.targets, RefitOptions(steps=1, gain=0, memory=memory))
+                peaks.append((device.allocated - free, result))
+    (whole, one), (sliced, other) = peaks
+    assert same(one, other)
+    assert sliced < 0.6 * one_piece < whole
+
+
+@pytest.mark.one_runtime
+def test_slices_of_nothing():
+    with pytest.raises(UsageError, match="slices of 0 splats"):
+        RefitOptions(slices=0)
+
+
+@pytest.mark.one_runtime
+def test_memory_is_that_of_vectors_and_views_together(device, monkeypatch):
+    """Also where the vectors lie on the device."""
+    monkeypatch.setattr(placement, "_ANYWAY", 0)
+    count = 3000
+    one_piece = 3400 * count
+    with case_of(device, 3, count) as case:
+        free, room = device.allocated, []
+        for memory in (4 * one_piece, 12 * one_piece):
+            with ColourRefit(device, case.scene, case.cameras, memory=memory) as refit:
+                refit.solve(case.scene.sh, case.targets, RefitOptions(steps=1, gain=0))
+                assert device.allocated - free < memory
+                room.append(refit.colour_map.own.room)
+    assert room[1] - room[0] == pytest.approx(8 * one_piece, rel=0.01)
+    assert room[0] < 3 * one_piece
+
+
+def test_which_splats_are_reached(device, monkeypatch):
+    """All that are drawn but some that stand behind others; the picture of these alone is the picture of all."""
+    monkeypatch.setattr(reached, "LEAST_SPLATS", 1)
+    monkeypatch.setattr(reached, "WORTH_IT", 1.0)
+    scene, cameras = crowded(800)
+    with Rasterizer(device, scene) as rasterizer:
+        reach = reached_splats(rasterizer, cameras, range(len(cameras)))
+        assert reach is not None
+        found = [reach.of[number] for number in range(len(cameras))]
+        assert (reach.total, reach.most) == (sum(map(len, found)), max(map(len, found)))
+        drawn = []
+        for camera, numbers in zip(cameras, found, strict=True):
+            with rasterizer.prepare_set([camera]) as views:
+                listed = device.download(views.intersections, (views.capacity,), np.uint32)
+                wanted, _ = rasterizer.composite(views.views[0])
+            drawn.append(np.unique(listed))
+            assert np.all(np.diff(numbers.astype(np.int64)) > 0)
+            assert np.isin(numbers, drawn[-1]).all()
+            subset = scene.subset(numbers.astype(np.int64))
+            with Rasterizer(device, subset) as alone, alone.prepare_set([camera]) as views:
+                got, _ = alone.composite(views.views[0])
+            assert np.array_equal(got, wanted)
+        assert sum(map(len, found)) < 0.9 * sum(map(len, drawn)) < 0.5 * len(scene) * len(cameras)
+
+
+def test_fewer_views_together_where_the_device_has_no_room(device, monkeypatch):
+    if device.family == "cpu":
+        pytest.skip("kernels for CPUs do one view at a time")
+    monkeypatch.setattr(reached, "LEAST_SPLATS", 1)
+    monkeypatch.setattr(reached, "WORTH_IT", 1.0)
+    scene, cameras = crowded(200)
+    prepare = Rasterizer.prepare_set
+    together, found = [], []
+
+    def failing(self, some, *args):
+        together.append(len(some))
+        if len(some) > 3:
+            raise DeviceMemoryError("no room")
+        return prepare(self, some, *args)
+
+    with Rasterizer(device, scene) as rasterizer:
+        for full in (False, True):
+            if full:
+                monkeypatch.setattr(Rasterizer, "prepare_set", failing)
+            reach = reached_splats(rasterizer, cameras, range(len(cameras)))
+            assert reach is not None
+            found.append(reach.of)
+    assert max(together) > 3
+    for number in range(len(cameras)):
+        assert np.array_equal(found[0][number], found[1][number])
+
+
+def test_not_where_views_reach_much(device, monkeypatch):
+    scene, cameras = crowded(800)
+    with Rasterizer(device, scene) as rasterizer:
+        assert reached_splats(rasterizer, cameras, range(5)) is None
+        monkeypatch.setattr(reached, "LEAST_SPLATS", len(scene))
+        monkeypatch.setattr(reached, "WORTH_IT", 1.0)
+        assert reached_splats(rasterizer, cameras, range(5)) is not None
+        monkeypatch.setattr(reached, "WORTH_IT", 0.01)
+        assert reached_splats(rasterizer, cameras, range(5)) is None
+        monkeypatch.setattr(reached, "LEAST_SPLATS", len(scene) + 1)
+        assert reached_splats(rasterizer, cameras, range(5)) is None
+
+
+@pytest.mark.parametrize("slices", [None, 256], ids=["in one piece", "in slices"])
+def test_what_views_reach_is_found_once(device, monkeypatch, slices):
+    """Also where it is not worth it."""
+    made = []
+
+    class Noting(reached.Picker):
+        def __init__(self, *args: object) -> None:
+            made.append(self)
+            super().__init__(*args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(reached, "Picker", Noting)
+    monkeypatch.setattr(reached, "LEAST_SPLATS", 1)
+    monkeypatch.setattr(reached, "WORTH_IT", 0.0)
+    scene, cameras = crowded(200)
+    with ColourRefit(device, scene, cameras, slices=slices):
+        assert len(made) == 1
+
+
+#: Bytes that all lists fit and some geometry, that some views fit, and none.
+@pytest.mark.parametrize("memory", [None, 400_000, 150_000, 0])
+def test_products(device, picked, memory):
+    case, _ = crowded_case(device, 3)
+    with case:
+        direction = np.random.default_rng(5).normal(size=case.scene.sh.shape)
+        found = []
+        for on in (False, True):
+            made = picked(on)
+            with Linearised(case, memory=memory) as linear:
+                assert len(made) == int(on)
+                found.append((linear.error, linear.gradient, linear.blocks, linear.normal(direction)))
+    for whole, some in zip(*found, strict=True):
+        assert np.array_equal(whole, some)
+    assert found[0][0] > 0
+
+
+def test_a_view_that_sees_nothing(device, picked):
+    scene, cameras = crowded(800)
+    away = dataclasses.replace(cameras[0], translation=cameras[0].translation + 1000)
+    errors = []
+    with Case(device, scene, scene, [away, *cameras[:3]], background=(0.2, 0.1, 0.0)) as case:
+        case.scene.sh[:, 0] += 0.1
+        for on in (False, True):
+            picked(on)
+            with Linearised(case) as linear:
+                errors.append((linear.error, linear.gradient))
+    assert errors[0][0] == errors[1][0] > 0
+    assert np.array_equal(errors[0][1], errors[1][1])
+
+
+def test_more_views_stay(device, picked):
+    """In the memory that two thirds of them fit with all splats."""
+    case, _ = crowded_case(device, splats=800)
+    with case:
+        room = {}
+        for on in (False, True):
+            picked(on)
+            with ColourRefit(device, case.scene, case.cameras, memory=10**8) as refit:
+                room[on] = refit.colour_map.own.room
+    assert 10**8 - room[True] < 0.6 * (10**8 - room[False])
+
+
+@pytest.mark.slow
+@pytest.mark.one_runtime
+@pytest.mark.parametrize("part", [0.3, 0.6])
+def test_little_memory_is_enough_for_views_with_splats_of_their_own(device, picked, part, monkeypatch):
+    """What lies on the device keeps to what is given, as soon as that is more than the least."""
+    monkeypatch.setattr(placement, "_ANYWAY", 0)
+    monkeypatch.setattr(placement, "_LEAST_SLICE", 512)
+    device = Device(dataclasses.replace(device.info, kind="gpu", integrated=False), family=device.family)
+    scene, cameras = crowded(5000, degree=3)
+    one_piece = 3400 * len(scene)
+    memory = int(part * one_piece)
+    results = []
+    with Case(device, scene, dataclasses.replace(scene, sh=-scene.sh), cameras) as case:
+        free = device.allocated
+        for on, given in ((False, None), (True, memory)):
+            picked(on)
+            with ColourRefit(device, scene, cameras, memory=given) as refit:
+                results.append(refit.solve(scene.sh, case.targets, RefitOptions(steps=2, gain=0, drop=1e-7)))
+                taken = device.allocated - free
+    assert taken < memory
+    assert same(*results)
+
+
+@pytest.mark.one_family
+@pytest.mark.one_runtime
+def test_the_same_file(device, plush_excerpt, plush_excerpt_cameras, monkeypatch):
+    """Of a whole encode: with the vectors on the device, or with them and the target pictures on the host."""
+    small = plush_excerpt_cameras[:12]
+    options = EncodeOptions.for_preset("best", between=False).changed(prune={"iterations": 4})
+    whole = encode(plush_excerpt, small, options, device=device)
+    monkeypatch.setattr(refit_stage, "_LARGE", 0)
+    remembered = encode(plush_excerpt, small, options.changed(memory=1 << 30), device=device)
+    assert remembered.data == whole.data
+    for name in ("_ANYWAY", "_OF_FREE", "_OF_GIVEN"):
+        monkeypatch.setattr(placement, name, 0)
+    sliced = encode(plush_excerpt, small, options, device=device)
+    assert sliced.data == whole.data
+    assert sliced.refitted.errors == whole.refitted.errors
+
+
+def test_the_same_file_of_views_with_splats_of_their_own(device, picked):
+    """Of a whole encode, on one device and on two."""
+    scene, cameras = crowded(400)
+    options = EncodeOptions.for_preset("best", cameras_anyway=True).changed(prune={"iterations": 4})
+    picked(False)
+    wanted = encode(scene, cameras, options, device=device)
+    made = picked(True)
+    assert encode(scene, cameras, options, device=device).data == wanted.data
+    assert len(made) == 1
+    made.clear()
+    with HostPool([device, open_device(device.family)]) as pool:
+        assert encode(scene, cameras, options, device=device, pool=pool).data == wanted.data
+    assert len(made) == 2
