@@ -126,6 +126,8 @@ class Device:
         try:
             yield
         except (cl.Error, MemoryError) as error:
+            if self._leaving is not None:
+                self._leaving.detach()  # it may work no more: some drivers tell a crash as a lack of resources
             said = compiler.complaint(error)
             if isinstance(error, (cl.MemoryError, MemoryError)) or any(
                 code in str(error).partition("\n")[0] for code in _NO_MEMORY
@@ -133,8 +135,6 @@ class Device:
                 raise DeviceMemoryError(
                     f"device {self.info} ran out of memory ({said}): {self._memory_advice()}"
                 ) from None
-            if self._leaving is not None:
-                self._leaving.detach()  # it may work no more
             raise DeviceError(f"device {self.info} {what} ({said}): choose another with --device") from None
 
     def _memory_advice(self) -> str:

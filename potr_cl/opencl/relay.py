@@ -89,7 +89,7 @@ class Relay(Owner):
         if not nbytes:
             return
         device = self._device
-        with device.errors("failed while computing"), lent.device.errors("failed while computing"):
+        with device.errors("failed while computing"):
             # Kernels that were enqueued before may still look at what the target held.
             free = free or done_so_far(device)
             if lent.device is device:
@@ -113,13 +113,16 @@ class Relay(Owner):
                 up[number - _SLOTS].wait()
             slot, first = slots[number % _SLOTS][: sizes[number]], start + number * _SLICE
             waits = None if number else [lent.ready]
-            down.append(
-                cl.enqueue_copy(departing, slot, lent.buffer, src_offset=first, is_blocking=False, wait_for=waits)
-            )
-            departing.flush()
+            with lent.device.errors("failed while computing"):
+                copied = cl.enqueue_copy(
+                    departing, slot, lent.buffer, src_offset=first, is_blocking=False, wait_for=waits
+                )
+                down.append(copied)
+                departing.flush()
 
         def land(number: int) -> None:
-            down[number].wait()
+            with lent.device.errors("failed while computing"):
+                down[number].wait()
             slot, first = slots[number % _SLOTS][: sizes[number]], number * _SLICE
             waits = None if number else [free]
             up.append(cl.enqueue_copy(self._queue, target, slot, dst_offset=first, is_blocking=False, wait_for=waits))

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 
 import pyopencl as cl
 
+from potr_cl.errors import DeviceError
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.view_set import ViewSet
@@ -75,14 +76,15 @@ class ViewCache(Owner):
         needed = views.nbytes_cached + own
         if needed + shared > self.room + sum(map(self._geometry, self._whole)):
             return False
-        self.room -= needed + self._geometry(views)
+        left = self.room - needed - self._geometry(views)
+        if self.shared is None and left < max(self._others, 0):
+            self._share(shared // GEOMETRY)
+            left -= shared
+        self.room = left
         while self.room < 0 or (self.room < self._others and to_spare):
             other = to_spare.pop()
             self.room += self._geometry(other)
             other.free_geometry()
-            if self.shared is None:
-                self.room -= shared
-                self._share(shared // GEOMETRY)
         self._whole = to_spare
         return True
 
@@ -90,10 +92,14 @@ class ViewCache(Owner):
         return GEOMETRY * views.stride * len(views.views)
 
     def _share(self, splats: int) -> None:
-        self.shared = (
-            self._memory.allocate(_SHAPE * splats, "the projected splats"),
-            self._memory.allocate(_COLOUR * splats, "the projected splats' colours"),
-        )
+        try:
+            self.shared = (
+                self._memory.allocate(_SHAPE * splats, "the projected splats"),
+                self._memory.allocate(_COLOUR * splats, "the projected splats' colours"),
+            )
+        except DeviceError:
+            self._memory.close()
+            raise
 
     @contextmanager
     def geometry(self, views: ViewSet, rasterizer: Rasterizer | None = None) -> Iterator[bool]:

@@ -377,7 +377,8 @@ class _ClusterWorker(Worker):
                 ]
                 self._next += 1
                 number = self._next
-            self.ask("make", number, kind, memory, things)
+                # Until it is made nothing else is sent, for which the seat would forget what this is made of.
+                self.ask("make", number, kind, memory, things)
             return _HeldThere(self._pool, self, number)
 
         return self._pool.begin(made)

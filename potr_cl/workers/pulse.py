@@ -28,14 +28,19 @@ class Pulse:
 
     def __init__(self, client: Client) -> None:
         self._client = client
-        self._asked: dict[str, float] = {}  # since when those have been asked that have not answered
+        #: Since when those have been asked that have not answered, and when they were asked last.
+        self._asked: dict[str, tuple[float, float]] = {}
         self._lock = threading.Lock()
 
     def is_still(self, address: str) -> bool:
         """Whether a worker has not answered for long. To be asked every few seconds: each time begins to ask it."""
+        now = time.monotonic()
         with self._lock:
-            since = self._asked.setdefault(address, time.monotonic())
-        if since + _STILL < time.monotonic():
+            since, last = self._asked.get(address, (now, now))
+            if last + _STILL < now:  # nobody has waited for it meanwhile: an answer that was lost then says nothing
+                since = now
+            self._asked[address] = since, now
+        if since + _STILL < now:
             return True
         with suppress(RuntimeError):  # the client is closed
             asking = asyncio.run_coroutine_threadsafe(self._ask(address), self._client.loop.asyncio_loop)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from potr_cl.errors import DeviceMemoryError
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.view_cache import ViewCache
 from tests.devices import FAMILIES, open_device
@@ -32,3 +33,21 @@ def test_lists_come_first_and_projections_last(device, plush_excerpt, plush_exce
             assert cache.room == pytest.approx((geometries - whole - shared) * one)
             for views in sets:
                 views.close()
+
+
+def test_a_device_that_refuses_what_views_share_takes_no_room(
+    device, plush_excerpt, plush_excerpt_cameras, monkeypatch
+):
+    with Rasterizer(device, plush_excerpt) as rasterizer, rasterizer.prepare_set(plush_excerpt_cameras[:1]) as views:
+        room = views.nbytes_cached + 48 * rasterizer.stride
+        with ViewCache(rasterizer, room, others=1e12) as cache:
+
+            def refused(nbytes, what):
+                raise DeviceMemoryError("full")
+
+            with monkeypatch.context() as refusing:
+                refusing.setattr(device, "allocate", refused)
+                with pytest.raises(DeviceMemoryError):
+                    cache.keep(views)
+            assert cache.room == room
+            assert cache.keep(views)

@@ -187,17 +187,23 @@ class ResidentSweep(Owner):
     def _sweep_listed(self) -> None:
         counts, self._counts = self._counts or [], [0] * len(self._sets) if self.device_lists else None
         work = [(count, place) for place, count in enumerate(counts) if count]
-        if work:
+        if self._engine.plan.copies_rest:  # there is room for one copy at a time
+            by_copy: dict[int, list[tuple[int, int]]] = {}
+            for count, place in work:
+                by_copy.setdefault(id(self._sets[place].subset), []).append((count, place))
+            parts = list(by_copy.values())
+        else:
+            parts = [work] if work else []
+        for part in parts:
             # The longest first, so that nothing long begins at the end.
-            work.sort(key=lambda each: -each[0])
-            for (count, place), queue in self._queues.dealt(work):
+            part.sort(key=lambda each: -each[0])
+            for (count, place), queue in self._queues.dealt(part):
                 self._engine.project(self._sets[place])
                 self._kernels[place].sweep(self._firsts[place], count, queue)
-            self.tiles_swept += sum(counts)
             self._queues.wait()
-            for ready in self._sets:
-                if ready.shares and self._engine.plan.copies_rest:
-                    self._engine.source.rest(ready.subset)
+            if self._engine.plan.copies_rest:
+                self._engine.source.rest(self._sets[part[0][1]].subset)
+        self.tiles_swept += sum(counts)
         if not self._targets_known and self._measurements:
             for kernels in self._kernels:
                 kernels.target_is_known()
