@@ -7,6 +7,7 @@ coefficients (cl/refit/gather.cl). W weighs pixels so that all views count the s
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -16,6 +17,7 @@ import pyopencl as cl
 from potr_cl.model.camera import Camera
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.view_cache import ViewCache
 from potr_cl.raster.view_set import TABLE_ENTRY, ViewSet
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.refitting.coefficients import Coefficients, Vector
@@ -25,8 +27,11 @@ from potr_cl.stages.refitting.reached import Reach
 from potr_cl.stages.refitting.sweep import Sweep
 from potr_cl.stages.refitting.targets import Targets, nbytes
 from potr_cl.stages.refitting.view_errors import ViewErrors
-from potr_cl.stages.refitting.view_groups import Ready, ViewGroups
 from potr_cl.stages.refitting.view_kernels import Picks, SweptSums, ViewKernels
+from potr_cl.views import plan as plans
+from potr_cl.views.budget import free_memory
+from potr_cl.views.engine import Ready, ViewEngine
+from potr_cl.views.subsets import ListedSplats, Subset, WholeScene
 
 #: Bytes a splat and view of a sweep's own buffers: the colours' change and the sums.
 _CHANGE, _TOTALS = 16, 32
@@ -79,25 +84,29 @@ class OwnViews(Owner):
         self.count = len(cameras)
         self.parts = parts_of(len(cameras))
         own_numbers = range(len(cameras)) if numbers is None else numbers
-        seen = {} if reach is None else {number: len(splats) for number, splats in reach.of.items()}
+        source = WholeScene(rasterizer, reused=True) if reach is None else ListedSplats(rasterizer, reach.of)
+        rooms = {number: source.room(number) for number in own_numbers}
         # Launches, and what is gathered together, are of one part. Views of a launch have about as many splats.
-        self._numbers = sorted(own_numbers, key=lambda each: (each % self.parts, -seen.get(each, 0), each))
-        of_parts = [sum(number % self.parts == part for number in own_numbers) for part in range(self.parts)]
-        breaks = np.cumsum(of_parts).tolist()
-        cameras = [cameras[number] for number in self._numbers]
-        weights = [_weight(camera) for camera in cameras]
-        self._fixed_points = [fixed_points[number] for number in self._numbers]
+        order = sorted(own_numbers, key=lambda each: (each % self.parts, -rooms[each], each))
+        parts = [list(some) for _, some in itertools.groupby(order, lambda each: each % self.parts)]
+        # To render a picture takes many times as long as to project a view, and it takes less room.
+        pictures = sum(nbytes(cameras[number]) for number in own_numbers)
+        self._cache = ViewCache(device, free_memory(device) if memory is None else memory, pictures)
         self._memory = Memory(device)
-        self._owned: list[Owner] = [self._memory]
+        self._owned: list[Owner] = [self._cache, self._memory]
         try:
-            # To render a picture takes many times as long as to project a view, and it takes less room.
-            pictures = sum(nbytes(camera) for camera in cameras)
-            splats = None if reach is None else [reach.of[number] for number in self._numbers]
-            self._views = ViewGroups(
-                rasterizer, cameras, splats, sweep.most_views, _CHANGE + _TOTALS, memory, breaks, pictures
-            )
-            self._owned.append(self._views)
-            groups = self._views.groups
+            plan = plans.in_launches(parts, rooms, self._cache, sweep.most_views, _CHANGE + _TOTALS)
+            self._engine: ViewEngine[_Attached] = ViewEngine(source, cameras, plan, _Attached, sweep.most_views)
+            self._owned.append(self._engine)
+            rasterizer.rest()
+            launches = sorted(self._engine.walk(), key=lambda each: each.numbers[0] % self.parts)
+            self._numbers = [number for each in launches for number in each.numbers]
+            cameras = [cameras[number] for number in self._numbers]
+            weights = [_weight(camera) for camera in cameras]
+            self._fixed_points = [fixed_points[number] for number in self._numbers]
+            ends = [0, *itertools.accumulate(len(each.numbers) for each in launches)]
+            groups = self._groups = [range(*each) for each in itertools.pairwise(ends)]
+            self._launches = dict(zip(groups, launches, strict=True))
             most = max(map(len, groups), default=0)
             together = min(sweep.gathered, max(len(groups), 1)) if most == 1 and reach is None else 1
             self._gathered: list[list[list[range]]] = [
@@ -107,15 +116,14 @@ class OwnViews(Owner):
                     for part in range(self.parts)
                 )
             ]
-            at_once = together * max((len(group) * self._views.stride(group) for group in groups), default=0)
+            at_once = together * max((each.size for each in launches), default=0)
             self._change = self._memory.allocate(_CHANGE * at_once, "the colours' change")
             self._totals = self._memory.allocate(_TOTALS * at_once, "the re-fit's sums")
             #: Which channels of views' own splats are free: a byte a splat and view, which stays as the views may not.
             self._free: dict[range, cl.Buffer] = {}
             if reach is not None:
-                for group in groups:
-                    size = len(group) * self._views.stride(group)
-                    self._free[group] = self._memory.allocate(size, "the channels that are cut")
+                for group, launch in self._launches.items():
+                    self._free[group] = self._memory.allocate(launch.size, "the channels that are cut")
             self._slots = [
                 _Slot(*(_part(of, slot, together) for of in (self._change, self._totals))) for slot in range(together)
             ]
@@ -129,7 +137,7 @@ class OwnViews(Owner):
             scales = np.array([self.one * weight / fixed_point for weight, fixed_point in pairs], np.float32)
             scales = self._memory.upload(scales, "the views' scales")
             self._kernels = ViewKernels(device, layout, rasterizer.parameters.means, scales)
-            self._targets = KeptPictures(device, cameras, self._views.budget, self._numbers, groups)
+            self._targets = KeptPictures(device, cameras, self._cache, self._numbers, groups)
             self._owned.append(self._targets)
         except BaseException:
             self.close()
@@ -138,7 +146,7 @@ class OwnViews(Owner):
     @property
     def room(self) -> float:
         """Bytes of the memory for prepared views and targets that are left."""
-        return self._views.budget.room
+        return self._cache.room
 
     def prepare(self, targets: Targets) -> None:
         """Have the pictures of this device's views that are kept there, before the first gradient asks for them.
@@ -146,7 +154,7 @@ class OwnViews(Owner):
         Raises:
             DeviceError: the device failed. What the targets raise.
         """
-        self._targets.fill(targets, self._views.groups)
+        self._targets.fill(targets, self._groups)
 
     def gradient(
         self,
@@ -165,16 +173,16 @@ class OwnViews(Owner):
                 splats of its own. None: it is not wanted.
         """
 
-        def sweep(group: range, ready: Ready, slot: _Slot) -> None:
-            views = ready.views
-            self._kernels.colour(views, self._picks(group, ready), x, views.colours)
+        def sweep(group: range, ready: Ready[_Attached], slot: _Slot) -> None:
+            views, (_, colours) = ready.views, ready.geometry
+            self._kernels.colour(views, self._picks(group, ready), x, colours, colours)
             pictures = self._targets.of(targets, group)
-            self._enqueue_sweep(group, views, views.colours, pictures, blocks is not None, slot)
+            self._enqueue_sweep(group, ready, colours, pictures, blocks is not None, slot)
             if drawn is not None:
                 self._kernels.mark_drawn(views, drawn)
             # Which of them are cut, the gathering asks.
             nbytes = _CHANGE * views.stride * len(group)
-            cl.enqueue_copy(self._device.queue, slot.change, views.colours, byte_count=nbytes)
+            cl.enqueue_copy(self._device.queue, slot.change, colours, byte_count=nbytes)
             self._errors.keep(group)
 
         self._add_up(sweep, constant=constant, blocks=blocks)
@@ -187,8 +195,8 @@ class OwnViews(Owner):
         """Enqueue the blocks' part of :meth:`gradient` alone, of the splats from one on."""
         self._coefficients.zero(self._change)  # black, and no channel is free
 
-        def sweep(group: range, ready: Ready, slot: _Slot) -> None:
-            self._enqueue_sweep(group, ready.views, slot.change, None, True, slot)
+        def sweep(group: range, ready: Ready[_Attached], slot: _Slot) -> None:
+            self._enqueue_sweep(group, ready, slot.change, None, True, slot)
 
         self._add_up(sweep, blocks=blocks, first_block=first)
 
@@ -202,18 +210,19 @@ class OwnViews(Owner):
             unit: the direction is multiplied by this.
         """
 
-        def sweep(group: range, ready: Ready, slot: _Slot) -> None:
-            views, picks = ready.views, self._picks(group, ready)
-            if ready.anew and picks is None:  # which colours are cut is not known any more
-                self._kernels.colour(views, picks, self._coefficients.on_device(at, 1), views.colours)
-            self._kernels.colour(views, picks, direction, slot.change, unit, constant)
-            self._enqueue_sweep(group, views, slot.change, None, False, slot)
+        def sweep(group: range, ready: Ready[_Attached], slot: _Slot) -> None:
+            views, picks, (_, colours) = ready.views, self._picks(group, ready), ready.geometry
+            anew = ready.shares or self._launches[group].resident is None
+            if anew and picks is None:  # which colours are cut is not known any more
+                self._kernels.colour(views, picks, self._coefficients.on_device(at, 1), colours, colours)
+            self._kernels.colour(views, picks, direction, slot.change, colours, unit, constant)
+            self._enqueue_sweep(group, ready, slot.change, None, False, slot)
 
         self._add_up(sweep, part, constant)
 
     def _add_up(
         self,
-        sweep: Callable[[range, Ready, _Slot], None],
+        sweep: Callable[[range, Ready[_Attached], _Slot], None],
         part: int | None = None,
         constant: bool = False,
         blocks: cl.Buffer | None = None,
@@ -229,33 +238,46 @@ class OwnViews(Owner):
         for groups in self._gathered if part is None else [self._gathered[part]]:
             for gathered in groups:
                 for slot, group in zip(self._slots, gathered, strict=False):
-                    with self._views.ready(group) as ready:
+                    with self._engine.ready(self._launches[group]) as ready:
                         sweep(group, ready, slot)
                         start, size = TABLE_ENTRY * (group.start - gathered[0].start), TABLE_ENTRY * len(group)
                         cl.enqueue_copy(
                             self._device.queue, self._tables, ready.views.table, byte_count=size, dst_offset=start
                         )
                 views = range(gathered[0].start, gathered[-1].stop)
-                stride = self._views.stride(gathered[0])
-                found = SweptSums(self._totals, self._change, stride, ready.picks, self._tables, views)
+                picks, stride = ready.subset.numbers, ready.views.stride
+                found = SweptSums(self._totals, self._change, stride, picks, self._tables, views)
                 self._kernels.gather(found, self.sums, constant, blocks, first_block)
 
-    def _picks(self, group: range, ready: Ready) -> Picks | None:
-        return None if ready.picks is None else Picks(ready.picks, self._free[group])
+    def _picks(self, group: range, ready: Ready[_Attached]) -> Picks | None:
+        numbers = ready.subset.numbers
+        return None if numbers is None else Picks(numbers, self._free[group])
 
     def _enqueue_sweep(
-        self, group: range, views: ViewSet, colours: cl.Buffer, target: cl.Buffer | None, weights: bool, slot: _Slot
-    ) -> None:
+        self, group: range, ready: Ready[_Attached], colours: cl.Buffer, target: cl.Buffer | None, weights: bool,
+        slot: _Slot,
+    ) -> None:  # fmt: skip
         """Enqueue a group's sweep; without a target colours are a change, and black is behind them."""
         background = (0.0, 0.0, 0.0) if target is None else self._background
-        scale = self._fixed_points[group.start]
-        self._sweep.run(views, colours, background, target, scale, self._errors.latest, slot.totals, weights)
+        views, (shapes, _), scale = ready.views, ready.geometry, self._fixed_points[group.start]
+        self._sweep.run(views, shapes, colours, background, target, scale, self._errors.latest, slot.totals, weights)
 
     def close(self) -> None:
         """Give all device memory back."""
         self._slots = []  # parts of buffers, which would keep these
         for owner in reversed(self._owned):
             owner.close()
+
+
+class _Attached(Owner):
+    """Views, with nothing of a re-fit's own but the numbers of their splats."""
+
+    def __init__(self, numbers: Sequence[int], subset: Subset, views: ViewSet, *_: object) -> None:
+        self.nbytes = 0 if subset.numbers is None else subset.numbers.size
+        self._views = views
+
+    def close(self) -> None:
+        self._views.close()
 
 
 @dataclass(frozen=True)
