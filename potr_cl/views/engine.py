@@ -235,7 +235,8 @@ class ViewEngine(Owner, Generic[W]):
                     else:
                         work.close()
                     first += len(some)
-                    said(first)
+                    if first < len(numbers):  # the end is told by who has asked for the group
+                        said(first)
         except BaseException:
             for ready in found:
                 ready.work.close()
