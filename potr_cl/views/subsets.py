@@ -8,7 +8,7 @@ the others keep their order.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -27,6 +27,7 @@ from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.raster.scene_buffers import SPLAT_GROUP, Drawable, SceneBuffers, stride_of
 from potr_cl.raster.view_set import ViewSet
 from potr_cl.views.groups import Indices, ViewGroup
+from potr_cl.views.reached import Reach
 
 
 @dataclass(frozen=True)
@@ -248,13 +249,13 @@ class ListedSplats(_Parted):
 
     Args:
         rasterizer: of the scene; the caller's.
-        listed: (n,) uint32, the splats of each view by its number, ascending.
+        reach: of the views.
     """
 
-    def __init__(self, rasterizer: Rasterizer, listed: Mapping[int, NDArray[np.uint32]]) -> None:
+    def __init__(self, rasterizer: Rasterizer, reach: Reach) -> None:
         self._whole = rasterizer.parameters
         super().__init__(rasterizer.device, self._whole, rasterizer.stride, rasterizer.background, rasterizer.rules)
-        self._listed = dict(listed)
+        self._listed = dict(reach.of)
 
     def streams_in(self) -> Memory:
         return Reused(self.device)

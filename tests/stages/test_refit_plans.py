@@ -16,11 +16,12 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.picked_splats import PickedSplats
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages import refit as refit_stage
-from potr_cl.stages.refitting import own_views, placement, reached
+from potr_cl.stages.refitting import own_views, placement
 from potr_cl.stages.refitting.colour_refit import ColourRefit, HelpFrom
-from potr_cl.stages.refitting.reached import reached_splats
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
+from potr_cl.views import reached
+from potr_cl.views.reached import reached_splats
 from potr_cl.views.subsets import ListedSplats
 from potr_cl.workers.host import HostPool
 from tests.cases.elsewhere import ElsewherePool

@@ -23,7 +23,6 @@ from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.refitting.coefficients import Coefficients, Vector
 from potr_cl.stages.refitting.fixed_point import gathered_scale
 from potr_cl.stages.refitting.kept_pictures import KeptPictures
-from potr_cl.stages.refitting.reached import Reach
 from potr_cl.stages.refitting.sweep import Sweep
 from potr_cl.stages.refitting.targets import Targets, nbytes
 from potr_cl.stages.refitting.view_errors import ViewErrors
@@ -31,6 +30,7 @@ from potr_cl.stages.refitting.view_kernels import Picks, SweptSums, ViewKernels
 from potr_cl.views import plan as plans
 from potr_cl.views.budget import free_memory
 from potr_cl.views.engine import Ready, ViewEngine
+from potr_cl.views.reached import Reach
 from potr_cl.views.subsets import ListedSplats, Subset, WholeScene
 
 #: Bytes a splat and view of a sweep's own buffers: the colours' change and the sums.
@@ -84,7 +84,7 @@ class OwnViews(Owner):
         self.count = len(cameras)
         self.parts = parts_of(len(cameras))
         own_numbers = range(len(cameras)) if numbers is None else numbers
-        source = WholeScene(rasterizer, reused=True) if reach is None else ListedSplats(rasterizer, reach.of)
+        source = WholeScene(rasterizer, reused=True) if reach is None else ListedSplats(rasterizer, reach)
         rooms = {number: source.room(number) for number in own_numbers}
         # Launches, and what is gathered together, are of one part. Views of a launch have about as many splats.
         order = sorted(own_numbers, key=lambda each: (each % self.parts, -rooms[each], each))
