@@ -29,7 +29,7 @@ from potr_cl.stages.refitting.view_errors import ViewErrors
 from potr_cl.stages.refitting.view_kernels import Picks, SweptSums, ViewKernels
 from potr_cl.views import plan as plans
 from potr_cl.views.budget import free_memory
-from potr_cl.views.engine import Ready, ViewEngine
+from potr_cl.views.engine import Launch, Ready, ViewEngine
 from potr_cl.views.reached import Reach
 from potr_cl.views.subsets import ListedSplats, Subset, WholeScene
 
@@ -79,8 +79,9 @@ class OwnViews(Owner):
         self._device = device = coefficients.device
         layout = coefficients.layout
         self._coefficients, self._background, self._sweep = coefficients, background, sweep
-        self.one = gathered_scale(cameras, [_weight(camera) for camera in cameras])
-        fixed_points = sweep.fixed_point_scales(cameras)
+        weights = [_weight(camera) for camera in cameras]
+        self.one = gathered_scale(cameras, weights)
+        self._fixed_points = sweep.fixed_point_scales(cameras)
         self.count = len(cameras)
         self.parts = parts_of(len(cameras))
         own_numbers = range(len(cameras)) if numbers is None else numbers
@@ -100,30 +101,22 @@ class OwnViews(Owner):
             self._owned.append(self._engine)
             rasterizer.rest()
             launches = sorted(self._engine.walk(), key=lambda each: each.numbers[0] % self.parts)
-            self._numbers = [number for each in launches for number in each.numbers]
-            cameras = [cameras[number] for number in self._numbers]
-            weights = [_weight(camera) for camera in cameras]
-            self._fixed_points = [fixed_points[number] for number in self._numbers]
             ends = [0, *itertools.accumulate(len(each.numbers) for each in launches)]
-            groups = self._groups = [range(*each) for each in itertools.pairwise(ends)]
-            self._launches = dict(zip(groups, launches, strict=True))
-            most = max(map(len, groups), default=0)
-            together = min(sweep.gathered, max(len(groups), 1)) if most == 1 and reach is None else 1
-            self._gathered: list[list[list[range]]] = [
-                [some[first : first + together] for first in range(0, len(some), together)]
-                for some in (
-                    [group for group in groups if self._numbers[group[0]] % self.parts == part]
-                    for part in range(self.parts)
-                )
+            self._launches = [
+                _Own(each, range(*views), None if reach is None else self._memory.allocate(each.size, "what is cut"))
+                for each, views in zip(launches, itertools.pairwise(ends), strict=True)
             ]
+            most = max((len(each.numbers) for each in launches), default=0)
+            together = min(sweep.gathered, max(len(launches), 1)) if most == 1 and reach is None else 1
+            self._gathered: list[list[list[_Own]]] = [[] for _ in range(self.parts)]
+            for own in self._launches:
+                of_part = self._gathered[own.launch.numbers[0] % self.parts]
+                if not of_part or len(of_part[-1]) == together:
+                    of_part.append([])
+                of_part[-1].append(own)
             at_once = together * max((each.size for each in launches), default=0)
             self._change = self._memory.allocate(_CHANGE * at_once, "the colours' change")
             self._totals = self._memory.allocate(_TOTALS * at_once, "the re-fit's sums")
-            #: Which channels of views' own splats are free: a byte a splat and view, which stays as the views may not.
-            self._free: dict[range, cl.Buffer] = {}
-            if reach is not None:
-                for group, launch in self._launches.items():
-                    self._free[group] = self._memory.allocate(launch.size, "the channels that are cut")
             self._slots = [
                 _Slot(*(_part(of, slot, together) for of in (self._change, self._totals))) for slot in range(together)
             ]
@@ -131,13 +124,13 @@ class OwnViews(Owner):
             coefficients.zero(self._totals)
             self.sums = self._memory.allocate(8 * layout.columns * layout.stride, "the sums over views")
             coefficients.zero(self.sums)
-            self._errors = ViewErrors(device, cameras, weights, self._numbers, groups)
+            sets = [each.numbers for each in launches]
+            self._errors = ViewErrors(device, cameras, weights, sets)
             self._owned.append(self._errors)
-            pairs = zip(weights, self._fixed_points, strict=True)
-            scales = np.array([self.one * weight / fixed_point for weight, fixed_point in pairs], np.float32)
-            scales = self._memory.upload(scales, "the views' scales")
+            ratios = [self.one * weights[each] / self._fixed_points[each] for some in sets for each in some]
+            scales = self._memory.upload(np.array(ratios, np.float32), "the views' scales")
             self._kernels = ViewKernels(device, layout, rasterizer.parameters.means, scales)
-            self._targets = KeptPictures(device, cameras, self._cache, self._numbers, groups)
+            self._targets = KeptPictures(device, cameras, self._cache, sets)
             self._owned.append(self._targets)
         except BaseException:
             self.close()
@@ -154,7 +147,7 @@ class OwnViews(Owner):
         Raises:
             DeviceError: the device failed. What the targets raise.
         """
-        self._targets.fill(targets, self._groups)
+        self._targets.fill(targets, [each.launch.numbers for each in self._launches])
 
     def gradient(
         self,
@@ -173,17 +166,17 @@ class OwnViews(Owner):
                 splats of its own. None: it is not wanted.
         """
 
-        def sweep(group: range, ready: Ready[_Attached], slot: _Slot) -> None:
+        def sweep(own: _Own, ready: Ready[_Attached], slot: _Slot) -> None:
             views, (_, colours) = ready.views, ready.geometry
-            self._kernels.colour(views, self._picks(group, ready), x, colours, colours)
-            pictures = self._targets.of(targets, group)
-            self._enqueue_sweep(group, ready, colours, pictures, blocks is not None, slot)
+            self._kernels.colour(views, own.picks(ready), x, colours, colours)
+            pictures = self._targets.of(targets, own.launch.numbers)
+            self._enqueue_sweep(ready, colours, pictures, blocks is not None, slot)
             if drawn is not None:
                 self._kernels.mark_drawn(views, drawn)
             # Which of them are cut, the gathering asks.
-            nbytes = _CHANGE * views.stride * len(group)
+            nbytes = _CHANGE * views.stride * len(own.views)
             cl.enqueue_copy(self._device.queue, slot.change, colours, byte_count=nbytes)
-            self._errors.keep(group)
+            self._errors.keep(own.views)
 
         self._add_up(sweep, constant=constant, blocks=blocks)
 
@@ -195,8 +188,8 @@ class OwnViews(Owner):
         """Enqueue the blocks' part of :meth:`gradient` alone, of the splats from one on."""
         self._coefficients.zero(self._change)  # black, and no channel is free
 
-        def sweep(group: range, ready: Ready[_Attached], slot: _Slot) -> None:
-            self._enqueue_sweep(group, ready, slot.change, None, True, slot)
+        def sweep(own: _Own, ready: Ready[_Attached], slot: _Slot) -> None:
+            self._enqueue_sweep(ready, slot.change, None, True, slot)
 
         self._add_up(sweep, blocks=blocks, first_block=first)
 
@@ -210,19 +203,19 @@ class OwnViews(Owner):
             unit: the direction is multiplied by this.
         """
 
-        def sweep(group: range, ready: Ready[_Attached], slot: _Slot) -> None:
-            views, picks, (_, colours) = ready.views, self._picks(group, ready), ready.geometry
-            anew = ready.shares or self._launches[group].resident is None
+        def sweep(own: _Own, ready: Ready[_Attached], slot: _Slot) -> None:
+            views, picks, (_, colours) = ready.views, own.picks(ready), ready.geometry
+            anew = ready.shares or own.launch.resident is None
             if anew and picks is None:  # which colours are cut is not known any more
                 self._kernels.colour(views, picks, self._coefficients.on_device(at, 1), colours, colours)
             self._kernels.colour(views, picks, direction, slot.change, colours, unit, constant)
-            self._enqueue_sweep(group, ready, slot.change, None, False, slot)
+            self._enqueue_sweep(ready, slot.change, None, False, slot)
 
         self._add_up(sweep, part, constant)
 
     def _add_up(
         self,
-        sweep: Callable[[range, Ready[_Attached], _Slot], None],
+        sweep: Callable[[_Own, Ready[_Attached], _Slot], None],
         part: int | None = None,
         constant: bool = False,
         blocks: cl.Buffer | None = None,
@@ -235,31 +228,27 @@ class OwnViews(Owner):
             part: of the views; None: all.
             constant, blocks, first_block: as of :meth:`ViewKernels.gather`.
         """
-        for groups in self._gathered if part is None else [self._gathered[part]]:
-            for gathered in groups:
-                for slot, group in zip(self._slots, gathered, strict=False):
-                    with self._engine.ready(self._launches[group]) as ready:
-                        sweep(group, ready, slot)
-                        start, size = TABLE_ENTRY * (group.start - gathered[0].start), TABLE_ENTRY * len(group)
+        for of_part in self._gathered if part is None else [self._gathered[part]]:
+            for gathered in of_part:
+                views = range(gathered[0].views.start, gathered[-1].views.stop)
+                for slot, own in zip(self._slots, gathered, strict=False):
+                    with self._engine.ready(own.launch) as ready:
+                        sweep(own, ready, slot)
+                        start, size = TABLE_ENTRY * (own.views.start - views.start), TABLE_ENTRY * len(own.views)
                         cl.enqueue_copy(
                             self._device.queue, self._tables, ready.views.table, byte_count=size, dst_offset=start
                         )
-                views = range(gathered[0].start, gathered[-1].stop)
                 picks, stride = ready.subset.numbers, ready.views.stride
                 found = SweptSums(self._totals, self._change, stride, picks, self._tables, views)
                 self._kernels.gather(found, self.sums, constant, blocks, first_block)
 
-    def _picks(self, group: range, ready: Ready[_Attached]) -> Picks | None:
-        numbers = ready.subset.numbers
-        return None if numbers is None else Picks(numbers, self._free[group])
-
     def _enqueue_sweep(
-        self, group: range, ready: Ready[_Attached], colours: cl.Buffer, target: cl.Buffer | None, weights: bool,
+        self, ready: Ready[_Attached], colours: cl.Buffer, target: cl.Buffer | None, weights: bool,
         slot: _Slot,
     ) -> None:  # fmt: skip
         """Enqueue a group's sweep; without a target colours are a change, and black is behind them."""
         background = (0.0, 0.0, 0.0) if target is None else self._background
-        views, (shapes, _), scale = ready.views, ready.geometry, self._fixed_points[group.start]
+        views, (shapes, _), scale = ready.views, ready.geometry, self._fixed_points[ready.numbers[0]]
         self._sweep.run(views, shapes, colours, background, target, scale, self._errors.latest, slot.totals, weights)
 
     def close(self) -> None:
@@ -278,6 +267,25 @@ class _Attached(Owner):
 
     def close(self) -> None:
         self._views.close()
+
+
+@dataclass(frozen=True)
+class _Own:
+    """What a re-fit knows of a launch.
+
+    Attributes:
+        launch: the engine's.
+        views: their places among all of the views that are done here.
+        free: which channels of views' own splats are free: a byte a splat and view, which stays as the views may not.
+    """
+
+    launch: Launch[_Attached]
+    views: range
+    free: cl.Buffer | None
+
+    def picks(self, ready: Ready[_Attached]) -> Picks | None:
+        """The views' own splats; None: they have all."""
+        return None if ready.subset.numbers is None else Picks(ready.subset.numbers, self.free)
 
 
 @dataclass(frozen=True)
