@@ -17,6 +17,7 @@ bench.virtual_cameras  what does encoding without cameras cost, and what is left
 bench.paired           are whole encodes faster or slower than those of another checkout?
 bench.recoded          are the same splats smaller, and faster to decode, than with another checkout's coder?
 bench.scaling          time and memory against splats, views and workers: with which exponents?
+bench.web              how fast is the browser's decoder against native C, and in how much memory?
 =====================  =================================================================================================
 
 What a choice costs or brings, against the alternatives (``study``):
@@ -54,6 +55,7 @@ make.readme_picture   the picture at the top of the README
 make.other_tools      splats in the formats of six tools, and how splat-transform reads them
 make.golden_files     files that every later decoder must read to the same values
 make.native           the compiled part of the decoder, in the checkout
+make.web              the decoder for browsers, and the viewer of pages
 make.docs             the pages and tables of README and docs that are made from the code (see CONTRIBUTING.md)
 make.benchmarks       the tables and plots of docs/benchmarks, from the results beside them
 ====================  ==================================================================================================

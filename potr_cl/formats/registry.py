@@ -18,7 +18,7 @@ from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.cameras import cameras_json, colmap, transforms
 from potr_cl.formats.declaration import CameraFormat, SceneFormat, SceneLoader, SceneSaver
 from potr_cl.formats.levels import without_level
-from potr_cl.formats.scenes import compressed_ply, gltf, ksplat, ply, potr, sog, sog_levels, splat, spz
+from potr_cl.formats.scenes import compressed_ply, gltf, ksplat, page, ply, potr, sog, sog_levels, splat, spz
 
 _GSPLAT = "export it as PLY, by gsplat's simple_trainer.py with --save-ply or by gsplat.export_splats"
 _NERFSTUDIO = "export it as PLY, by nerfstudio's `ns-export gaussian-splat --load-config CONFIG.yml --output-dir DIR`"
@@ -36,6 +36,7 @@ SCENE_FORMATS: tuple[SceneFormat, ...] = (
     gltf.FORMAT,
     splat.FORMAT,
     ksplat.FORMAT,
+    page.FORMAT,
 )
 
 #: Bytes that a scene begins with and that may be needed to tell its format.

@@ -11,6 +11,7 @@ from potr_cl.formats.registry import listed, stem_of_scene, suffix_of_name, writ
 from potr_cl.outputs.compressed_ply import CompressedPly
 from potr_cl.outputs.gltf import Gltf
 from potr_cl.outputs.output import Output
+from potr_cl.outputs.page import Page
 from potr_cl.outputs.ply import Ply
 from potr_cl.outputs.potr import Potr
 from potr_cl.outputs.sog import Sog
@@ -24,6 +25,7 @@ OUTPUTS: tuple[type[Output], ...] = (
     CompressedPly,
     Gltf,
     Ply,
+    Page,
 )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import dataclasses
 import json
 
@@ -11,7 +12,7 @@ import pytest
 import potr_cl
 from potr_cl import Scene
 from potr_cl.formats import registry
-from potr_cl.formats.scenes import ply
+from potr_cl.formats.scenes import page, ply
 from potr_cl.report.scene import format_scene, scene_report
 from tests.reference.scenes import random_scene
 
@@ -214,6 +215,9 @@ def test_every_format_that_is_read_is_told(tmp_path, data, scene):
     # Opacities in steps that are fine enough for the comparison below.
     potr_cl.encode(scene, prune=False, refit=False, compact=False, sf_opacity=30, output=tmp_path / "scene.potr")
     files.append(tmp_path / "scene.potr")
+    coded = base64.b64encode((tmp_path / "scene.potr").read_bytes())
+    (tmp_path / "scene.html").write_bytes(page.BEGIN + coded + page.END)
+    files.append(tmp_path / "scene.html")
     told = set()
     opacities, scales = scene.opacities, np.exp(scene.log_scales.max(axis=1))
     for path in files:

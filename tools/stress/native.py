@@ -301,6 +301,8 @@ def _attack(args: argparse.Namespace, library: Path, folder: Path) -> _Findings:
         if not workers:
             return found
         for worker in list(workers):
+            if time.monotonic() >= end:
+                worker.stop()
             if worker.process.poll() is not None:
                 workers.remove(worker)
                 worker.add_to(found)
@@ -308,13 +310,14 @@ def _attack(args: argparse.Namespace, library: Path, folder: Path) -> _Findings:
 
 
 class _Worker:
-    """A process, and the files that it reads. One that a file ends goes on behind it."""
+    """A process, and the files that it reads."""
+
+    _stopped = False
 
     def __init__(self, args: argparse.Namespace, first: int, stop: int, library: Path, folder: Path) -> None:
         self._seed = args.seed
         self._said = folder / f"said-{first}"
         self._at = folder / f"at-{first}"
-        self._stop = stop
         environment = {
             **os.environ,
             LIBRARY_VARIABLE: str(library),
@@ -333,6 +336,13 @@ class _Worker:
                 [*command, *map(str, numbers)], stdout=said, stderr=subprocess.STDOUT, env=environment, cwd=folder
             )
 
+    def stop(self) -> None:
+        """Its batches until now count."""
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+            self._stopped = True
+
     def add_to(self, found: _Findings) -> None:
         for told in self._lines():
             if "differs" in told:
@@ -343,13 +353,13 @@ class _Worker:
                 found.files += told["read"] + told["refused"]
                 for name in ("read", "refused", "compared"):
                     setattr(found, name, getattr(found, name) + told[name])
-        if self.process.returncode:
+        if self.process.returncode and not self._stopped:
             at = self._at.read_text().strip() if self._at.exists() else "?"
             found.told.append(f"file {at} of seed {self._seed} ended a process:\n{self._said.read_text()[-3000:]}")
 
     def _lines(self) -> Iterator[dict[str, Any]]:
         for line in self._said.read_text().splitlines():
-            if line.startswith("{"):
+            if line.startswith("{") and line.endswith("}"):
                 yield json.loads(line)
 
 

@@ -20,17 +20,17 @@ static int decode_items(const stream_model *model, reader *r, uint32_t *states, 
     return decode_tokens(model, r, states, lanes, items, &rows);
 }
 
-static INLINE int32_t integer_of(const work *w, size_t at)
+static INLINE level integer_of(const work *w, size_t at)
 {
     const uint32_t token = w->tokens[at];
     if (token < DIRECT)
-        return (int32_t)token;
-    return (int32_t)((4 + (token - DIRECT) % 4) << extra_bits(token) | w->extra[at]);
+        return (level)token;
+    return (level)((mapped_level)(4 + (token - DIRECT) % 4) << extra_bits(token) | w->extra[at]);
 }
 
-static INLINE int32_t from_zigzag(int32_t u)
+static INLINE level from_zigzag(level u)
 {
-    return (int32_t)((uint32_t)u >> 1) ^ -(u & 1);
+    return (level)((mapped_level)u >> 1) ^ -(u & 1);
 }
 
 /* Tokens where no splat is, to the end of the rows: what lanes without one have found there may stand for anything. */
@@ -68,7 +68,7 @@ static void add_terms(
 
 /* The integers of a stream of an item a splat. Nearly all are tokens by themselves. */
 POTR_WIDE
-static void keep_dense(const stream_model *model, const work *w, size_t places, int is_signed, int32_t *restrict integers)
+static void keep_dense(const stream_model *model, const work *w, size_t places, int is_signed, level *restrict integers)
 {
     const uint8_t *const tokens = w->tokens;
     if (is_signed)
@@ -93,7 +93,7 @@ static void keep_dense(const stream_model *model, const work *w, size_t places, 
 static int dense_section(
     const stream_model *models, size_t number, const int16_t *const *known, size_t known_number, int is_signed,
     reader *r, uint32_t *states, size_t lanes, size_t splats, work *w, int16_t sizes[][BUNDLE],
-    int32_t integers[][BUNDLE])
+    level integers[][BUNDLE])
 {
     const size_t steps = steps_of(splats), places = LANES * steps;
     const size_t whole = (places + LANE - 1) / LANE * LANE;
@@ -121,7 +121,7 @@ static void find_steps(const colour_steps *steps, uint64_t begin, size_t splats,
         const size_t rows = steps_of(splats);
         for (size_t step = 0; step < rows; step++) {
             const size_t at = step * LANES, count = (splats - step + rows - 1) / rows;
-            const int32_t *const scales[3] = { w->scales[0] + at, w->scales[1] + at, w->scales[2] + at };
+            const level *const scales[3] = { w->scales[0] + at, w->scales[1] + at, w->scales[2] + at };
             find_classes(steps, w->logarithms, scales, w->opacity + at, begin + step, rows, count,
                 w->dc_classes + at, w->ac_classes + at);
         }
@@ -183,7 +183,7 @@ static int decode_band(
 
     for (size_t c = 0; c < 3; c++) {
         model = &models[VALUE_STREAM + c];
-        int32_t *const channel = w->channels[band][c];
+        level *const channel = w->channels[band][c];
         memset(channel, 0, items * sizeof *channel);
         memset(w->value_sizes[c], 0, items * sizeof *w->value_sizes[c]);
         size_t chosen = 0;
@@ -349,17 +349,17 @@ POTR_EXPORT void potr_bundles_begin(work *w)
 
 /* Where a bundle's integers go. */
 typedef struct {
-    int32_t *opacity;      /* (splats of the bundle) */
-    int32_t *scales;       /* (3, splats) */
-    int32_t *rotations;    /* (3, splats) */
-    int32_t *dc;           /* (3, splats) */
+    level *opacity;        /* (splats of the bundle) */
+    level *scales;         /* (3, splats) */
+    level *rotations;      /* (3, splats) */
+    level *dc;             /* (3, splats) */
     uint16_t *item_splats; /* (15 · splats) of each item, counted from the bundle's first */
     uint8_t *item_coefficients; /* (15 · splats) 1 to 15 */
-    int32_t *item_channels;     /* (3, 15 · splats) */
+    level *item_channels;       /* (3, 15 · splats) */
     uint64_t items[3];     /* of each degree */
 } bundle_levels;
 
-static void to_splats(const int32_t *rows, size_t steps, size_t splats, int32_t *out)
+static void to_splats(const level *rows, size_t steps, size_t splats, level *out)
 {
     for (size_t s = 0; s < splats; s++)
         out[s] = rows[s % steps * LANES + s / steps];
@@ -395,7 +395,7 @@ POTR_EXPORT int potr_bundles_levels(
             out->item_coefficients[number + i] = (uint8_t)(first + w->coefficients[band][i]);
         }
         for (size_t c = 0; c < 3; c++)
-            memcpy(out->item_channels + c * 15 * splats + number, w->channels[band][c], items * sizeof(int32_t));
+            memcpy(out->item_channels + c * 15 * splats + number, w->channels[band][c], items * sizeof(level));
         number += items;
     }
     return FINE;

@@ -29,6 +29,16 @@ enum {
     TERMS = 12             /* most of a stream */
 };
 
+/* Integers of splats. Those of real files are below 2^29 in magnitude; POTR_WIDE_LEVELS has room for all that the format
+ * allows, for builds that have no other path for them. */
+#if defined(POTR_WIDE_LEVELS)
+typedef int64_t level;
+typedef uint64_t mapped_level;
+#else
+typedef int32_t level;
+typedef uint32_t mapped_level;
+#endif
+
 /* Sections in the order of decoding, and where the streams of each begin among all. */
 enum { OPACITY, SCALE, DC, BAND_1, BAND_2, BAND_3, ROTATION, SECTIONS };
 enum { OPACITY_STREAM = 0, SCALE_STREAM = 1, DC_STREAM = 4, BAND_STREAM = 7, ROTATION_STREAM = 22, STREAMS = 25 };
@@ -80,18 +90,18 @@ typedef struct {
     /* Classes of the steps of DC and of AC, in rows, from 0 on: more by CLASSES than they are. */
     uint8_t dc_classes[BUNDLE], ac_classes[BUNDLE];
     /* Integers in rows; of DC what its prediction has left. */
-    int32_t opacity[BUNDLE], scales[3][BUNDLE], rotations[3][BUNDLE], dc[3][BUNDLE];
+    level opacity[BUNDLE], scales[3][BUNDLE], rotations[3][BUNDLE], dc[3][BUNDLE];
     /* AC coefficients that are not 0, degree by degree, in the order of splats: place, number of the coefficient from
      * the first of the degree on, channels. */
     uint16_t places[3][ITEMS + 8];
     uint8_t coefficients[3][ITEMS + 8];
-    int32_t channels[3][3][ITEMS];
+    level channels[3][3][ITEMS];
     uint32_t items[3];
     /* Of the stream that is being decoded: in rows of its own. */
     int32_t expected[ITEMS + LANES];
     uint8_t tokens[ITEMS + LANES];
     int16_t sizes[ITEMS + LANES];
-    uint32_t extra[ITEMS + LANES];
+    mapped_level extra[ITEMS + LANES];
     /* Of the degree that is being decoded. */
     int32_t of_splats[BUNDLE];
     uint8_t patterns[ITEMS];

@@ -30,8 +30,8 @@ static int renormalise(reader *r, uint32_t *states, size_t count)
     return 0;
 }
 
-/* The bits beside the tokens of a row. Bits beyond the 32nd are lost: the caller knows that there are none. */
-static int take_bits(reader *r, uint32_t *states, size_t count, const uint8_t *tokens, uint32_t *extra)
+/* The bits beside the tokens of a row. Bits beyond those of a level are lost: the caller knows that there are none. */
+static int take_bits(reader *r, uint32_t *states, size_t count, const uint8_t *tokens, mapped_level *extra)
 {
     memset(extra, 0, count * sizeof *extra);
     for (unsigned shift = 0;; shift += CHUNK) {
@@ -41,7 +41,7 @@ static int take_bits(reader *r, uint32_t *states, size_t count, const uint8_t *t
             if (all <= shift)
                 continue;
             const unsigned bits = all - shift < CHUNK ? all - shift : CHUNK;
-            extra[i] |= (states[i] & ((1u << bits) - 1)) << shift;
+            extra[i] |= (mapped_level)(states[i] & ((1u << bits) - 1)) << shift;
             states[i] >>= bits;
             more = 1;
         }

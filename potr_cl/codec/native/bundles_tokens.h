@@ -16,7 +16,7 @@ typedef struct {
     const int32_t *expected; /* sums of terms, constant and bias */
     uint8_t *tokens;
     int16_t *sizes;          /* of the tokens */
-    uint32_t *extra;         /* bits beside tokens, in rows that have some */
+    mapped_level *extra;     /* bits beside tokens, in rows that have some */
 } rows_of_tokens;
 
 /* Entries of stream_model.intervals. */

@@ -10,12 +10,12 @@
 
 /* Values of a table for the levels in rows, every `stride`-th number of `out`; whether a level is beyond the table. */
 static int look_up(
-    const int32_t *rows, size_t lanes, size_t steps, size_t splats, const float *table, uint64_t levels, float *out,
+    const level *rows, size_t lanes, size_t steps, size_t splats, const float *table, uint64_t levels, float *out,
     size_t stride)
 {
-    uint32_t most = 0;
+    mapped_level most = 0;
     for (size_t i = 0; i < LANES * steps; i++)
-        most = (uint32_t)rows[i] > most ? (uint32_t)rows[i] : most;
+        most = (mapped_level)rows[i] > most ? (mapped_level)rows[i] : most;
     if (most >= levels)
         return 1;
     for (size_t lane = 0, splat = 0; lane < lanes; lane++)
@@ -32,7 +32,7 @@ static void rotations(
         const size_t begin = lane * steps, number = splats - begin < steps ? splats - begin : steps;
         for (size_t step = 0; step < number; step++) {
             const size_t place = step * LANES + lane;
-            int32_t largest = w->scales[0][place];
+            level largest = w->scales[0][place];
             largest = w->scales[1][place] > largest ? w->scales[1][place] : largest;
             largest = w->scales[2][place] > largest ? w->scales[2][place] : largest;
             factors[step] = (float)(largest > 1 ? largest : 1);
@@ -75,19 +75,19 @@ static void rotations(
     }
 }
 
-static INLINE int32_t as_it_is(int32_t level)
+static INLINE level as_it_is(level integer)
 {
-    return level;
+    return integer;
 }
 
-DC_OF(dc_runs, int32_t, as_it_is)
+DC_OF(dc_runs, level, as_it_is)
 
 /* DC of a bundle's splats. Lanes that are whole are runs of the prediction; where they are shorter, it goes on from lane
  * to lane. */
 static void colours_of_dc(const work *w, const scene_values *out, size_t steps, size_t splats, float *to, uint64_t all)
 {
     const dc_steps of = { out->step, out->inverse, out->sf_dc };
-    const int32_t *const *const dc = (const int32_t *const[]) { w->dc[0], w->dc[1], w->dc[2] };
+    const level *const *const dc = (const level *const[]) { w->dc[0], w->dc[1], w->dc[2] };
     if (steps == RUN) {
         const size_t whole = splats / RUN, four = whole / SIDE_BY_SIDE * SIDE_BY_SIDE;
         for (size_t lane = 0; lane < four; lane += SIDE_BY_SIDE) {
@@ -127,13 +127,13 @@ static INLINE void colours_of_items(
     float *blue)
 {
     const uint16_t *const places = w->places[band] + begin;
-    const int32_t *const y = w->channels[band][0] + begin, *const co = w->channels[band][1] + begin,
-                  *const cg = w->channels[band][2] + begin;
+    const level *const y = w->channels[band][0] + begin, *const co = w->channels[band][1] + begin,
+                *const cg = w->channels[band][2] + begin;
     float divisor[LANE];
     for (size_t i = 0; i < number; i++)
         divisor[i] = divisors[w->ac_classes[places[i]]];
     for (size_t i = 0; i < number; i++) {
-        const int32_t rest = y[i] - cg[i];
+        const level rest = y[i] - cg[i];
         red[i] = (float)(rest + co[i]) / divisor[i];
         green[i] = (float)(y[i] + cg[i]) / divisor[i];
         blue[i] = (float)(rest - co[i]) / divisor[i];

@@ -21,7 +21,9 @@
 #error "floats are computed in more digits than they have here, which makes other numbers of the same file"
 #endif
 
-#if defined(_MSC_VER)
+#if defined(POTR_SMALL)
+#define INLINE inline
+#elif defined(_MSC_VER)
 #define INLINE __forceinline
 #else
 #define INLINE inline __attribute__((always_inline))

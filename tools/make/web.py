@@ -1,0 +1,79 @@
+"""Build the npm package of the decoder for browsers (web/), and what pages are made of (potr_cl/outputs/page.html).
+
+    python -m tools.make.web [--only-wasm]
+
+The C is compiled to WebAssembly by Zig's C compiler, which PyPI has (pip install ziglang), or by clang, wasi-libc and
+lld of Debian, whichever is there. All else is npm's: web/package-lock.json says what is installed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import potr_cl.codec.native
+
+WEB = Path(__file__).parents[2] / "web"
+_NATIVE = Path(potr_cl.codec.native.__file__).parent
+_SOURCES = ("bundles", "bundles_tokens", "bundles_values", "steps", "octree", "quantise")
+_ALWAYS = (
+    "--target=wasm32-wasi", "-mexec-model=reactor", "-std=c11", "-flto", "-ffp-contract=off", "-fno-math-errno",
+    "-fvisibility=hidden", "-fno-stack-protector", "-mbulk-memory", "-mnontrapping-fptoint", "-msign-ext",
+    "-Wl,--no-entry", "-Wl,--gc-sections", "-Wl,--strip-all", "-Wl,--export=__heap_base",
+)  # fmt: skip
+#: The build that takes every file, as small as it can be; and the one for speed.
+BUILDS = {
+    "potr.wasm": ("-Oz", "-DPOTR_SMALL", "-DPOTR_WIDE_LEVELS"),
+    "potr-simd.wasm": ("-O3", "-msimd128"),
+}
+
+
+def compiler() -> list[str]:
+    """The command of a compiler for WebAssembly.
+
+    Raises:
+        SystemExit: there is none.
+    """
+    if importlib.util.find_spec("ziglang") is not None:
+        return [sys.executable, "-m", "ziglang", "cc"]
+    if shutil.which("clang") and shutil.which("wasm-ld") and Path("/usr/include/wasm32-wasi").exists():
+        return ["clang", "--sysroot=/usr", "-isystem", "/usr/include/wasm32-wasi", "-L/usr/lib/wasm32-wasi"]
+    sys.exit("there is no compiler for WebAssembly: pip install ziglang, or apt install clang lld wasi-libc")
+
+
+def compile_wasm(folder: Path) -> None:
+    """Compile all :data:`BUILDS` to a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    sources = [WEB / "src" / "decoder.c", *(_NATIVE / f"{name}.c" for name in _SOURCES)]
+    for name, options in BUILDS.items():
+        _run([*compiler(), *_ALWAYS, *options, f"-I{_NATIVE}", *map(str, sources), "-o", str(folder / name)])
+
+
+def _run(command: Sequence[str], folder: Path | None = None) -> None:
+    if subprocess.run(command, cwd=folder, check=False).returncode:
+        sys.exit(f"failed: {' '.join(command)}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only-wasm", action="store_true", help="compile the C, and leave npm alone")
+    args = parser.parse_args()
+    compile_wasm(WEB / "dist")
+    if args.only_wasm:
+        return
+    npm = shutil.which("npm")
+    if npm is None:
+        sys.exit("there is no npm: install Node 20 or newer")
+    if not (WEB / "node_modules").exists():
+        _run([npm, "ci", "--ignore-scripts"], WEB)
+    for script in ("check", "build"):
+        _run([npm, "run", "--silent", script], WEB)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,31 @@
+// A worker of the pool: decodes parts of blocks, of the one that it was sent last.
+
+import { Decoder } from './block.js';
+import { PotrError } from './container.js';
+import { loader } from './engine.js';
+
+export const NAME = 'potr-decoder';
+
+export function serve() {
+  /** @type {Decoder} */
+  let decoder;
+  /** @type {{id: number, block: any, data: Uint8Array, degree: number}} */
+  let opened;
+  onmessage = async ({ data: job }) => {
+    try {
+      decoder ??= new Decoder(loader(job.wasm));
+      if (job.data) opened = job;
+      await decoder.open(opened.id, opened.block, opened.data, opened.degree);
+      if (job.to === undefined) {
+        const positions = await decoder.positions();
+        postMessage({ positions }, { transfer: [positions.buffer] });
+      } else {
+        const { n, degree } = job, values = { scales: new Float32Array(3 * n), rotations: new Float32Array(4 * n), opacities: new Float32Array(n), sh: new Float32Array(3 * (degree + 1) ** 2 * n) };
+        await decoder.values(job.from, job.to, values, 0);
+        postMessage({ values }, { transfer: Object.values(values).map((array) => array.buffer) });
+      }
+    } catch (error) {
+      postMessage({ error: /** @type {Error} */ (error).message, refused: error instanceof PotrError });
+    }
+  };
+}
