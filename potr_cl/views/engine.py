@@ -237,8 +237,7 @@ class ViewEngine(Owner, Generic[W]):
                     else:
                         work.close()
                     first += len(some)
-                    if first < len(numbers):  # the end is told by who has asked for the group
-                        said(first)
+                    said(first)
         except BaseException:
             for ready in found:
                 ready.work.close()
