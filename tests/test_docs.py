@@ -217,8 +217,9 @@ def test_recipes_can_be_followed(tmp_path: Path) -> None:
         shutil.copytree(ROOT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("__pycache__", "images"))
     for file in ("pyproject.toml", "README.md", "CONTRIBUTING.md"):
         shutil.copy(ROOT / file, tmp_path)
-    # A quirk has no file of its own: it is an entry of quirks.py. Type checkers need the keywords of options by name.
-    lists = {"potr_cl/opencl/quirks.py", "potr_cl/api/choices.py"}
+    # A quirk has no file of its own: it is an entry of quirks.py. Type checkers need the keywords of options by name,
+    # and what a stage has found out.
+    lists = {"potr_cl/opencl/quirks.py", "potr_cl/api/choices.py", "potr_cl/stages/learnt.py"}
     tests, run = [], []
     for title, checks in RECIPES.items():
         blocks = recipe(title)

@@ -200,12 +200,14 @@ def prune(
     with contextlib.ExitStack() as stack:
         ranks = stack.enter_context(replacing(order)) if order is not None else None
         state, used = _run(what, views, virtual_views, options, Prune, device, progress)
-        pruned: Pruned = state.learnt["prune"]
+        pruned, unseen = state.learnt.pruned, state.learnt.unseen
+        assert pruned is not None
+        assert unseen is not None
         if write is not None:
             write(state.scene)
         if ranks is not None:
             np.save(ranks, pruned.order)
-    return PrunedScene(state.scene, len(what), used, pruned, state.learnt["unseen"])
+    return PrunedScene(state.scene, len(what), used, pruned, unseen)
 
 
 @with_choices(CompactChoices)

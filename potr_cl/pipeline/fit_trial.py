@@ -11,14 +11,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 from potr_cl.errors import DeviceMemoryError
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import Output
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import Drawable
-from potr_cl.stages.fit import Fit, LeftOut
+from potr_cl.stages.fit import LeftOut
 from potr_cl.stages.fitting.files import File, TwoFiles
 from potr_cl.stages.fitting.fit import Fitted, held_out_error
 from potr_cl.stages.refitting.targets import RenderedTargets
@@ -47,7 +46,8 @@ class Trial:
 
     def of(self, state: State) -> File:
         """The file that a state becomes, and how well it shows the views that a fit holds out."""
-        coded = self.remaining(state).learnt["code"]
+        coded = self.remaining(state).learnt.coded
+        assert coded is not None, "the last stage makes the file"
         with (
             self.output.seen(b"".join(coded.pieces), self.device, trust=True) as seen,
             Rasterizer(self.device, self.source, background=self.background) as rasterizer,
@@ -71,14 +71,14 @@ def only_if_it_pays(before: State, after: State, trial: Trial) -> State:
     Raises:
         As the stages.
     """
-    told: Any = after.learnt.get(Fit.name)
+    told = after.learnt.fitted
     if not isinstance(told, Fitted) or not told.in_doubt or told.ended_early or told.photographs is not None:
         return after
     left_out = LeftOut(_NO_SMALLER)
     try:
-        files = TwoFiles(trial.of(before.having_learnt(Fit.name, left_out)), trial.of(after))
+        files = TwoFiles(trial.of(before.having_learnt(fitted=left_out)), trial.of(after))
     except DeviceMemoryError:  # where there is no room to compare files, the fit's own judgement has to do
         return after
     if files.pays:
-        return after.having_learnt(Fit.name, dataclasses.replace(told, files=files))
-    return before.having_learnt(Fit.name, dataclasses.replace(left_out, files=files))
+        return after.having_learnt(fitted=dataclasses.replace(told, files=files))
+    return before.having_learnt(fitted=dataclasses.replace(left_out, files=files))

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.encoder import Coded
 from potr_cl.host.threads import in_background
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
@@ -24,7 +23,7 @@ from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.stages.between.price import priced
 from potr_cl.stages.fit import Fit, LeftOut
 from potr_cl.stages.fitting.fit import Fitted
-from potr_cl.stages.guarded import UNRESOLVED, Unresolved, as_they_were
+from potr_cl.stages.guarded import Unresolved, as_they_were
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.pruning.unseen import part_of_area
 from potr_cl.stages.refit import Refit
@@ -81,7 +80,8 @@ class Run:
         prune = next((each for each in self._options.stages if isinstance(each, Prune)), Prune())
         placed = is_virtual(state.views) and prune.keep is None and prune.count is None
         wanted = prune.unseen == "protect" or (prune.unseen == "keep" and placed)
-        if not wanted or UNRESOLVED in state.learnt or not state.views or not self._options.look_at_views(state.source):
+        known = state.learnt.unresolved is not None
+        if not wanted or known or not state.views or not self._options.look_at_views(state.source):
             return state
         self._watch("place cameras", 0.0)
 
@@ -91,12 +91,12 @@ class Run:
         splats, _ = on_device(self.device or self._given or Device(), self._options.memory, found)
         self._watch("place cameras", 1.0)
         area = in_background(part_of_area, state.source, splats).result if splats.any() else float
-        return state.having_learnt(UNRESOLVED, Unresolved(splats, area))
+        return state.having_learnt(unresolved=Unresolved(splats, area))
 
     def _fit_that_pays(self, before: State, after: State) -> State:
         """The state after a fit, or the one before it if a file says so."""
         device = self.device
-        if device is None or Fit.name not in after.learnt or not self._options.stage(Fit).compared:
+        if device is None or after.learnt.fitted is None or not self._options.stage(Fit).compared:
             return after
         names = [type(stage) for stage in self._options.stages]
         remaining = names[names.index(Fit) + 1 :]
@@ -153,17 +153,18 @@ class Run:
 
     def finished(self, state: State) -> Encoded:
         """What the stages have made, as the file that it is."""
-        coded: Coded = state.learnt["code"]
+        coded = state.learnt.coded
+        assert coded is not None, "the last stage makes the file"
         return Encoded(
             pieces=coded.pieces,
             nbytes=coded.nbytes,
             order=state.survivors[coded.order],
-            pruned=state.learnt.get("prune"),
-            unseen=state.learnt.get("unseen"),
-            fitted=state.learnt.get("fit"),
-            refitted=state.learnt.get("refit"),
-            photographs=state.learnt.get("photographs"),
-            between=state.learnt.get("between"),
+            pruned=state.learnt.pruned,
+            unseen=state.learnt.unseen,
+            fitted=state.learnt.fitted,
+            refitted=state.learnt.refitted,
+            photographs=state.learnt.photographs,
+            between=state.learnt.between,
             device=self.device,
             seconds=self._watch.seconds,
             options=self._options,
@@ -179,7 +180,7 @@ def as_done(options: EncodeOptions, state: State) -> EncodeOptions:
 
     Whether a fit pays is known then, and not asked again where other qualities follow.
     """
-    fitted = state.learnt.get(Fit.name)
+    fitted = state.learnt.fitted
     if isinstance(fitted, LeftOut):
         return options.changed(fit=False)
     if isinstance(fitted, Fitted):
@@ -199,7 +200,7 @@ def _metadata(state: State, options: EncodeOptions) -> bytes:
         "cameras": ("virtual" if is_virtual(views) else "given") if views else None,
         "beta": parameters.beta if views else None,
         "gamma": parameters.gamma,
-        "delta_mse_max": parameters.delta_mse_max if by_threshold and "prune" in state.learnt else None,
+        "delta_mse_max": parameters.delta_mse_max if by_threshold and state.learnt.pruned is not None else None,
         "lambda": parameters.lam if compacts else None,
         "alpha": parameters.alpha if compacts else None,
         "source_splats": len(state.source),

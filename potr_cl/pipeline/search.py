@@ -259,7 +259,7 @@ class _Search(AbstractContextManager["_Search"]):
 
     def _mind_interrupts(self, thinned: State) -> None:
         """Fit no more where someone has interrupted a fit."""
-        fitted = thinned.learnt.get(Fit.name)
+        fitted = thinned.learnt.fitted
         if fitted is not None and fitted.ended_early:
             self._options = self._options.changed(fit=False)
 

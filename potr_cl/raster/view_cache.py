@@ -7,14 +7,11 @@ projection, which is made again whenever it is needed.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import pyopencl as cl
 
 from potr_cl.errors import DeviceError
+from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
-from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.view_set import ViewSet
 
 #: A launch's views should take at most a sixteenth of the budget: it is filled launch by launch, and what is left over
@@ -29,7 +26,7 @@ class ViewCache(Owner):
     """What is kept of views.
 
     Args:
-        rasterizer: that prepares them.
+        device: that they are prepared on.
         budget: bytes that they may take.
         others: bytes of the budget for which others have more use than views have for geometry of their own.
 
@@ -41,9 +38,8 @@ class ViewCache(Owner):
             have their own.
     """
 
-    def __init__(self, rasterizer: Rasterizer, budget: float, others: float = 0) -> None:
-        self._rasterizer = rasterizer
-        self._memory = Memory(rasterizer.device)
+    def __init__(self, device: Device, budget: float, others: float = 0) -> None:
+        self._memory = Memory(device)
         self._whole: list[ViewSet] = []  # those that keep their geometry
         self.room, self._others = budget, others
         self.largest = 0
@@ -53,10 +49,9 @@ class ViewCache(Owner):
         """Views to do in one launch: ``most``, or as many as surely are a small part of the budget.
 
         Args:
-            nbytes: that a view takes besides its geometry, at least.
+            nbytes: that a view takes, at least.
         """
-        least = GEOMETRY * self._rasterizer.stride + nbytes
-        return int(min(max(self.room // (LEAST_SETS * least), 1), most))
+        return int(min(max(self.room // (LEAST_SETS * nbytes), 1), most))
 
     def keep(self, views: ViewSet, own: int = 0) -> bool:
         """Keep prepared views if the budget allows it.
@@ -100,28 +95,6 @@ class ViewCache(Owner):
         except DeviceError:
             self._memory.close()
             raise
-
-    @contextmanager
-    def geometry(self, views: ViewSet, rasterizer: Rasterizer | None = None) -> Iterator[bool]:
-        """Make sure that kept views have their geometry inside the block.
-
-        Args:
-            views: that are kept.
-            rasterizer: that has prepared them; None: the cache's own.
-
-        Yields:
-            Whether it had to be made again.
-        """
-        if views.shapes is not None:
-            yield False
-            return
-        assert self.shared is not None
-        views.shapes, views.colours = self.shared
-        try:
-            (rasterizer or self._rasterizer).project(views)
-            yield True
-        finally:
-            views.shapes = views.colours = None
 
     def close(self) -> None:
         """Give back the memory that views share; the views themselves are closed by their owners."""

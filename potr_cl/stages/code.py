@@ -126,4 +126,4 @@ class Code(Stage):
         if geometry is not None and geometry.asked != bench.parameters:
             geometry = None
         coded = bench.output.file(state.scene, geometry, bench.request(state, bench.metadata(state), self.coder))
-        return state.having_learnt(self.name, coded)
+        return state.having_learnt(coded=coded)

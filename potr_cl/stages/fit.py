@@ -216,7 +216,7 @@ class Fit(Stage):
         those say that the fit does not pay.
         """
         if len(state.views) - state.added < 2:
-            return state.having_learnt(self.name, LeftOut(_TOO_FEW_VIEWS))
+            return state.having_learnt(fitted=LeftOut(_TOO_FEW_VIEWS))
         bench.progress("fit", 0.0)
         with ExitStack() as stack:
             stack.callback(bench.progress, "fit", 1.0)
@@ -232,7 +232,7 @@ class Fit(Stage):
             found = dataclasses.replace(found, views=state.views, added=state.added)
             if bench.photographs is not None and self.photograph_steps != 0 and not asked:
                 found = self._to_photographs(found, bench, asked)
-            told = found.learnt[self.name]
+            told = found.learnt.fitted
             # Others do not round as finely then as is known here.
             if asked or not (isinstance(told, Fitted) and told.spared):
                 return found
@@ -252,7 +252,7 @@ class Fit(Stage):
 
     def _cycles(self, state: State, bench: Workbench, targets: Targets | TargetPictures, asked: SupportsBool) -> State:
         """Remove splats and fit by turns, each time up to a higher threshold, and keep what costs least."""
-        price: float | None = state.learnt.get("price")
+        price = state.learnt.price
         worth = 0.0 if price is None else _WORTH * price
         without = held_out_error(bench.opened, state.scene, state.views, targets, state.added, bench.background)
         least = plain = without + worth * len(state.scene)
@@ -283,8 +283,8 @@ class Fit(Stage):
                 break
         if taken is None:
             why = _INTERRUPTED if asked else _NO_GAIN if len(steps_of) > 1 else _LITTLE_GAIN
-            return state.having_learnt(self.name, LeftOut(why, bool(asked)))
-        return best.having_learnt(self.name, taken)
+            return state.having_learnt(fitted=LeftOut(why, bool(asked)))
+        return best.having_learnt(fitted=taken)
 
     def _settled(self, state: State, bench: Workbench, looking: Looking, asked: SupportsBool) -> State:
         """Choose coefficients and round geometry, with what is left fitted once more in between."""
@@ -298,8 +298,9 @@ class Fit(Stage):
             bench.progress("fit", min(done / total, 1.0) * 0.99)
 
         then, errors = settle(state, bench, looking, settling, options, asked, progress)
-        told = dataclasses.replace(state.learnt[self.name], settled=errors)
-        return then.having_learnt(self.name, told)
+        told = state.learnt.fitted
+        assert isinstance(told, Fitted)
+        return then.having_learnt(fitted=dataclasses.replace(told, settled=errors))
 
     def _steps_of_cycles(self, family: Family, removing: bool) -> list[int]:
         """The steps of the fit in each cycle."""
@@ -325,15 +326,16 @@ class Fit(Stage):
             asked, lambda done, steps: bench.progress("fit to photographs", done / steps),
         )  # fmt: skip
         bench.progress("fit to photographs", 1.0)
-        told: Fitted | LeftOut = dataclasses.replace(state.learnt[self.name], photographs=found)
-        then = state.having_learnt(self.name, told)
+        told = state.learnt.fitted
+        assert told is not None
+        then = state.having_learnt(fitted=dataclasses.replace(told, photographs=found))
         if found.scene is None:
             return then
         return dataclasses.replace(then, scene=found.scene, truth=found.scene, geometry=None)
 
     def _sparse(self, rates: Rates, state: State) -> Rates:
         """The rates, without those that would change coefficients which compaction has chosen."""
-        return dataclasses.replace(rates, ac=0.0) if "compact" in state.learnt else rates
+        return dataclasses.replace(rates, ac=0.0) if state.learnt.compacted else rates
 
     def _pruned(self, state: State, limit: float, bench: Workbench) -> State:
         """The state without the splats that a fit will make up for."""

@@ -12,9 +12,6 @@ from numpy.typing import NDArray
 from potr_cl.model.scene import FloatArray
 from potr_cl.stages.stage import State
 
-#: The name under which a state knows its :class:`Unresolved`.
-UNRESOLVED = "unresolved"
-
 
 @dataclass(frozen=True)
 class Unresolved:
@@ -60,7 +57,7 @@ class Unresolved:
 
 def as_they_were(state: State) -> State:
     """A state in which stages have not changed what no view has resolved."""
-    unresolved: Unresolved | None = state.learnt.get(UNRESOLVED)
+    unresolved = state.learnt.unresolved
     if unresolved is None or state.scene is state.source:
         return state
     rows = np.flatnonzero(unresolved.among(state.survivors))
@@ -80,7 +77,7 @@ def as_they_were(state: State) -> State:
 
 def as_important(effects: FloatArray, state: State) -> FloatArray:
     """What errors of splats cost, (n,), where what no view has resolved counts as the middle of the others at least."""
-    unresolved: Unresolved | None = state.learnt.get(UNRESOLVED)
+    unresolved = state.learnt.unresolved
     if unresolved is None:
         return effects
     rows = unresolved.among(state.survivors)

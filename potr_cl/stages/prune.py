@@ -15,7 +15,7 @@ from potr_cl.model.scene import FloatArray
 from potr_cl.raster.kept_scene import lying_on
 from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.raster.surely_seen import surely_seen
-from potr_cl.stages.guarded import UNRESOLVED
+from potr_cl.stages.guarded import Unresolved
 from potr_cl.stages.pruning.measured import Measured, Removal, measurement
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import LARGEST_LIMIT, RemovalSweep
@@ -153,12 +153,11 @@ class Prune(Stage):
     def run(self, state: State, bench: Workbench) -> State:
         """Remove splats, and leave a :class:`potr_cl.stages.pruning.schedule.Pruned` in ``learnt``.
 
-        And as "unseen" a :class:`potr_cl.stages.pruning.unseen.Unseen`; and as "price", where the number of splats is
-        not given, the ΔMSE below which a splat has gone; and as "shares" the
-        :class:`potr_cl.views.shares.ViewShares`, where workers elsewhere get what their views see.
+        And what no view sees; the price of a splat, where the number of splats is not given; and the shares, where
+        workers elsewhere get what their views see.
         """
-        if UNRESOLVED in state.learnt:
-            return self._guarded(state, bench)
+        if state.learnt.unresolved is not None:
+            return self._guarded(state, bench, state.learnt.unresolved)
         with thread_pool(bench.threads) as pool, lying_on(bench.opened, bench.placed(state)) as placed:
             quick = partial(surely_seen, placed) if isinstance(placed, SceneBuffers) else None
             part = in_background(seen_part, state.scene, state.views)  # while a device finds the unseen ones
@@ -172,7 +171,7 @@ class Prune(Stage):
                 sights = sights.lasting()
         splats = int(np.count_nonzero(hidden))
         kept = self.unseen == "keep" and self.keep is None and self.count is None
-        told = state.having_learnt("unseen", Unseen(splats, len(state.scene), kept, area))
+        told = state.having_learnt(unseen=Unseen(splats, len(state.scene), kept, area))
         told = self._told(told, bench, sights)
         if not (kept and splats):
             return self._pruned(told, bench, sights)
@@ -188,19 +187,19 @@ class Prune(Stage):
         if not len(seen):
             everything = np.arange(splats)
             return told.having_learnt(
-                self.name, Pruned(splats, np.full(splats, -1, np.int32), 0, lambda: Course(everything))
+                pruned=Pruned(splats, np.full(splats, -1, np.int32), 0, lambda: Course(everything))
             )
         if sights is not None:
             sights = visibility_of_large(state.scene.uncoloured().subset(seen), state.views)
         return self._pruned(told, bench, sights, seen, hidden)
 
-    def _guarded(self, state: State, bench: Workbench) -> State:
+    def _guarded(self, state: State, bench: Workbench, unresolved: Unresolved) -> State:
         """Prune, but for what no view has resolved.
 
         Raises:
             UsageError: fewer splats are asked for than that.
         """
-        spared = int(np.count_nonzero(state.learnt[UNRESOLVED].among(state.survivors)))
+        spared = int(np.count_nonzero(unresolved.among(state.survivors)))
         wanted = self._schedule(0.0, len(state.scene)).count
         if wanted is not None and wanted < spared:
             raise UsageError(
@@ -213,7 +212,7 @@ class Prune(Stage):
             sights = visibility_of_large(state.scene, state.views, groups, pool.map)
             if sights is not None and (bench.pool is None or bench.pool.in_process):
                 sights = sights.lasting()
-        told = self._told(state, bench, sights).having_learnt("unseen", state.learnt[UNRESOLVED])
+        told = self._told(state, bench, sights).having_learnt(unseen=unresolved)
         return self._pruned(told, bench, sights)
 
     def _told(self, state: State, bench: Workbench, sights: Visibility | None) -> State:
@@ -223,7 +222,7 @@ class Prune(Stage):
             if sights is not None and bench.kept is not None and bench.kept.is_of(state.source):
                 bench.kept.groups = sights.groups  # for who judges by pictures later
         if self.keep is None and self.count is None:
-            state = state.having_learnt("price", bench.parameters.delta_mse_max)
+            state = state.having_learnt(price=bench.parameters.delta_mse_max)
         return state
 
     def _pruned(
@@ -247,8 +246,8 @@ class Prune(Stage):
         dealt = None
         if sights is not None and bench.pool is not None and not bench.pool.in_process:
             dealt = _dealt(state, seen, bench.pool, sights)
-            state = state.having_learnt("shares", dealt)
-        unresolved = state.learnt.get(UNRESOLVED)
+            state = state.having_learnt(shares=dealt)
+        unresolved = state.learnt.unresolved
         stays = None if unresolved is None else unresolved.among(state.survivors)
         waiting = sorted(bench.interludes, key=lambda interlude: interlude.after)
         schedule = self._schedule(bench.parameters.delta_mse_max, len(state.scene) if seen is None else len(seen))
@@ -284,7 +283,7 @@ class Prune(Stage):
         """The state after pruning; ``seen`` and ``hidden`` as of :meth:`_pruned`."""
         survivors = pruned.survivors
         if hidden is None or seen is None:
-            left = course.left(survivors).having_learnt(self.name, pruned)
+            left = course.left(survivors).having_learnt(pruned=pruned)
             return left if hidden is None else without_directions(left, hidden[survivors])
         of_whole = in_background(as_of_whole, seen, hidden, pruned)
         kept = hidden.copy()
@@ -292,7 +291,7 @@ class Prune(Stage):
         numbers = np.flatnonzero(kept)
         # Nobody looked at the hidden ones from any direction.
         left = without_directions(course.having(numbers), hidden[numbers])
-        return left.having_learnt(self.name, of_whole.result())
+        return left.having_learnt(pruned=of_whole.result())
 
 
 def part_of_time(iterations: float, stays: bool) -> float:

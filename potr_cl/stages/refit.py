@@ -135,9 +135,9 @@ class Refit(Stage):
         """
         bench.progress("refit", 0.0)
         parameters = bench.parameters
-        compacted = "compact" in state.learnt
+        compacted = state.learnt.compacted
         active = active_coefficients(state.scene.sh, parameters.sf_sh) if compacted else None
-        if state.learnt.get("chosen") == parameters:
+        if state.learnt.chosen == parameters:
             active = chosen_coefficients(state.scene.sh)
         options = RefitOptions(steps=self.steps, drop=parameters.drop, memory=bench.memory)
         on_grid = bench.output.on_grid(bench.request(state))
@@ -205,8 +205,8 @@ class Refit(Stage):
                 choice = PhotographChoice(len(judging), *psnrs)
                 if choice.kept:
                     refitted, geometry = to_photographs, its_geometry
-        then = replace(state.recoloured(refitted.sh), geometry=geometry).having_learnt(self.name, refitted)
-        return then if choice is None else then.having_learnt("photographs", choice)
+        then = replace(state.recoloured(refitted.sh), geometry=geometry).having_learnt(refitted=refitted)
+        return then if choice is None else then.having_learnt(photographs=choice)
 
 
 def _rounded(state: State, bench: Workbench) -> Rounded:

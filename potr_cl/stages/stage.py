@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,6 +29,7 @@ from potr_cl.outputs.output import Output, Request, Rounded
 from potr_cl.outputs.potr import Potr
 from potr_cl.raster.kept_scene import KeptScene, PartOfKept
 from potr_cl.raster.scene_buffers import Drawable
+from potr_cl.stages.learnt import Learnt
 from potr_cl.views.shares import ViewShares
 from potr_cl.views.visibility import Visibility
 from potr_cl.workers.pool import Pool, Shared
@@ -73,7 +74,7 @@ class State:
         geometry: of ``scene`` as the file's readers will see it, once a stage has had it rounded. A stage that then
             changes anything but colours makes it None again.
         importances: of the splats in each view, for stages that work while splats are being removed; else None.
-        learnt: what each stage has found out, by the stage's name.
+        learnt: what stages have found out.
     """
 
     source: Scene
@@ -82,7 +83,7 @@ class State:
     views: tuple[Camera, ...]
     geometry: Rounded | None = None
     importances: Importances | None = None
-    learnt: Mapping[str, Any] = field(default_factory=dict)
+    learnt: Learnt = field(default_factory=Learnt)
     added: int = 0
     cut: Scene | None = None
     truth: Scene | None = None
@@ -113,9 +114,9 @@ class State:
         """Whether ``scene`` is known to be some splats of ``source`` as they are there."""
         return self.scene is self.source or self.scene is self.cut
 
-    def having_learnt(self, name: str, result: Any) -> State:
-        """This state with what a stage has found out."""
-        return dataclasses.replace(self, learnt={**self.learnt, name: result})
+    def having_learnt(self, **found: Any) -> State:
+        """This state with what a stage has found out, by the fields of :class:`Learnt`."""
+        return dataclasses.replace(self, learnt=dataclasses.replace(self.learnt, **found))
 
 
 @dataclass(frozen=True)
@@ -190,7 +191,7 @@ class Workbench:
     def shared_source(self, state: State) -> Scene | KeptScene | ViewShares:
         """A state's source for the pool's workers; where they have what their views see already, that."""
         in_process = self.pool is not None and self.pool.in_process
-        dealt: ViewShares | None = state.learnt.get("shares")
+        dealt = state.learnt.shares
         if dealt is not None and dealt.views is state.views and not in_process:
             return dealt
         return self.kept if self.kept is not None and in_process and self.kept.is_of(state.source) else state.source

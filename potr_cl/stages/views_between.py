@@ -14,7 +14,6 @@ from potr_cl.model.scene import Scene
 from potr_cl.model.views_between import SPREAD, views_between
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.stages.between.amount import needed, views_where_few
-from potr_cl.stages.between.price import SHOWN
 from potr_cl.stages.between.room import room_for
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
 
@@ -116,7 +115,7 @@ class Between(Stage):
             known = GivenViews(state.source, state.views, pool.map)
             parts = known.views_of_parts()
             if self.weigh and (shown := known.part_of_views()) is not None:
-                state = state.having_learnt(SHOWN, shown)
+                state = state.having_learnt(shown=shown)
             each, shown_by = 0.0 if virtual and self.views == "auto" else self.views, None
             if each == "auto":
                 each = 0.0
@@ -130,7 +129,7 @@ class Between(Stage):
         if self.views == 0 or (virtual and not added):
             return state
         then = replace(state, views=(*state.views, *added), added=len(added))
-        return then.having_learnt(self.name, Added(given, len(added), shown_by))
+        return then.having_learnt(between=Added(given, len(added), shown_by))
 
 
 def _evenly(views: Sequence[Camera], count: int) -> list[Camera]:

@@ -2,7 +2,8 @@
 
 Follow it in this order:
 
-1. visibility.py: what views may draw of a scene, and whether that pays. Pure NumPy.
+1. visibility.py: what views may draw of a scene, and whether that pays. Pure NumPy. reached.py: what a sweep fetches
+   of that, as a device finds it.
 2. groups.py and plan.py: views that are looked at with the same splats, and the four ways to group all views. A plan
    is data: to look at views in another way, write another function there.
 3. budget.py: how much memory there is, and which groups of a plan stay on the device. *Who decides what is resident?*
@@ -11,11 +12,10 @@ Follow it in this order:
    does not fit?*
 
 A stage is a *use*: it says what it makes of a set of prepared views, and adds up exact integers by the splats' numbers
-in the scene, so that plans, devices and computers give the same bits. Pruning is one (stages/pruning/removal.py).
-Others come onto it like this. A fit or a re-fit gives :class:`~potr_cl.views.engine.ViewEngine` an ``attach`` that
-takes a set's own buffers, binds its kernels for ``engine.resident``, and walks ``engine.streamed`` by
-``engine.stream(group, None)`` and ``engine.prepared(numbers, subset)``. Judging makes its pictures in the same walk
-with a plan of which nothing stays. Several devices make a plan each, of the numbers of their own views.
+in the scene, so that plans, devices and computers give the same bits. Pruning is one (stages/pruning/removal.py), the
+re-fit another (stages/refitting/own_views.py): it goes through :meth:`~potr_cl.views.engine.ViewEngine.walk`, to which
+it makes no difference which views stay. A fit and judging come onto it in the same way; judging with a plan of which
+nothing stays. Several devices make a plan each, of the numbers of their own views.
 
 shares.py deals views and splats out to computers. pictures.py renders large scenes.
 """

@@ -14,12 +14,15 @@ from typing import Protocol
 
 from potr_cl.model.camera import Camera
 from potr_cl.opencl.device import Device
+from potr_cl.raster.view_cache import ViewCache
 from potr_cl.raster.view_set import TILE
 from potr_cl.views.groups import ViewGroup, work
 
 #: Part of the device's memory that the views may take unless the caller sets a budget. A CPU's is that of the host: the
 #: scene, its new colours and all other programs live there too.
 _SHARE, _SHARE_OF_HOST = 0.5, 0.3
+#: The same of what is free, of views that share the device with other large things: a re-fit's vectors.
+_SHARE_OF_FREE, _SHARE_OF_FREE_HOST = 0.4, 0.25
 #: Bytes that a view whose splats are named by their numbers is expected to take, for each splat: shape, colour, number,
 #: and two and a half tile intersections. A third of the views has fewer intersections.
 _NAMED, _LEAST = 87, 2 / 3
@@ -42,6 +45,12 @@ def default_memory(device: Device) -> int:
     return int(device.info.memory * (_SHARE_OF_HOST if device.info.shares_host_memory else _SHARE))
 
 
+def free_memory(device: Device) -> float:
+    """Bytes that the views may take beside what is there: two fifths of what is free, or a quarter of the host's."""
+    free = device.info.memory - device.allocated
+    return free * (_SHARE_OF_FREE_HOST if device.info.shares_host_memory else _SHARE_OF_FREE)
+
+
 def target_bytes(camera: Camera) -> int:
     """What a view's picture takes."""
     return 12 * camera.width * camera.height
@@ -58,7 +67,13 @@ def drawn_bytes(splats: int, intersections: int, camera: Camera) -> int:
 
 
 class Budget(Protocol):
-    """What groups may take, one after the other."""
+    """What groups may take, one after the other.
+
+    Attributes:
+        cache: keeps the views of all groups; None: each group has one of its own, of its room.
+    """
+
+    cache: ViewCache | None = None
 
     def room(self, group: ViewGroup) -> float:
         """Bytes that the next group may take; negative: it need not be tried."""
@@ -99,6 +114,23 @@ class Shared(Budget):
     def took(self, group: ViewGroup, nbytes: int) -> None:
         self._to_come.remove(group)
         self._left = max(self._left - nbytes, 0)
+
+
+class Together(Budget):
+    """One cache for all groups: lists of as many as possible first, then what others want, then geometry.
+
+    Args:
+        cache: whose room it is; the caller's.
+    """
+
+    def __init__(self, cache: ViewCache) -> None:
+        self.cache: ViewCache = cache
+
+    def room(self, group: ViewGroup) -> float:
+        return self.cache.room
+
+    def took(self, group: ViewGroup, nbytes: int) -> None:
+        """The cache knows."""
 
 
 class Named(Budget):

@@ -7,6 +7,7 @@ fits (:mod:`potr_cl.views.budget`), and in which sets views are prepared: as man
 - :attr:`ViewEngine.resident`: sets that stay on the device, with what the use has made of them.
 - :attr:`ViewEngine.streamed`: groups that do not. :meth:`ViewEngine.stream` opens the splats of one, and
   :meth:`ViewEngine.prepared` prepares its sets, one after the other in the same memory.
+- :meth:`ViewEngine.walk`: both, for a use to which it makes no difference, with :meth:`ViewEngine.ready` for each.
 
 Pruning is a use (:mod:`potr_cl.stages.pruning.removal`): lists of stale tiles, targets, and integer totals.
 """
@@ -24,7 +25,7 @@ from potr_cl.errors import DeviceMemoryError
 from potr_cl.model.camera import Camera
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner, Reused
-from potr_cl.raster.view_cache import ViewCache
+from potr_cl.raster.view_cache import GEOMETRY, ViewCache
 from potr_cl.raster.view_set import ViewSet
 from potr_cl.views.groups import ViewGroup
 from potr_cl.views.plan import ViewPlan
@@ -74,6 +75,27 @@ class Ready(Generic[W]):
     def shares(self) -> bool:
         """Whether it has no geometry of its own, so that it is projected whenever it is looked at."""
         return self.views.shapes is None
+
+
+@dataclass(frozen=True)
+class Launch(Generic[W]):
+    """Views that are looked at together.
+
+    Attributes:
+        numbers: of the views among all.
+        resident: what is there of them; None: they are streamed.
+        group: of the streamed ones.
+    """
+
+    numbers: tuple[int, ...]
+    resident: Ready[W] | None
+    group: ViewGroup | None = None
+
+    @property
+    def size(self) -> int:
+        """Splats that they project at most, each view's counted for itself; padded if the plan's are."""
+        of_view = self.resident.views.stride if self.resident else self.group.count if self.group else 0
+        return len(self.numbers) * of_view
 
 
 class ViewEngine(Owner, Generic[W]):
@@ -141,7 +163,17 @@ class ViewEngine(Owner, Generic[W]):
             self._owned = owned.pop_all()
 
     def _bring_in(self, group: ViewGroup, room: float, said: Callable[[int], None]) -> list[ViewGroup]:
-        """Prepare the views of a group, and keep those that fit; returns the group of the others."""
+        """Prepare the views of a group, and keep those that fit; returns the groups of the others."""
+        try:
+            return self._bring_in_whole(group, room, said)
+        except DeviceMemoryError:
+            half = len(group.numbers) // 2
+            if not half or not group.most:
+                raise
+        halves = [replace(group, numbers=numbers) for numbers in (group.numbers[:half], group.numbers[half:])]
+        return [left for some in halves for left in self._bring_in(some, room, said)]
+
+    def _bring_in_whole(self, group: ViewGroup, room: float, said: Callable[[int], None]) -> list[ViewGroup]:
         device, plan = self.device, self.plan
         before, some, most = device.allocated, list[Ready[W]](), 0
         subset: Subset | None = None
@@ -152,12 +184,15 @@ class ViewEngine(Owner, Generic[W]):
                 self.idle += group.numbers
                 plan.budget.took(group, 0)
                 return []
-            cache = stack.enter_context(ViewCache(subset.rasterizer, room)) if plan.in_sets else None
+            cache = plan.budget.cache
+            if cache is None and plan.in_sets:
+                cache = stack.enter_context(ViewCache(device, room))
             some, most = self._prepare_all(group, subset, cache, room, before, said)
             if some:
                 self._owned.enter_context(stack.pop_all())  # what all sets of the group need; the sets go first
                 for ready in some:
                     self._owned.callback(ready.work.close)
+                self.source.forget([number for ready in some for number in ready.numbers])
                 if plan.copies_rest:
                     self.source.rest(subset)
         self.resident += some
@@ -173,10 +208,10 @@ class ViewEngine(Owner, Generic[W]):
     ) -> tuple[list[Ready[W]], int]:  # fmt: skip
         """The sets of a group that fit, and how many views one has at most."""
         found: list[Ready[W]] = []
-        most, first, numbers = 1, 0, group.numbers
-        if cache is not None:
+        most, first, numbers = max(group.most, 1), 0, group.numbers
+        if cache is not None and not group.most:
             largest = 12 * max(self.cameras[number].width * self.cameras[number].height for number in numbers)
-            most = cache.most_views(self.most_views, largest)
+            most = cache.most_views(self.most_views, GEOMETRY * subset.rasterizer.stride + largest)
         try:
             with subset.rasterizer.preparing_many():
                 while first < len(numbers):
@@ -184,7 +219,7 @@ class ViewEngine(Owner, Generic[W]):
                     try:
                         work, views = self._prepare(some, subset)
                     except DeviceMemoryError:
-                        if most == 1:
+                        if most == 1 or group.most:
                             raise
                         most //= 2
                         continue
@@ -239,6 +274,29 @@ class ViewEngine(Owner, Generic[W]):
         """The numbers of a group's views, set by set."""
         most = group.most or self.most_views
         return [group.numbers[first : first + most] for first in range(0, len(group.numbers), most)]
+
+    def walk(self) -> list[Launch[W]]:
+        """All views."""
+        resident = [Launch(tuple(each.numbers), each) for each in self.resident]
+        return [*resident, *(Launch(some, None, group) for group in self.streamed for some in self.sets(group))]
+
+    @contextmanager
+    def ready(self, launch: Launch[W]) -> Iterator[Ready[W]]:
+        """Views with their geometry, inside the block; the numbers of streamed ones' splats stay until the next ones'.
+
+        Raises:
+            DeviceError: they do not fit the device.
+        """
+        if launch.resident is not None:
+            self.project(launch.resident)
+            yield launch.resident
+            return
+        assert launch.group is not None
+        # The group that is opened is these views', so that its splats are in their order.
+        with self.stream(replace(launch.group, numbers=launch.numbers), None) as subset:
+            assert subset is not None
+            with self.prepared(launch.numbers, subset) as ready:
+                yield ready
 
     def give_back(self) -> None:
         """Give back what streamed groups leave for the next ones."""

@@ -22,7 +22,7 @@ class ViewGroup:
         among, bits: a bit for each of the splats of these numbers, ascending, packed; no bits: all of them. None: not
             so.
         nbytes: what the views are known to take if they stay on the device.
-        most: how many of them are prepared together at most; 0: as many as one launch does.
+        most: how many of them are prepared together at most, as a plan has it; 0: as many as one launch does.
     """
 
     numbers: tuple[int, ...]

@@ -1,16 +1,17 @@
 """Which views are looked at with which splats, and what becomes of those that do not fit: :class:`ViewPlan`.
 
-A plan is made once a stage. Four ways to group views make all there are; to add one, write a function here:
+A plan is made once a stage. Five ways to group views make all there are; to add one, write a function here:
 
 - :func:`whole`: all views with all splats. For scenes that are small, or of which views see much.
 - :func:`by_view`: each view with the splats that it may draw, by their numbers, where a GPU has the whole scene.
 - :func:`by_cluster`: views that see much of the same with a copy of that, on a GPU that has no room for the scene.
+- :func:`in_launches`: launch by launch, with all splats or those that each view is known to need, one budget for all.
 - :func:`as_drawn`: each view with a copy of the splats that it does draw, on a CPU, whose memory is the host's.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +20,8 @@ from numpy.typing import NDArray
 from potr_cl.model.camera import Camera
 from potr_cl.raster.preparing_memory import PreparingMemory
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.views.budget import COPIED_SPLAT, Budget, Foretold, Named, Shared, drawn_bytes, target_bytes
+from potr_cl.raster.view_cache import GEOMETRY, LEAST_SETS, ViewCache
+from potr_cl.views.budget import COPIED_SPLAT, Budget, Foretold, Named, Shared, Together, drawn_bytes, target_bytes
 from potr_cl.views.groups import ViewGroup
 from potr_cl.views.subsets import CopiedSplats
 from potr_cl.views.visibility import Visibility
@@ -73,6 +75,31 @@ def whole(numbers: Sequence[int], splats: int, memory: int) -> ViewPlan:
     """All views with all splats."""
     group = ViewGroup(tuple(numbers), splats)
     return ViewPlan([group], Shared(memory, [group]), in_sets=True)
+
+
+def in_launches(
+    parts: Sequence[Sequence[int]], strides: Mapping[int, int], cache: ViewCache, most_views: int, splat: int
+) -> ViewPlan:
+    """Views that a launch does together, each with room for as many splats as the first of them.
+
+    Args:
+        parts: numbers of views; no launch does views of two parts. In each, views have fewer and fewer splats.
+        strides: room that each view's splats need.
+        cache: keeps them.
+        most_views: how many views a launch can do.
+        splat: bytes that a splat of a view takes in buffers of a launch's own.
+    """
+    # The largest view has its room in any case.
+    room = max(cache.room // (LEAST_SETS * (GEOMETRY + splat)), *strides.values(), 0)
+    groups: list[ViewGroup] = []
+    for left in map(tuple, parts):
+        while left:
+            stride = strides[left[0]]
+            most = int(min(room // stride, most_views))
+            groups.append(ViewGroup(left[:most], stride, most=most))
+            left = left[most:]
+    cache.largest = max((len(group.numbers) * group.count for group in groups), default=0)
+    return ViewPlan(groups, Together(cache), in_sets=True)
 
 
 def by_view(

@@ -1,4 +1,5 @@
-"""Where the views of a group get their splats from: :class:`WholeScene`, :class:`NamedSplats`, :class:`CopiedSplats`.
+"""Where the views of a group get their splats from: :class:`WholeScene`, :class:`NamedSplats`, :class:`ListedSplats`,
+:class:`CopiedSplats`.
 
 Pictures and sums are the same bits with any of them: splats that are left out reach no pixel of the group's views, and
 the others keep their order.
@@ -19,12 +20,14 @@ from numpy.typing import NDArray
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner, Reused
-from potr_cl.raster.picked_splats import PickedSplats, Picker, Picks
+from potr_cl.raster.picked_splats import NO_SPLAT, PickedSplats, Picker, Picks
 from potr_cl.raster.preparing_memory import PreparingMemory
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.scene_buffers import Drawable, SceneBuffers, stride_of
+from potr_cl.raster.rules import INRIA, RasterRules
+from potr_cl.raster.scene_buffers import SPLAT_GROUP, Drawable, SceneBuffers, stride_of
 from potr_cl.raster.view_set import ViewSet
 from potr_cl.views.groups import Indices, ViewGroup
+from potr_cl.views.reached import Reach
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,8 @@ class Subset:
     Attributes:
         rasterizer: of these.
         count: how many they are.
-        numbers: (count,) uint32 in the device's memory, their numbers in the scene, ascending; None: they are all.
+        numbers: (count,) uint32 in the device's memory, their numbers in the scene, ascending; None: they are all. With
+            splats of each view's own, (views, count).
         splats: the same on the host, where they are copied.
         scene: the copy.
     """
@@ -81,6 +85,10 @@ class SplatSource(Owner):
     def streams_in(self) -> Memory:
         """Memory for one streamed group after the other."""
         return Memory(self.device)
+
+    def room(self, number: int) -> int:
+        """How many splats of a view there is room for, where each is looked at by itself."""
+        return self.stride
 
     @abstractmethod
     def open(self, stack: ExitStack, memory: Memory, group: ViewGroup, left: Left | None = None) -> Subset | None:
@@ -120,6 +128,9 @@ class SplatSource(Owner):
     def rest(self, subset: Subset) -> None:
         """Give a copy's memory back, of which only projections need anything."""
 
+    def forget(self, numbers: Sequence[int]) -> None:
+        """These views stay as they are: nobody opens their splats again."""
+
     def forget_scratch(self) -> None:
         """Give back what preparing views takes besides, if others want it more than the next views."""
 
@@ -132,13 +143,18 @@ class WholeScene(SplatSource):
 
     Args:
         rasterizer: of the scene; the caller's.
+        reused: whether streamed groups take turns in the same memory.
     """
 
     selects = False
 
-    def __init__(self, rasterizer: Rasterizer) -> None:
+    def __init__(self, rasterizer: Rasterizer, reused: bool = False) -> None:
+        self._reused = reused
         self.device, self.splats, self.stride = rasterizer.device, rasterizer.splats, rasterizer.stride
         self._subset = Subset(rasterizer, rasterizer.splats)
+
+    def streams_in(self) -> Memory:
+        return Reused(self.device) if self._reused else super().streams_in()
 
     def open(self, stack: ExitStack, memory: Memory, group: ViewGroup, left: Left | None = None) -> Subset:
         return self._subset
@@ -150,13 +166,18 @@ class WholeScene(SplatSource):
 
 
 class _Parted(SplatSource):
-    """What the two sources share whose groups have rasterizers of their own."""
+    """What the sources share whose groups have rasterizers of their own."""
 
-    def __init__(self, device: Device, scene: Drawable, stride: int, background: tuple[float, float, float]) -> None:
+    def __init__(
+        self, device: Device, scene: Drawable, stride: int, background: tuple[float, float, float],
+        rules: RasterRules = INRIA,
+    ) -> None:  # fmt: skip
         self.device, self.stride = device, stride
         self.splats = scene.splats if isinstance(scene, SceneBuffers) else len(scene)
         self._preparing = PreparingMemory(device)
-        self._rasterizer = partial(Rasterizer, device, background=background, preparing=self._preparing)
+        self._rasterizer = partial(
+            Rasterizer, device, rules=rules, background=background, preparing=self._preparing
+        )  # fmt: skip
 
     def close(self) -> None:
         self._preparing.close()
@@ -219,6 +240,47 @@ class NamedSplats(_Parted):
     def close(self) -> None:
         for owner in (self._picker, self._memory, self._preparing):
             owner.close()
+
+
+class ListedSplats(_Parted):
+    """Splats of a scene that lies whole on a device, each view's own, by numbers that the host knows.
+
+    Views of a group have room for as many as the one of them that has most. The scene's colours are not looked at.
+
+    Args:
+        rasterizer: of the scene; the caller's.
+        reach: of the views.
+    """
+
+    def __init__(self, rasterizer: Rasterizer, reach: Reach) -> None:
+        self._whole = rasterizer.parameters
+        super().__init__(rasterizer.device, self._whole, rasterizer.stride, rasterizer.background, rasterizer.rules)
+        self._listed = dict(reach.of)
+
+    def streams_in(self) -> Memory:
+        return Reused(self.device)
+
+    def room(self, number: int) -> int:
+        return max(-(-len(self._listed[number]) // SPLAT_GROUP), 1) * SPLAT_GROUP
+
+    def open(self, stack: ExitStack, memory: Memory, group: ViewGroup, left: Left | None = None) -> Subset:
+        stride = max(map(self.room, group.numbers))
+        padded = np.full((len(group.numbers), stride), NO_SPLAT, np.uint32)
+        for row, number in zip(padded, group.numbers, strict=True):
+            row[: len(self._listed[number])] = self._listed[number]
+        numbers = memory.upload(padded, "the numbers of views' splats")
+        rasterizer = stack.enter_context(self._rasterizer(PickedSplats(self._whole, numbers, stride, apart=stride)))
+        return Subset(rasterizer, stride, numbers)
+
+    def replace_sh(self, sh: FloatArray) -> None:
+        """Nobody looks at its colours."""
+
+    def forget(self, numbers: Sequence[int]) -> None:
+        for number in numbers:
+            del self._listed[number]
+
+    def forget_scratch(self) -> None:
+        self._preparing.rest()
 
 
 class CopiedSplats(_Parted):

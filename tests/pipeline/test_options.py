@@ -112,7 +112,7 @@ class Brighten(Stage):
     def run(self, state: State, bench: Workbench) -> State:
         sh = state.scene.sh.copy()
         sh[:, 0] += np.float32(self.by * (1 + self.twice))
-        return state.recoloured(sh).having_learnt(self.name, self.by)
+        return state.recoloured(sh)
 
 
 def test_a_new_stage_is_run_and_has_flags():

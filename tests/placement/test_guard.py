@@ -19,7 +19,6 @@ from potr_cl.placement.guard import unresolved
 from potr_cl.placement.virtual import place_cameras
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.code import Code
-from potr_cl.stages.guarded import UNRESOLVED
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions
@@ -95,7 +94,7 @@ def test_no_stage_touches_what_no_view_resolved(device, preset):
     for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
         assert np.array_equal(getattr(state.scene, name)[rows], getattr(scene, name)[found]), name
     assert len(state.survivors) < len(scene), "others go"
-    assert state.learnt[UNRESOLVED].splats == state.learnt["unseen"].splats == np.count_nonzero(found)
+    assert state.learnt.unresolved.splats == state.learnt.unseen.splats == np.count_nonzero(found)
 
 
 @pytest.mark.slow
@@ -103,7 +102,7 @@ def test_without_the_guard_they_are_lost(device):
     dropped = kept(device, "drop")
     assert np.count_nonzero(dropped.survivors >= _EACH) < 50
     plain = kept(device, "keep")
-    assert UNRESOLVED not in plain.learnt, "given cameras say where people look"
+    assert plain.learnt.unresolved is None, "given cameras say where people look"
     assert np.count_nonzero(plain.survivors >= _EACH) < _EACH / 2
 
 

@@ -193,7 +193,7 @@ def test_pruning_copies_no_more_of_a_scene_than_is_left(device):
             _, most = tracemalloc.get_traced_memory()
         finally:
             tracemalloc.stop()
-    assert left.learnt["unseen"].splats == 3000
+    assert left.learnt.unseen.splats == 3000
     assert not left.scene.sh[np.isin(left.survivors, np.arange(0, 60_000, 20)), 1:].any()
     assert np.array_equal(left.scene.means, scene.means[left.survivors])
     assert len(left.scene) < 20_000

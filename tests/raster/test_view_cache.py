@@ -26,7 +26,7 @@ def test_lists_come_first_and_projections_last(device, plush_excerpt, plush_exce
     with Rasterizer(device, plush_excerpt) as rasterizer:
         sets = [rasterizer.prepare_set([camera]) for camera in plush_excerpt_cameras[:7]]
         one, lists = 48 * rasterizer.stride, sum(views.nbytes_cached for views in sets)
-        with ViewCache(rasterizer, lists + geometries * one, others * one) as cache:
+        with ViewCache(device, lists + geometries * one, others * one) as cache:
             assert all([cache.keep(views) for views in sets])
             assert sum(views.shapes is not None for views in sets) == whole
             shared = int(cache.shared is not None)

@@ -13,14 +13,16 @@ from potr_cl.opencl.device import Device
 from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.raster.picked_splats import PickedSplats
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages import refit as refit_stage
-from potr_cl.stages.refitting import own_views, placement, reached
+from potr_cl.stages.refitting import own_views, placement
 from potr_cl.stages.refitting.colour_refit import ColourRefit, HelpFrom
-from potr_cl.stages.refitting.reached import reached_splats
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
-from potr_cl.stages.refitting.view_groups import ViewGroups
+from potr_cl.views import reached
+from potr_cl.views.reached import reached_splats
+from potr_cl.views.subsets import ListedSplats
 from potr_cl.workers.host import HostPool
 from tests.cases.elsewhere import ElsewherePool
 from tests.cases.streets import street
@@ -80,21 +82,20 @@ def device(request):
 @pytest.fixture
 def picked(monkeypatch):
     """Have views pick their splats, and note which views did."""
-    made: list[ViewGroups] = []
+    made: list[ListedSplats] = []
 
-    class Noting(ViewGroups):
+    class Noting(ListedSplats):
         def __init__(self, *args: object) -> None:
-            if args[2] is not None:
-                made.append(self)
+            made.append(self)
             super().__init__(*args)  # type: ignore[arg-type]
 
-    def switch(on: bool) -> list[ViewGroups]:
+    def switch(on: bool) -> list[ListedSplats]:
         monkeypatch.setattr(reached, "LEAST_SPLATS", 1 if on else 1 << 60)
         monkeypatch.setattr(reached, "WORTH_IT", 1.0)
         made.clear()
         return made
 
-    monkeypatch.setattr(own_views, "ViewGroups", Noting)
+    monkeypatch.setattr(own_views, "ListedSplats", Noting)
     return switch
 
 
@@ -359,6 +360,34 @@ def test_products(device, picked, memory):
     for whole, some in zip(*found, strict=True):
         assert np.array_equal(whole, some)
     assert found[0][0] > 0
+
+
+@pytest.mark.parametrize("on", [False, True], ids=["all splats", "own splats"])
+def test_launches_are_halved_where_the_device_has_no_room(device, picked, monkeypatch, on):
+    if device.family == "cpu":
+        pytest.skip("kernels for CPUs do one view at a time")
+    case, _ = crowded_case(device)
+    prepare = Rasterizer.prepare_set
+    together = []
+
+    def failing(self, some, *args):
+        if isinstance(self.parameters, PickedSplats) == on:
+            together.append(len(some))
+            if len(some) > 1:
+                raise DeviceMemoryError("no room")
+        return prepare(self, some, *args)
+
+    picked(on)
+    with case:
+        found = []
+        for full in (False, True):
+            if full:
+                monkeypatch.setattr(Rasterizer, "prepare_set", failing)
+            with Linearised(case) as linear:
+                found.append((linear.error, linear.gradient))
+    assert max(together) > 1
+    assert found[0][0] == found[1][0] > 0
+    assert np.array_equal(found[0][1], found[1][1])
 
 
 def test_a_view_that_sees_nothing(device, picked):

@@ -67,13 +67,14 @@ from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions
 from potr_cl.stages.pruning.survivors import Survivors
 from potr_cl.stages.pruning.sweep_options import SweepOptions
-from potr_cl.stages.refitting import coefficients, reached, sliced_arrays
+from potr_cl.stages.refitting import coefficients, sliced_arrays
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.exchange import Exchange
 from potr_cl.stages.refitting.layout import Layout
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.refitting.targets import RenderedTargets
+from potr_cl.views import reached
 from potr_cl.views.visibility import Visibility
 from tests.reference import raster as reference
 from tests.reference.scenes import plain_splats, random_splats, straight_camera, tilted_camera

@@ -13,9 +13,6 @@ from dataclasses import replace
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.stages.stage import State
 
-#: The name under which a state knows which part of the views shows a splat
-#: (:meth:`potr_cl.model.placement.given_views.GivenViews.part_of_views`).
-SHOWN = "shown"
 #: Which part of the views shows a splat, on the average, in a scene that is seen whole: an object hides half of itself,
 #: and a captured one is seen from near and from afar.
 _WHOLE = 0.25
@@ -28,6 +25,5 @@ def priced(parameters: HyperParameters, state: State) -> HyperParameters:
         parameters: of a scene that is seen whole.
         state: knows which part of the views shows a splat, if anyone has found out.
     """
-    shown: float = state.learnt.get(SHOWN, 1.0)
-    part = min(shown / _WHOLE, 1.0)
+    part = min(state.learnt.shown / _WHOLE, 1.0)
     return replace(parameters, delta_mse_max=part * parameters.delta_mse_max, drop=part * parameters.drop)

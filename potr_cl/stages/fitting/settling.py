@@ -96,7 +96,7 @@ def settle(
     Returns:
         The state: its ``scene`` is not rounded yet, so that other steps can be tried with it. Its ``geometry`` is, for
         the steps of now, if the output is a .potr file in one block of version 2 or later: what others hold is not
-        known here. In ``learnt``, "chosen" are the parameters that coefficients were chosen with. And the mean squared
+        known here. What is learnt are the parameters that coefficients were chosen with. And the mean squared
         error of the held-out views after each fit.
 
     Raises:
@@ -119,9 +119,9 @@ def settle(
         return found.scene
 
     still = ("ac",)
-    if settling.choosing and bench.parameters.drop and "compact" not in state.learnt:
+    if settling.choosing and bench.parameters.drop and not state.learnt.compacted:
         scene = fitted(_with_chosen(state, bench, looking), settling.choosing, settling.gentle, still)
-        state = dataclasses.replace(state, scene=scene, geometry=None).having_learnt("chosen", bench.parameters)
+        state = dataclasses.replace(state, scene=scene, geometry=None).having_learnt(chosen=bench.parameters)
     rounded = bench.output.geometry(state.scene, bench.request(state)) if settling.rounding else None
     if not isinstance(rounded, Geometry) or not isinstance(QUANTISERS[rounded.parameters.quantiser], Balanced):
         return state, tuple(errors)

@@ -38,7 +38,6 @@ class KeptPictures(Owner):
         device: whose memory it is.
         cameras: the views.
         budget: that the pictures which are kept are taken from.
-        numbers: of these cameras among the views that targets know; None: they are the same.
         sets: of views that will be asked for: there is room for the largest in any case.
 
     Raises:
@@ -50,11 +49,9 @@ class KeptPictures(Owner):
         device: Device,
         cameras: Sequence[Camera],
         budget: Budget,
-        numbers: Sequence[int] | None = None,
         sets: Iterable[Sequence[int]] = (),
     ) -> None:
         self._device, self._cameras, self._budget = device, list(cameras), budget
-        self._numbers = range(len(cameras)) if numbers is None else numbers
         self._memory = Memory(device)
         self._others = Scratch(device, "the target images")
         self._kept: dict[tuple[int, ...], cl.Buffer] = {}
@@ -123,7 +120,7 @@ class KeptPictures(Owner):
                 start += size
 
     def _into(self, targets: Targets, numbers: Sequence[int], buffer: cl.Buffer) -> None:
-        targets.into([self._numbers[number] for number in numbers], buffer)
+        targets.into(numbers, buffer)
 
     def _reserved(self, numbers: Sequence[int]) -> cl.Buffer:
         self._others.reserve(self.nbytes(numbers))

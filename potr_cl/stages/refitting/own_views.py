@@ -7,6 +7,7 @@ coefficients (cl/refit/gather.cl). W weighs pixels so that all views count the s
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -16,17 +17,21 @@ import pyopencl as cl
 from potr_cl.model.camera import Camera
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.view_cache import ViewCache
 from potr_cl.raster.view_set import TABLE_ENTRY, ViewSet
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.refitting.coefficients import Coefficients, Vector
 from potr_cl.stages.refitting.fixed_point import gathered_scale
 from potr_cl.stages.refitting.kept_pictures import KeptPictures
-from potr_cl.stages.refitting.reached import Reach
 from potr_cl.stages.refitting.sweep import Sweep
 from potr_cl.stages.refitting.targets import Targets, nbytes
 from potr_cl.stages.refitting.view_errors import ViewErrors
-from potr_cl.stages.refitting.view_groups import Ready, ViewGroups
 from potr_cl.stages.refitting.view_kernels import Picks, SweptSums, ViewKernels
+from potr_cl.views import plan as plans
+from potr_cl.views.budget import free_memory
+from potr_cl.views.engine import Launch, Ready, ViewEngine
+from potr_cl.views.reached import Reach
+from potr_cl.views.subsets import ListedSplats, Subset, WholeScene
 
 #: Bytes a splat and view of a sweep's own buffers: the colours' change and the sums.
 _CHANGE, _TOTALS = 16, 32
@@ -74,48 +79,44 @@ class OwnViews(Owner):
         self._device = device = coefficients.device
         layout = coefficients.layout
         self._coefficients, self._background, self._sweep = coefficients, background, sweep
-        self.one = gathered_scale(cameras, [_weight(camera) for camera in cameras])
-        fixed_points = sweep.fixed_point_scales(cameras)
+        weights = [_weight(camera) for camera in cameras]
+        self.one = gathered_scale(cameras, weights)
+        self._fixed_points = sweep.fixed_point_scales(cameras)
         self.count = len(cameras)
         self.parts = parts_of(len(cameras))
         own_numbers = range(len(cameras)) if numbers is None else numbers
-        seen = {} if reach is None else {number: len(splats) for number, splats in reach.of.items()}
+        source = WholeScene(rasterizer, reused=True) if reach is None else ListedSplats(rasterizer, reach)
+        rooms = {number: source.room(number) for number in own_numbers}
         # Launches, and what is gathered together, are of one part. Views of a launch have about as many splats.
-        self._numbers = sorted(own_numbers, key=lambda each: (each % self.parts, -seen.get(each, 0), each))
-        of_parts = [sum(number % self.parts == part for number in own_numbers) for part in range(self.parts)]
-        breaks = np.cumsum(of_parts).tolist()
-        cameras = [cameras[number] for number in self._numbers]
-        weights = [_weight(camera) for camera in cameras]
-        self._fixed_points = [fixed_points[number] for number in self._numbers]
+        order = sorted(own_numbers, key=lambda each: (each % self.parts, -rooms[each], each))
+        parts = [list(some) for _, some in itertools.groupby(order, lambda each: each % self.parts)]
+        # To render a picture takes many times as long as to project a view, and it takes less room.
+        pictures = sum(nbytes(cameras[number]) for number in own_numbers)
+        self._cache = ViewCache(device, free_memory(device) if memory is None else memory, pictures)
         self._memory = Memory(device)
-        self._owned: list[Owner] = [self._memory]
+        self._owned: list[Owner] = [self._cache, self._memory]
         try:
-            # To render a picture takes many times as long as to project a view, and it takes less room.
-            pictures = sum(nbytes(camera) for camera in cameras)
-            splats = None if reach is None else [reach.of[number] for number in self._numbers]
-            self._views = ViewGroups(
-                rasterizer, cameras, splats, sweep.most_views, _CHANGE + _TOTALS, memory, breaks, pictures
-            )
-            self._owned.append(self._views)
-            groups = self._views.groups
-            most = max(map(len, groups), default=0)
-            together = min(sweep.gathered, max(len(groups), 1)) if most == 1 and reach is None else 1
-            self._gathered: list[list[list[range]]] = [
-                [some[first : first + together] for first in range(0, len(some), together)]
-                for some in (
-                    [group for group in groups if self._numbers[group[0]] % self.parts == part]
-                    for part in range(self.parts)
-                )
+            plan = plans.in_launches(parts, rooms, self._cache, sweep.most_views, _CHANGE + _TOTALS)
+            self._engine: ViewEngine[_Attached] = ViewEngine(source, cameras, plan, _Attached, sweep.most_views)
+            self._owned.append(self._engine)
+            rasterizer.rest()
+            launches = sorted(self._engine.walk(), key=lambda each: each.numbers[0] % self.parts)
+            ends = [0, *itertools.accumulate(len(each.numbers) for each in launches)]
+            self._launches = [
+                _Own(each, range(*views), None if reach is None else self._memory.allocate(each.size, "what is cut"))
+                for each, views in zip(launches, itertools.pairwise(ends), strict=True)
             ]
-            at_once = together * max((len(group) * self._views.stride(group) for group in groups), default=0)
+            most = max((len(each.numbers) for each in launches), default=0)
+            together = min(sweep.gathered, max(len(launches), 1)) if most == 1 and reach is None else 1
+            self._gathered: list[list[list[_Own]]] = [[] for _ in range(self.parts)]
+            for own in self._launches:
+                of_part = self._gathered[own.launch.numbers[0] % self.parts]
+                if not of_part or len(of_part[-1]) == together:
+                    of_part.append([])
+                of_part[-1].append(own)
+            at_once = together * max((each.size for each in launches), default=0)
             self._change = self._memory.allocate(_CHANGE * at_once, "the colours' change")
             self._totals = self._memory.allocate(_TOTALS * at_once, "the re-fit's sums")
-            #: Which channels of views' own splats are free: a byte a splat and view, which stays as the views may not.
-            self._free: dict[range, cl.Buffer] = {}
-            if reach is not None:
-                for group in groups:
-                    size = len(group) * self._views.stride(group)
-                    self._free[group] = self._memory.allocate(size, "the channels that are cut")
             self._slots = [
                 _Slot(*(_part(of, slot, together) for of in (self._change, self._totals))) for slot in range(together)
             ]
@@ -123,13 +124,13 @@ class OwnViews(Owner):
             coefficients.zero(self._totals)
             self.sums = self._memory.allocate(8 * layout.columns * layout.stride, "the sums over views")
             coefficients.zero(self.sums)
-            self._errors = ViewErrors(device, cameras, weights, self._numbers, groups)
+            sets = [each.numbers for each in launches]
+            self._errors = ViewErrors(device, cameras, weights, sets)
             self._owned.append(self._errors)
-            pairs = zip(weights, self._fixed_points, strict=True)
-            scales = np.array([self.one * weight / fixed_point for weight, fixed_point in pairs], np.float32)
-            scales = self._memory.upload(scales, "the views' scales")
+            ratios = [self.one * weights[each] / self._fixed_points[each] for some in sets for each in some]
+            scales = self._memory.upload(np.array(ratios, np.float32), "the views' scales")
             self._kernels = ViewKernels(device, layout, rasterizer.parameters.means, scales)
-            self._targets = KeptPictures(device, cameras, self._views.budget, self._numbers, groups)
+            self._targets = KeptPictures(device, cameras, self._cache, sets)
             self._owned.append(self._targets)
         except BaseException:
             self.close()
@@ -138,7 +139,7 @@ class OwnViews(Owner):
     @property
     def room(self) -> float:
         """Bytes of the memory for prepared views and targets that are left."""
-        return self._views.budget.room
+        return self._cache.room
 
     def prepare(self, targets: Targets) -> None:
         """Have the pictures of this device's views that are kept there, before the first gradient asks for them.
@@ -146,7 +147,7 @@ class OwnViews(Owner):
         Raises:
             DeviceError: the device failed. What the targets raise.
         """
-        self._targets.fill(targets, self._views.groups)
+        self._targets.fill(targets, [each.launch.numbers for each in self._launches])
 
     def gradient(
         self,
@@ -165,17 +166,17 @@ class OwnViews(Owner):
                 splats of its own. None: it is not wanted.
         """
 
-        def sweep(group: range, ready: Ready, slot: _Slot) -> None:
-            views = ready.views
-            self._kernels.colour(views, self._picks(group, ready), x, views.colours)
-            pictures = self._targets.of(targets, group)
-            self._enqueue_sweep(group, views, views.colours, pictures, blocks is not None, slot)
+        def sweep(own: _Own, ready: Ready[_Attached], slot: _Slot) -> None:
+            views, (_, colours) = ready.views, ready.geometry
+            self._kernels.colour(views, own.picks(ready), x, colours, colours)
+            pictures = self._targets.of(targets, own.launch.numbers)
+            self._enqueue_sweep(ready, colours, pictures, blocks is not None, slot)
             if drawn is not None:
                 self._kernels.mark_drawn(views, drawn)
             # Which of them are cut, the gathering asks.
-            nbytes = _CHANGE * views.stride * len(group)
-            cl.enqueue_copy(self._device.queue, slot.change, views.colours, byte_count=nbytes)
-            self._errors.keep(group)
+            nbytes = _CHANGE * views.stride * len(own.views)
+            cl.enqueue_copy(self._device.queue, slot.change, colours, byte_count=nbytes)
+            self._errors.keep(own.views)
 
         self._add_up(sweep, constant=constant, blocks=blocks)
 
@@ -187,8 +188,8 @@ class OwnViews(Owner):
         """Enqueue the blocks' part of :meth:`gradient` alone, of the splats from one on."""
         self._coefficients.zero(self._change)  # black, and no channel is free
 
-        def sweep(group: range, ready: Ready, slot: _Slot) -> None:
-            self._enqueue_sweep(group, ready.views, slot.change, None, True, slot)
+        def sweep(own: _Own, ready: Ready[_Attached], slot: _Slot) -> None:
+            self._enqueue_sweep(ready, slot.change, None, True, slot)
 
         self._add_up(sweep, blocks=blocks, first_block=first)
 
@@ -202,18 +203,19 @@ class OwnViews(Owner):
             unit: the direction is multiplied by this.
         """
 
-        def sweep(group: range, ready: Ready, slot: _Slot) -> None:
-            views, picks = ready.views, self._picks(group, ready)
-            if ready.anew and picks is None:  # which colours are cut is not known any more
-                self._kernels.colour(views, picks, self._coefficients.on_device(at, 1), views.colours)
-            self._kernels.colour(views, picks, direction, slot.change, unit, constant)
-            self._enqueue_sweep(group, views, slot.change, None, False, slot)
+        def sweep(own: _Own, ready: Ready[_Attached], slot: _Slot) -> None:
+            views, picks, (_, colours) = ready.views, own.picks(ready), ready.geometry
+            anew = ready.shares or own.launch.resident is None
+            if anew and picks is None:  # which colours are cut is not known any more
+                self._kernels.colour(views, picks, self._coefficients.on_device(at, 1), colours, colours)
+            self._kernels.colour(views, picks, direction, slot.change, colours, unit, constant)
+            self._enqueue_sweep(ready, slot.change, None, False, slot)
 
         self._add_up(sweep, part, constant)
 
     def _add_up(
         self,
-        sweep: Callable[[range, Ready, _Slot], None],
+        sweep: Callable[[_Own, Ready[_Attached], _Slot], None],
         part: int | None = None,
         constant: bool = False,
         blocks: cl.Buffer | None = None,
@@ -226,36 +228,64 @@ class OwnViews(Owner):
             part: of the views; None: all.
             constant, blocks, first_block: as of :meth:`ViewKernels.gather`.
         """
-        for groups in self._gathered if part is None else [self._gathered[part]]:
-            for gathered in groups:
-                for slot, group in zip(self._slots, gathered, strict=False):
-                    with self._views.ready(group) as ready:
-                        sweep(group, ready, slot)
-                        start, size = TABLE_ENTRY * (group.start - gathered[0].start), TABLE_ENTRY * len(group)
+        for of_part in self._gathered if part is None else [self._gathered[part]]:
+            for gathered in of_part:
+                views = range(gathered[0].views.start, gathered[-1].views.stop)
+                for slot, own in zip(self._slots, gathered, strict=False):
+                    with self._engine.ready(own.launch) as ready:
+                        sweep(own, ready, slot)
+                        start, size = TABLE_ENTRY * (own.views.start - views.start), TABLE_ENTRY * len(own.views)
                         cl.enqueue_copy(
                             self._device.queue, self._tables, ready.views.table, byte_count=size, dst_offset=start
                         )
-                views = range(gathered[0].start, gathered[-1].stop)
-                stride = self._views.stride(gathered[0])
-                found = SweptSums(self._totals, self._change, stride, ready.picks, self._tables, views)
+                picks, stride = ready.subset.numbers, ready.views.stride
+                found = SweptSums(self._totals, self._change, stride, picks, self._tables, views)
                 self._kernels.gather(found, self.sums, constant, blocks, first_block)
 
-    def _picks(self, group: range, ready: Ready) -> Picks | None:
-        return None if ready.picks is None else Picks(ready.picks, self._free[group])
-
     def _enqueue_sweep(
-        self, group: range, views: ViewSet, colours: cl.Buffer, target: cl.Buffer | None, weights: bool, slot: _Slot
-    ) -> None:
+        self, ready: Ready[_Attached], colours: cl.Buffer, target: cl.Buffer | None, weights: bool,
+        slot: _Slot,
+    ) -> None:  # fmt: skip
         """Enqueue a group's sweep; without a target colours are a change, and black is behind them."""
         background = (0.0, 0.0, 0.0) if target is None else self._background
-        scale = self._fixed_points[group.start]
-        self._sweep.run(views, colours, background, target, scale, self._errors.latest, slot.totals, weights)
+        views, (shapes, _), scale = ready.views, ready.geometry, self._fixed_points[ready.numbers[0]]
+        self._sweep.run(views, shapes, colours, background, target, scale, self._errors.latest, slot.totals, weights)
 
     def close(self) -> None:
         """Give all device memory back."""
         self._slots = []  # parts of buffers, which would keep these
         for owner in reversed(self._owned):
             owner.close()
+
+
+class _Attached(Owner):
+    """Views, with nothing of a re-fit's own but the numbers of their splats."""
+
+    def __init__(self, numbers: Sequence[int], subset: Subset, views: ViewSet, *_: object) -> None:
+        self.nbytes = 0 if subset.numbers is None else subset.numbers.size
+        self._views = views
+
+    def close(self) -> None:
+        self._views.close()
+
+
+@dataclass(frozen=True)
+class _Own:
+    """What a re-fit knows of a launch.
+
+    Attributes:
+        launch: the engine's.
+        views: their places among all of the views that are done here.
+        free: which channels of views' own splats are free: a byte a splat and view, which stays as the views may not.
+    """
+
+    launch: Launch[_Attached]
+    views: range
+    free: cl.Buffer | None
+
+    def picks(self, ready: Ready[_Attached]) -> Picks | None:
+        """The views' own splats; None: they have all."""
+        return None if ready.subset.numbers is None else Picks(ready.subset.numbers, self.free)
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -27,9 +28,9 @@ from potr_cl.stages.refitting.exchange import Exchange, SentVector
 from potr_cl.stages.refitting.layout import Layout
 from potr_cl.stages.refitting.own_views import OwnViews
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
-from potr_cl.stages.refitting.reached import reached_splats
 from potr_cl.stages.refitting.sweep import Sweep
 from potr_cl.stages.refitting.targets import Targets, targets_of
+from potr_cl.views.reached import reached_splats
 from potr_cl.views.visibility import Visibility
 from potr_cl.workers.pool import Part
 
@@ -172,13 +173,12 @@ class ColourPart(Part):
     def _drawn(self, marks: cl.Buffer | None) -> NDArray[np.uint8]:
         """A bit for each splat that is marked, or that any view reaches."""
         splats = self._coefficients.layout.splats
+        found: NDArray[Any]
         if marks is not None:
             found = self._device.download(marks, (splats,), np.uint8)
         else:
             assert self._reach is not None
-            found = np.zeros(splats, np.uint8)
-            for numbers in self._reach.of.values():
-                found[numbers] = 1
+            found = self._reach.marks(splats)
         return np.packbits(found, bitorder="little")
 
     def block_rows(self, first: int, rows: int) -> Narrowed:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from potr_cl.opencl.device import Device
-from potr_cl.stages.refitting.reached import Reach
+from potr_cl.views.reached import Reach
 
 #: Vectors of a solution: six of the solver and what it was before it was rounded.
 _VECTORS = 7

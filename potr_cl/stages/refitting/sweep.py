@@ -73,6 +73,7 @@ class Sweep:
     def run(
         self,
         views: ViewSet,
+        shapes: cl.Buffer,
         colours: cl.Buffer,
         background: tuple[float, float, float],
         target: cl.Buffer | None,
@@ -84,7 +85,8 @@ class Sweep:
         """Enqueue a sweep: from the splats' colours to the pixels' values, and from those to sums for each splat.
 
         Args:
-            views: prepared, with their geometry.
+            views: prepared.
+            shapes: (views, stride, 8) float32, theirs.
             colours: (views, stride, 4) float32, R, G, B of each splat in each view.
             background: R, G, B behind the splats.
             target: (pixels, 3) float32, view after view: subtracted from the pixels; None: nothing is.
@@ -101,7 +103,7 @@ class Sweep:
             of_family = {"view": camera_struct(views.views[0].camera)}
         kernel = self._kernels[weights].bind(
             **of_family,
-            shapes=views.shapes,
+            shapes=shapes,
             colours=colours,
             offsets=views.offsets,
             intersections=views.intersections,

@@ -11,7 +11,7 @@ import pyopencl as cl
 from potr_cl.model.camera import Camera
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
-from potr_cl.raster.view_set import TILE
+from potr_cl.views.budget import tiles_of
 
 
 class ViewErrors(Owner):
@@ -22,8 +22,8 @@ class ViewErrors(Owner):
 
     Args:
         device: that computes.
-        cameras: the views. weights: what a pixel of each counts. numbers: of each among all views.
-        launches: which of these cameras each launch does; they cover all, in their order.
+        cameras: all views. weights: what a pixel of each counts.
+        launches: numbers of the views that each launch does.
 
     Attributes:
         latest: (tiles,) float32 on the device, where a sweep writes what it finds.
@@ -33,24 +33,20 @@ class ViewErrors(Owner):
     """
 
     def __init__(
-        self,
-        device: Device,
-        cameras: Sequence[Camera],
-        weights: Sequence[float],
-        numbers: Sequence[int],
-        launches: Sequence[range],
+        self, device: Device, cameras: Sequence[Camera], weights: Sequence[float], launches: Sequence[Sequence[int]]
     ) -> None:
-        self._device, self._weights, self._numbers = device, list(weights), list(numbers)
-        self._ends = [0, *itertools.accumulate(map(_tiles, cameras))]
-        most = max((self._ends[each.stop] - self._ends[each.start] for each in launches), default=0)
+        self._device, self._weights = device, list(weights)
+        self._numbers = [number for each in launches for number in each]
+        self._ends = [0, *itertools.accumulate(tiles_of(cameras[number]) for number in self._numbers)]
+        most = max((sum(tiles_of(cameras[number]) for number in each) for each in launches), default=0)
         self._memory = Memory(device)
         with device.all_or_nothing():
             self.latest = self._memory.allocate(4 * most, "the tiles' errors")
             self._all = self._memory.allocate(4 * self._ends[-1], "the tiles' errors")
 
-    def keep(self, launch: range) -> None:
-        """Enqueue that what the last sweep, of this launch, has found is kept until :meth:`found`."""
-        first, end = self._ends[launch.start], self._ends[launch.stop]
+    def keep(self, views: range) -> None:
+        """Enqueue that what the last sweep has found is kept until :meth:`found`; views by their place in launches."""
+        first, end = self._ends[views.start], self._ends[views.stop]
         with self._device.errors("failed while computing"):
             cl.enqueue_copy(
                 self._device.queue, self._all, self.latest, byte_count=4 * (end - first), dst_offset=4 * first
@@ -60,17 +56,10 @@ class ViewErrors(Owner):
         """The squared error by W of each view, by its number among all; waits for the device."""
         tiles = self._device.download(self._all, (self._ends[-1],), np.float32)
         return {
-            number: weight * float(tiles[first:end].sum(dtype=np.float64))
-            for number, weight, (first, end) in zip(
-                self._numbers, self._weights, itertools.pairwise(self._ends), strict=True
-            )
+            number: self._weights[number] * float(tiles[first:end].sum(dtype=np.float64))
+            for number, (first, end) in zip(self._numbers, itertools.pairwise(self._ends), strict=True)
         }
 
     def close(self) -> None:
         """Give the device's memory back."""
         self._memory.close()
-
-
-def _tiles(camera: Camera) -> int:
-    """Tiles that cover a view."""
-    return -(-camera.width // TILE) * -(-camera.height // TILE)

@@ -75,16 +75,18 @@ class ViewKernels:
         picks: Picks | None,
         x: cl.Buffer,
         result: cl.Buffer,
+        free: cl.Buffer,
         unit: float | None = None,
         constant: bool = False,
     ) -> None:
         """Enqueue the views' colours, or what ``unit`` times a direction adds to them where none is cut at 0.
 
         Args:
-            views: with their colours at the coefficients, if a direction is looked along and they have all splats.
+            views: prepared.
             picks: the views' own splats; None: they have all.
             x: (3 M, stride of the layout) float32, the coefficients or the direction.
             result: (views, stride, 4) float32.
+            free: the same at the coefficients, if a direction is looked along and views have all splats.
             unit: of the direction; None: x are coefficients.
             constant: the direction's other coefficients are 0.
         """
@@ -101,7 +103,7 @@ class ViewKernels:
             view_count=len(views.views),
             direction=unit is not None,
             unit=np.float32(1.0 if unit is None else unit),
-            free=views.colours,
+            free=free,
             free_picks=views.table if picks is None else picks.free,
             colours=result,
         )

@@ -2,7 +2,7 @@
 
 A view reaches a splat if a sweep fetches it, for any of its tiles. Most others lie beside the view; or behind what ends
 all pixels of their tiles, as most of a city does. What a sweep computes is the same to the last bit if the others are
-not there, since geometry and opacities stay as they are in a re-fit (cl/refit/reached.cl).
+not there, while geometry and opacities stay as they are (cl/raster/reached.cl).
 """
 
 from __future__ import annotations
@@ -52,6 +52,13 @@ class Reach:
     def total(self) -> int:
         """Splats that all views reach, each view's counted for itself."""
         return sum(map(len, self.of.values()))
+
+    def marks(self, splats: int) -> NDArray[np.bool_]:
+        """(splats,) which of so many any view reaches."""
+        found = np.zeros(splats, bool)
+        for numbers in self.of.values():
+            found[numbers] = True
+        return found
 
     @property
     def most(self) -> int:
@@ -144,10 +151,10 @@ def _reached(
     of_cpu = device.family == "cpu"
     if of_cpu:
         lanes = max(device.vector_width, 8)
-        mark = device.shared_kernel("refit/reached_cpu.cl", "mark_reached", LANES=lanes, **ends)
+        mark = device.shared_kernel("raster/reached_cpu.cl", "mark_reached", LANES=lanes, **ends)
     else:
         native = int(device.native_exp2)
-        mark = device.shared_kernel("refit/reached.cl", "mark_reached", NATIVE_EXP2=native, **ends)
+        mark = device.shared_kernel("raster/reached.cl", "mark_reached", NATIVE_EXP2=native, **ends)
     found: list[NDArray[np.uint32]] = []
     try:
         # Together: the longest tile list of one keeps few work-groups busy.
