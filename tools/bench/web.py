@@ -2,21 +2,27 @@
 
     python -m tools.bench.web FILE.potr... [--rounds 7] [--json FILE]
 
-By Node, whose WebAssembly is Chromium's, in one thread; native and both builds take turns, and the best round of each
-counts, in seconds of CPU time. ``python -m tools.make.web`` builds it.
+By Node, whose WebAssembly is Chromium's, in one thread. Native, native without vectors of 512 bits, and both builds take
+turns; the first round warms them, and the best of the others counts, in seconds of CPU time. ``python -m
+tools.make.web`` builds the decoder.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import time
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 from potr_cl.codec.decoder import open_file
+from potr_cl.codec.native.library import VECTORS_VARIABLE
 
+#: What the native decoder's variable is set to.
+_NATIVE = {"native": "1", "narrow": "0"}
 _PROGRAM = Path(__file__).parents[2] / "web" / "test" / "pace.mjs"
 
 
@@ -38,19 +44,21 @@ class _Node:
         self._process.communicate()
 
 
-def _native(file: Path) -> float:
-    begin = time.process_time()
-    open_file(file.read_bytes()).scene(threads=1)
-    return time.process_time() - begin
+def _native(file: Path, vectors: str) -> float:
+    with mock.patch.dict(os.environ, {VECTORS_VARIABLE: vectors}):
+        begin = time.process_time()
+        open_file(file.read_bytes()).scene(threads=1)
+        return time.process_time() - begin
 
 
 def measured(file: Path, rounds: int) -> dict[str, Any]:
     """Seconds by path, splats and peak memory of Node, bytes."""
     nodes = {build: _Node(build, file) for build in ("simd", "general")}
-    times: dict[str, list[float]] = {name: [] for name in ("native", *nodes)}
+    times: dict[str, list[float]] = {name: [] for name in (*_NATIVE, *nodes)}
     last: dict[str, Any] = {}
-    for _ in range(rounds):
-        times["native"].append(_native(file))
+    for _ in range(1 + rounds):
+        for name, vectors in _NATIVE.items():
+            times[name].append(_native(file, vectors))
         for build, node in nodes.items():
             last = node.ask("go")
             times[build].append(last["cpu"])
@@ -58,7 +66,7 @@ def measured(file: Path, rounds: int) -> dict[str, Any]:
     for node in nodes.values():
         node.end()
     arrays = last["splats"] * 4 * (11 + 3 * (last["degree"] + 1) ** 2)
-    best = {name: min(each) for name, each in times.items()}
+    best = {name: min(each[1:]) for name, each in times.items()}
     return {"file": file.name, "splats": last["splats"], "arrays": arrays, "seconds": best, "peak": peaks}
 
 
@@ -69,14 +77,26 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="keep the figures")
     args = parser.parse_args()
     results = [measured(file, args.rounds) for file in args.files]
-    heads = ("SIMD", "of native", "without SIMD", "of native", "arrays, MB", "Node's peak, MB")
-    print(f"| file | splats | native, M splats/s | {' | '.join(heads)} |")
-    print("|---|---|---|---|---|---|---|---|---|")
+    heads = (
+        "native, million splats/s",
+        "AVX2",
+        "SIMD (of native, of AVX2)",
+        "without SIMD",
+        "arrays, MB",
+        "Node's peak, MB",
+    )
+    print(f"| file | splats | {' | '.join(heads)} |")
+    print("|---" * (2 + len(heads)) + "|")
     for each in results:
-        native, simd, general = (each["splats"] / each["seconds"][name] / 1e6 for name in ("native", "simd", "general"))
+        pace = {name: each["splats"] / seconds / 1e6 for name, seconds in each["seconds"].items()}
+        of = {
+            name: " ({:.2f}, {:.2f})".format(*(pace[name] / pace[other] for other in _NATIVE))
+            for name in ("simd", "general")
+        }
         print(
-            f"| {each['file']} | {each['splats']:,} | {native:.2f} | {simd:.2f} | {simd / native:.2f} | "
-            f"{general:.2f} | {general / native:.2f} | {each['arrays'] / 1e6:.0f} | {each['peak']['simd'] / 1e6:.0f} |"
+            f"| {each['file']} | {each['splats']:,} | {pace['native']:.2f} | {pace['narrow']:.2f} | "
+            f"{pace['simd']:.2f}{of['simd']} | {pace['general']:.2f}{of['general']} | {each['arrays'] / 1e6:.0f} | "
+            f"{each['peak']['simd'] / 1e6:.0f} |"
         )
     if args.json is not None:
         args.json.write_text(json.dumps(results, indent=1) + "\n")
