@@ -2,8 +2,8 @@
 
     python -m tools.bench.web FILE.potr... [--rounds 7] [--json FILE]
 
-By Node, whose WebAssembly is Chromium's, in one thread. Native, native without vectors of 512 bits, and both builds take
-turns; the first round warms them, and the best of the others counts, in seconds of CPU time. ``python -m
+By Node, whose WebAssembly is Chromium's, in one thread. Native, native without vectors of 512 bits, and both builds
+take turns; the first round warms them, and the best of the others counts, in seconds of CPU time. ``python -m
 tools.make.web`` builds the decoder.
 """
 
