@@ -1,6 +1,6 @@
 """How fast does the browser's decoder decode, against native C on one core, and in how much memory?
 
-    python -m tools.bench.web FILE.potr... [--rounds 7] [--json FILE]
+    python -m tools.bench.web FILE.potr... [--rounds 7] [--rate MBIT] [--json FILE]
 
 By Node, whose WebAssembly is Chromium's, in one thread. Native, native without vectors of 512 bits, and both builds
 take turns; the first round warms them, and the best of the others counts, in seconds of CPU time. ``python -m
@@ -51,8 +51,8 @@ def _native(file: Path, vectors: str) -> float:
         return time.process_time() - begin
 
 
-def measured(file: Path, rounds: int) -> dict[str, Any]:
-    """Seconds by path, splats and peak memory of Node, bytes."""
+def measured(file: Path, rounds: int, rate: float = 0) -> dict[str, Any]:
+    """Seconds by path, and until all is decoded from a server of so many Mbit/s; peak memory of Node, bytes."""
     nodes = {build: _Node(build, file) for build in ("simd", "general")}
     times: dict[str, list[float]] = {name: [] for name in (*_NATIVE, *nodes)}
     last: dict[str, Any] = {}
@@ -62,21 +62,24 @@ def measured(file: Path, rounds: int) -> dict[str, Any]:
         for build, node in nodes.items():
             last = node.ask("go")
             times[build].append(last["cpu"])
+    slow = min(nodes["simd"].ask(str(rate))["seconds"] for _ in range(rounds)) if rate else None
     peaks = {build: node.ask("memory")["peak"] for build, node in nodes.items()}
     for node in nodes.values():
         node.end()
     arrays = last["splats"] * 4 * (11 + 3 * (last["degree"] + 1) ** 2)
     best = {name: min(each[1:]) for name, each in times.items()}
-    return {"file": file.name, "splats": last["splats"], "arrays": arrays, "seconds": best, "peak": peaks}
+    size = {"bytes": file.stat().st_size, "over": slow}
+    return {"file": file.name, **size, "splats": last["splats"], "arrays": arrays, "seconds": best, "peak": peaks}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("files", type=Path, nargs="+", metavar="FILE.potr")
     parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--rate", type=float, default=0, metavar="MBIT", help="of a slow server, Mbit/s")
     parser.add_argument("--json", type=Path, metavar="FILE", help="keep the figures")
     args = parser.parse_args()
-    results = [measured(file, args.rounds) for file in args.files]
+    results = [measured(file, args.rounds, args.rate) for file in args.files]
     heads = (
         "native, million splats/s",
         "AVX2",
@@ -97,6 +100,11 @@ def main() -> None:
             f"| {each['file']} | {each['splats']:,} | {pace['native']:.2f} | {pace['narrow']:.2f} | "
             f"{pace['simd']:.2f}{of['simd']} | {pace['general']:.2f}{of['general']} | {each['arrays'] / 1e6:.0f} | "
             f"{each['peak']['simd'] / 1e6:.0f} |"
+        )
+    for each in results if args.rate else ():
+        alone = each["bytes"] * 8e-6 / args.rate
+        print(
+            f"{each['file']} at {args.rate:g} Mbit/s: decoded after {each['over']:.2f} s, {alone:.2f} s of it transfer"
         )
     if args.json is not None:
         args.json.write_text(json.dumps(results, indent=1) + "\n")
