@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, overload
 
+import numpy as np
+
 from potr_cl.api.inputs import (
     CamerasSource,
     ColourSource,
@@ -313,11 +315,27 @@ def written_pictures(rasterizer: Renderer, cameras: Sequence[Camera], paths: Seq
 
     with thread_pool(min(os.cpu_count() or 1, _PACKING)) as pool:
         for camera, path in zip(cameras, paths, strict=True):
+            if 16 * camera.width * camera.height > _WAITING:
+                yield from written(0)
+                _write_huge(rasterizer, camera, path)
+                yield path
+                continue
             rendering = Rendering(*rasterizer.render(camera))
             packed.append((path, pool.submit(rendering.save, path)))
             nbytes = rendering.image.nbytes + rendering.transmittance.nbytes
             yield from written(min(_PACKING, _WAITING // max(nbytes, 1)))
         yield from written(0)
+
+
+def _write_huge(rasterizer: Renderer, camera: Camera, path: Path) -> None:
+    """The same of a picture that takes gigabytes: on the host it is there in 8 bits only."""
+    pixels = np.empty((camera.height, camera.width, 3), np.uint8)
+    first = 0
+    for strip in rasterizer.strips(camera):
+        pixels[first : first + len(strip)] = to_8_bits(strip)
+        first += len(strip)
+    with replacing(path) as file:
+        write_png(file, pixels)
 
 
 def png_bytes(pixels: U8) -> bytes:

@@ -31,6 +31,8 @@ class Renderer(Protocol):
 
     def render(self, camera: Camera) -> tuple[FloatArray, FloatArray]: ...
 
+    def strips(self, camera: Camera) -> Iterator[FloatArray]: ...
+
 
 @dataclass(frozen=True)
 class Picture:

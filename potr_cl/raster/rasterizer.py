@@ -40,6 +40,8 @@ from potr_cl.raster.view_set import View, ViewSet
 
 #: Least room for intersections before anything is known of a view, and as a multiple of the splats.
 _FIRST_CAPACITY, _FIRST_CAPACITY_A_SPLAT = 1 << 16, 4
+#: Bytes of a strip of a picture.
+_STRIP = 1 << 26
 #: Projected splats of the views that are rendered together. More take gigabytes, and a driver long to find them.
 _PROJECTED = 1 << 26
 
@@ -121,6 +123,14 @@ class Rasterizer(Owner):
         """
         self.render_device(camera)
         return self._pictures(camera)
+
+    def strips(self, camera: Camera) -> Iterator[FloatArray]:
+        """The image of :meth:`render` from top to bottom, a strip (rows, W, 3) after the other: for huge pictures."""
+        image, _ = self.render_device(camera)
+        rows = max(_STRIP // (12 * camera.width), 1)
+        for first in range(0, camera.height, rows):
+            shape = (min(rows, camera.height - first), camera.width, 3)
+            yield self.device.download(image, shape, np.float32, 12 * camera.width * first)
 
     def render_device(self, camera: Camera) -> tuple[cl.Buffer, cl.Buffer]:
         """Render one view and leave it on the device, finished.

@@ -112,7 +112,7 @@ class ViewEngine(Owner, Generic[W]):
         #: One streamed group after the other takes its splats and its views from these.
         self._splats, self._views = source.streams_in(), source.streams_in()
         others: list[ViewGroup] = []
-        done, count = len(plan.idle), len(plan.numbers)
+        done, count, told = len(plan.idle), len(plan.numbers), -1
         with ExitStack() as owned:
             for owner in (source, self._splats, self._views):
                 owned.enter_context(owner)
@@ -121,8 +121,10 @@ class ViewEngine(Owner, Generic[W]):
                 for group in plan.groups:
 
                     def said(some: int, before: int = done) -> None:
-                        if progress is not None:
-                            progress(before + some, count)
+                        nonlocal told
+                        if progress is not None and before + some > told:
+                            told = before + some
+                            progress(told, count)
 
                     room = plan.budget.room(group)
                     if room >= 0:

@@ -193,14 +193,23 @@ class SeenRasterizer(Owner):
 
     def render(self, camera: Camera) -> tuple[FloatArray, FloatArray]:
         """See :meth:`potr_cl.raster.rasterizer.Rasterizer.render`."""
+        with self._rasterizer_of(camera) as rasterizer:
+            return rasterizer.render(camera)
+
+    def strips(self, camera: Camera) -> Iterator[FloatArray]:
+        """See :meth:`potr_cl.raster.rasterizer.Rasterizer.strips`."""
+        with self._rasterizer_of(camera) as rasterizer:
+            yield from rasterizer.strips(camera)
+
+    @contextmanager
+    def _rasterizer_of(self, camera: Camera) -> Iterator[Rasterizer]:
         seen = self._groups.visible(camera, self.rules.near)
         with ExitStack() as stack:
             if self._picker is None:
-                rasterizer = stack.enter_context(self._gathered(seen))
+                yield stack.enter_context(self._gathered(seen))
             else:
                 memory = stack.enter_context(Memory(self.device))
-                rasterizer = stack.enter_context(self._picked(self.picks(memory, seen[None]), 0))
-            return rasterizer.render(camera)
+                yield stack.enter_context(self._picked(self.picks(memory, seen[None]), 0))
 
     def close(self) -> None:
         """Give all device memory back."""

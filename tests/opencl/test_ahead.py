@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections import defaultdict, deque
 from contextlib import suppress
 
@@ -24,6 +25,8 @@ def contexts(monkeypatch):
         made.append(handle)
         return real(handle)
 
+    gc.collect()  # devices of other tests leave their contexts now
+    monkeypatch.setattr(ahead, "_begun", None)
     monkeypatch.setattr(ahead, "new_context", counted)
     monkeypatch.setattr(ahead, "_left", defaultdict(lambda: deque(maxlen=0)))  # nothing of other tests
     return made

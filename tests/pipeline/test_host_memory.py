@@ -14,7 +14,8 @@ GB = 1_000_000_000
 
 
 def device(kind: str, integrated: bool = False) -> Device:
-    return cast(Device, SimpleNamespace(info=cast(Any, SimpleNamespace(kind=kind, integrated=integrated))))
+    shares = kind == "cpu" or integrated
+    return cast(Device, SimpleNamespace(info=cast(Any, SimpleNamespace(kind=kind, shares_host_memory=shares))))
 
 
 @pytest.mark.parametrize("given", [("cpu", False), ("gpu", True)])
