@@ -5,14 +5,16 @@
 An index shows the README away from its repository. So in a copy of the tracked files the links of the README become
 absolute, to the tag of this version, and pyproject.toml gets the project's URLs; from that copy both are built. Then
 ``twine check --strict`` and ``check-wheel-contents`` look at them, and what may not be in them is looked for: relative
-links, and anything of scenes that are not free. The sdist must have every tracked file, so that the tests run from it.
-Needs the extra ``release``; git tells which files are tracked.
+links, and anything of scenes that are not free. The viewer of pages is built first, where Node and a compiler for
+WebAssembly are; else a line says that it is not in. The sdist must have every tracked file, so that the tests run from
+it. Needs the extra ``release``; git tells which files are tracked.
 """
 
 from __future__ import annotations
 
 import argparse
 import re
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -22,6 +24,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from potr_cl import __version__
+from potr_cl.outputs.page import TEMPLATE
+from tools.make import web
 
 ROOT = Path(__file__).parents[2]
 _LINK = re.compile(r"(!?)(\[(?:[^\[\]]|\[[^\]]*\])*\]\()([^)\s]+)(\))")
@@ -33,6 +37,11 @@ def main() -> None:
     parser.add_argument("url", help="of the repository, where it can be browsed")
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "dist", metavar="DIR")
     args = parser.parse_args()
+    lack = web.lacking()
+    if lack:
+        print(f"made without the viewer of pages, so that `encode -o scene.html` will refuse: {lack}", file=sys.stderr)
+    else:
+        web.build()
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder)
         listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True).stdout
@@ -40,6 +49,8 @@ def main() -> None:
         for name in tracked:
             (copy / name).parent.mkdir(parents=True, exist_ok=True)
             (copy / name).write_bytes((ROOT / name).read_bytes())
+        if not lack:
+            shutil.copyfile(TEMPLATE, copy / TEMPLATE.relative_to(ROOT))
         readme, project = copy / "README.md", copy / "pyproject.toml"
         readme.write_text(absolute_links(readme.read_text("utf-8"), args.url), "utf-8")
         project.write_text(with_urls(project.read_text("utf-8"), args.url), "utf-8")

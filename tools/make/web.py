@@ -59,20 +59,41 @@ def _run(command: Sequence[str], folder: Path | None = None) -> None:
         sys.exit(f"failed: {' '.join(command)}")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only-wasm", action="store_true", help="compile the C, and leave npm alone")
-    args = parser.parse_args()
+def lacking() -> str | None:
+    """What building all of it needs and this machine has not; None where it has it."""
+    if shutil.which("node") is None or shutil.which("npm") is None:
+        return "there is no npm: install Node 20 or newer"
+    try:
+        compiler()
+    except SystemExit as lack:
+        return str(lack)
+    return None
+
+
+def build() -> None:
+    """Build the package and the viewer of pages.
+
+    Raises:
+        SystemExit: something is lacking, or refuses.
+    """
+    if lack := lacking():
+        sys.exit(lack)
     compile_wasm(WEB / "dist")
-    if args.only_wasm:
-        return
-    npm = shutil.which("npm")
-    if npm is None:
-        sys.exit("there is no npm: install Node 20 or newer")
+    npm = str(shutil.which("npm"))
     if not (WEB / "node_modules").exists():
         _run([npm, "ci", "--ignore-scripts"], WEB)
     for script in ("check", "build"):
         _run([npm, "run", "--silent", script], WEB)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only-wasm", action="store_true", help="compile the C, and leave npm alone")
+    args = parser.parse_args()
+    if args.only_wasm:
+        compile_wasm(WEB / "dist")
+    else:
+        build()
 
 
 if __name__ == "__main__":

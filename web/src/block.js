@@ -4,8 +4,7 @@ import { PotrError, SECTIONS, find, readSection, refuse, storedBytes, view } fro
 import { largestOf, readDescription } from './streams.js';
 
 /** @typedef {import('./container.js').Block} Block */
-/** @typedef {Record<string, any>} Exports of WebAssembly */
-/** @typedef {(general: boolean) => Promise<Exports>} Load gives the C: the general build, or the fastest that there is */
+/** @typedef {import('./engine.js').Exports} Exports of WebAssembly */
 /**
  * Arrays of n splats, float32.
  * @typedef {object} Values
@@ -43,9 +42,9 @@ function sectionOf(stored, name, what, splats) {
 
 /** Decodes a block, and then another. */
 export class Decoder {
-  /** @param {Load} load */
-  constructor(load) {
-    this.load = load;
+  /** @param {import('./engine.js').Engine} engine */
+  constructor(engine) {
+    this.engine = engine;
     this.id = -1;
     /** @type {Exports} */
     this.c = {};
@@ -106,7 +105,7 @@ export class Decoder {
 
   /** @param {boolean} general */
   async begin(general) {
-    this.c = await this.load(general);
+    this.c = await this.engine.load(general);
     this.top = this.c.__heap_base.value;
     const { splats, quantiser, factors } = /** @type {Block} */ (this.block);
     this.c.potr_begin(splats, quantiser, this.count, ...factors);
@@ -205,7 +204,7 @@ export class Decoder {
 
   // ---------------------------------------------------------------------------------------------------- positions
 
-  /** Centres, (n, 3), world units. @returns {Promise<Float32Array>} */
+  /** Centres, (n, 3), world units: in WebAssembly's memory, until it is used again. @returns {Promise<Float32Array>} */
   positions() {
     return this.telling(() => {
       const kept = this.top;
@@ -252,6 +251,6 @@ export class Decoder {
     const wrong = c.potr_centres(multiplicities, tail, this.put(Float64Array.from(cube)), depth, this.put(Float32Array.from(box)), splats);
     if (wrong === 1) refuse('positions: a centre is beyond what single precision can hold');
     if (wrong) refuse("centres lie outside of the block's box: get the file again");
-    return new Float32Array(c.memory.buffer, means, 3 * splats).slice();
+    return new Float32Array(c.memory.buffer, means, 3 * splats);
   }
 }

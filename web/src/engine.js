@@ -18,18 +18,57 @@ async function compiled(wasm) {
   return WebAssembly.compile(await (await fetch(wasm)).arrayBuffer());
 }
 
+/** @typedef {Record<string, any>} Exports */
 /**
- * Gives the C of a build, loaded when it is first asked for.
- * @param {{general?: Wasm, simd?: Wasm | null}} [wasm] where the builds are; no simd: null
- * @returns {import('./block.js').Load}
+ * What is kept of a build in this thread: its code, and an instance that nobody uses.
+ * @typedef {{module: Promise<WebAssembly.Module>, idle?: Exports}} Build
  */
-export function loader(wasm = {}) {
-  /** @type {Promise<Record<string, any>>[]} */
-  const loaded = [];
-  return (general) => {
-    const simd = wasm.simd === undefined ? new URL('./potr-simd.wasm', import.meta.url) : wasm.simd;
-    const fast = !general && SIMD && simd;
-    return (loaded[+!!fast] ??= compiled(fast || (wasm.general ?? new URL('./potr.wasm', import.meta.url))).then(
-      async (module) => (await WebAssembly.instantiate(module)).exports));
-  };
+/** @type {Map<unknown, Build>} by address, or by what was given instead */
+const builds = new Map();
+/** An instance that has taken more memory than this is not kept, bytes. */
+const KEPT = 1 << 26;
+
+/** @param {Wasm} wasm @returns {Build} */
+function buildOf(wasm) {
+  const key = wasm instanceof URL ? wasm.href : wasm;
+  let build = builds.get(key);
+  if (!build) {
+    build = { module: compiled(wasm) };
+    builds.set(key, build);
+    build.module.catch(() => builds.delete(key));
+  }
+  return build;
+}
+
+/** The builds of the C for one decode. */
+export class Engine {
+  /** @param {{general?: Wasm, simd?: Wasm | null}} [wasm] where the builds are; no simd: null */
+  constructor(wasm = {}) {
+    this.wasm = wasm;
+    /** @type {Map<Build, Promise<Exports>>} */
+    this.loaded = new Map();
+  }
+
+  /** The C of a build, loaded when it is first asked for. @param {boolean} general @returns {Promise<Exports>} */
+  load(general) {
+    const simd = this.wasm.simd === undefined ? new URL('./potr-simd.wasm', import.meta.url) : this.wasm.simd;
+    const fast = !general && SIMD && simd, build = buildOf(fast || (this.wasm.general ?? new URL('./potr.wasm', import.meta.url)));
+    const { idle } = build;
+    let loaded = this.loaded.get(build);
+    if (!loaded) {
+      loaded = idle ? Promise.resolve(idle) : build.module.then(async (module) => (await WebAssembly.instantiate(module)).exports);
+      build.idle = undefined;
+      this.loaded.set(build, loaded);
+    }
+    return loaded;
+  }
+
+  /** Leaves the instances, with their memory, to the next decode in this thread. */
+  async keep() {
+    for (const [build, loaded] of this.loaded) {
+      const exports = await loaded;
+      if (exports.memory.buffer.byteLength <= KEPT) build.idle = exports;
+    }
+    this.loaded.clear();
+  }
 }

@@ -2,7 +2,7 @@
 
 import { BUNDLE, Decoder } from './block.js';
 import { PotrError, bytesTo, parseMetadata, readSection, refuse } from './container.js';
-import { loader } from './engine.js';
+import { Engine } from './engine.js';
 import { open } from './source.js';
 import { NAME, serve } from './worker.js';
 
@@ -121,6 +121,7 @@ export async function decode(source, options = {}) {
     }
     await Promise.all(running);
     await file.end();
+    await team.keep();
   } finally {
     signal?.removeEventListener('abort', stop);
     team.end();
@@ -144,7 +145,12 @@ class Alone {
 
   /** @param {Options['wasm']} wasm */
   constructor(wasm) {
-    this.decoder = new Decoder(loader(wasm));
+    this.engine = new Engine(wasm);
+    this.decoder = new Decoder(this.engine);
+  }
+
+  keep() {
+    return this.engine.keep();
   }
 
   /** @param {Block} block @param {Uint8Array} data @param {number} degree @param {All} into */
@@ -217,6 +223,8 @@ class Pool {
       else this.idle.push(member);
     }
   }
+
+  async keep() {}
 
   end(why = /** @type {unknown} */ (new Error('decoding has ended'))) {
     this.ended = why;

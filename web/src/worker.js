@@ -2,7 +2,7 @@
 
 import { Decoder } from './block.js';
 import { PotrError } from './container.js';
-import { loader } from './engine.js';
+import { Engine } from './engine.js';
 
 export const NAME = 'potr-decoder';
 
@@ -13,11 +13,11 @@ export function serve() {
   let opened;
   onmessage = async ({ data: job }) => {
     try {
-      decoder ??= new Decoder(loader(job.wasm));
+      decoder ??= new Decoder(new Engine(job.wasm));
       if (job.data) opened = job;
       await decoder.open(opened.id, opened.block, opened.data, opened.degree);
       if (job.to === undefined) {
-        const positions = await decoder.positions();
+        const positions = (await decoder.positions()).slice();
         postMessage({ positions }, { transfer: [positions.buffer] });
       } else {
         const { n, degree } = job, values = { scales: new Float32Array(3 * n), rotations: new Float32Array(4 * n), opacities: new Float32Array(n), sh: new Float32Array(3 * (degree + 1) ** 2 * n) };

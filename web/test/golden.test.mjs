@@ -20,3 +20,14 @@ for (const [name, bits] of Object.entries(BITS))
       const found = Object.fromEntries(Object.entries(NAMES).map(([theirs, ours]) => [theirs, sha256(scene[ours])]));
       assert.deepEqual(found, bits);
     });
+
+test('files that are decoded at the same time, and after one that is damaged', async () => {
+  const { 'with SIMD': wasm } = BUILDS, names = Object.keys(BITS), read = (name) => readFileSync(new URL(`${name}.potr`, DATA));
+  for (let round = 0; round < 2; round++) {
+    const damaged = read('golden_bundles_degree3');
+    damaged[damaged.length - 1] ^= 1;
+    const [broken, ...scenes] = await Promise.allSettled([decode(damaged, { wasm }), ...names.map((name) => decode(read(name), { wasm }))]);
+    assert.equal(broken.status, 'rejected');
+    scenes.forEach(({ value }, k) => assert.equal(sha256(value.sh), BITS[names[k]].sh, names[k]));
+  }
+});
