@@ -40,7 +40,7 @@ def test_a_device_that_refuses_what_views_share_takes_no_room(
 ):
     with Rasterizer(device, plush_excerpt) as rasterizer, rasterizer.prepare_set(plush_excerpt_cameras[:1]) as views:
         room = views.nbytes_cached + 48 * rasterizer.stride
-        with ViewCache(rasterizer, room, others=1e12) as cache:
+        with ViewCache(device, room, others=1e12) as cache:
 
             def refused(nbytes, what):
                 raise DeviceMemoryError("full")
