@@ -17,7 +17,7 @@ from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster import kept_scene
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.scene_buffers import gathered, uploaded
+from potr_cl.raster.scene_buffers import SceneBuffers, gathered, uploaded
 from potr_cl.stages import prune
 from potr_cl.stages.pruning import planned
 from potr_cl.stages.pruning.measured import measurement
@@ -27,7 +27,7 @@ from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.stage import State, Workbench
-from potr_cl.views import visibility
+from potr_cl.views import budget, visibility
 from potr_cl.views.shares import ViewShares
 from potr_cl.views.visibility import Visibility
 from potr_cl.workers.host import HostPool
@@ -312,3 +312,32 @@ def test_groups_are_made_only_where_they_can_be_of_use(kernels, monkeypatch):
         encode(scene, cameras, options, device=device)
     assert len(grouped) == 1
     assert 0.2 < visibility.seen_part(*street(5, 900)) < 0.45
+
+
+def test_copies_of_clusters_wake_one_at_a_time(kernels, monkeypatch):
+    """There is room for the largest only."""
+    skip_unless("by cluster", kernels)
+    awake: set[int] = set()
+    most = []
+    wake, close = SceneBuffers.wake, SceneBuffers.close
+
+    def woken(self):
+        wake(self)
+        awake.add(id(self))
+        most.append(len(awake))
+
+    def closed(self):
+        awake.discard(id(self))
+        close(self)
+
+    monkeypatch.setattr(budget, "SCENES", 0.0)
+    monkeypatch.setattr(SceneBuffers, "wake", woken)
+    monkeypatch.setattr(SceneBuffers, "close", closed)
+    scene, cameras = street()
+    with sweep([open_device(kernels)], "by cluster", SweepOptions(0.0, memory=1_600_000), scene, cameras) as got:
+        sets = got._engine.resident
+        assert got._engine.plan.copies_rest
+        assert len({id(ready.subset) for ready in sets if ready.shares}) > 1
+        most.clear()
+        got.measure()
+    assert max(most) == 1
