@@ -68,7 +68,7 @@ def called(capsys, *arguments):
         ([], "a command is missing: encode, prune, "),
         (["encod", "a.ply"], "there is no command 'encod': is encode meant?"),
         (["a.ply"], "to compress a scene: potr-cl encode a.ply -o OUT.potr"),
-        (["encode"], '.glb or .ply, a folder, or "-" for standard output) is missing (see'),
+        (["encode"], '.ply or .html, a folder, or "-" for standard output) is missing (see'),
         (["encode", "a.ply", "--outptu", "b"], "there is no option '--outptu': is --output OUT.potr meant?"),
         (["encode", "a.ply", "--camras=b", "-o", "c"], "is --cameras PATH meant?"),
         (["encode", "a.ply", "--bananas", "-o", "c"], "there is no option '--bananas'"),
