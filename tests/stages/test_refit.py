@@ -22,23 +22,9 @@ from potr_cl.stages.refitting.own_views import OwnViews
 from potr_cl.stages.refitting.refit import active_coefficients, refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.refitting.sweep import Sweep
-from tests.devices import KERNELS, open_device
 from tests.reference.refit import LENGTHS, selection, to_rgb, to_ycocg
 from tests.reference.refit_cases import Case, Linearised, Pictures
 from tests.reference.scenes import ring_of_cameras, tilted_camera, visible_scene
-
-
-@pytest.fixture(scope="module", params=KERNELS)
-def device(request):
-    device = open_device(request.param)
-    yield device
-    assert device.allocated == 0, "a re-fit did not give all its memory back"
-
-
-@pytest.fixture
-def case(device):
-    with Case(device, visible_scene(40), visible_scene(60, 2, seed=7), ring_of_cameras(4, size=40)) as case:
-        yield case
 
 
 def relative(a, b) -> float:

@@ -26,7 +26,7 @@ from potr_cl.views.subsets import ListedSplats
 from potr_cl.workers.host import HostPool
 from tests.cases.elsewhere import ElsewherePool
 from tests.cases.streets import street
-from tests.devices import KERNELS, open_device
+from tests.devices import open_device
 from tests.reference.refit_cases import Case, Linearised
 from tests.reference.scenes import ring_of_cameras, visible_scene
 
@@ -70,13 +70,6 @@ PLANS = {
 }
 #: What becomes of the solution: left as it is, rounded in rounds, or by somebody who asks what coefficients are worth.
 WAYS = ("solve", "colour_grid", "fix_ac")
-
-
-@pytest.fixture(scope="module", params=KERNELS)
-def device(request):
-    device = open_device(request.param)
-    yield device
-    assert device.allocated == 0, "a re-fit did not give all its memory back"
 
 
 @pytest.fixture

@@ -11,23 +11,9 @@ from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.stages.refitting.colour_refit import ColourRefit
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
-from tests.devices import KERNELS, open_device
 from tests.reference.refit import to_ycocg
 from tests.reference.refit_cases import Case, as_rows
 from tests.reference.scenes import ring_of_cameras, visible_scene
-
-
-@pytest.fixture(scope="module", params=KERNELS)
-def device(request):
-    device = open_device(request.param)
-    yield device
-    assert device.allocated == 0, "a re-fit did not give all its memory back"
-
-
-@pytest.fixture
-def case(device):
-    with Case(device, visible_scene(40), visible_scene(60, 2, seed=7), ring_of_cameras(4, size=40)) as case:
-        yield case
 
 
 def coarse(sh, refit) -> np.ndarray:

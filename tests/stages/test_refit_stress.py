@@ -9,17 +9,9 @@ import pytest
 
 from potr_cl.model.camera import Camera
 from potr_cl.stages.refitting.refit_options import RefitOptions
-from tests.devices import KERNELS, open_device
 from tests.reference.refit import to_ycocg
 from tests.reference.refit_cases import Case, Linearised
 from tests.reference.scenes import plain_splats, ring_of_cameras, straight_camera, visible_scene
-
-
-@pytest.fixture(scope="module", params=KERNELS)
-def device(request):
-    device = open_device(request.param)
-    yield device
-    assert device.allocated == 0, "a re-fit did not give all its memory back"
 
 
 def of_size(camera: Camera, width: int, height: int) -> Camera:
@@ -27,12 +19,6 @@ def of_size(camera: Camera, width: int, height: int) -> Camera:
     return dataclasses.replace(
         camera, width=width, height=height, fx=factor * camera.fx, fy=factor * camera.fy, cx=width / 2, cy=height / 2
     )
-
-
-@pytest.fixture
-def case(device):
-    with Case(device, visible_scene(40), visible_scene(60, 2, seed=7), ring_of_cameras(4, size=40)) as case:
-        yield case
 
 
 def test_same_bits_every_time(case):

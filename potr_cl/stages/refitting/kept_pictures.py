@@ -11,7 +11,8 @@ import pyopencl as cl
 from potr_cl.model.camera import Camera
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner, Scratch
-from potr_cl.stages.refitting.targets import Targets, nbytes
+from potr_cl.stages.refitting.targets import Targets
+from potr_cl.views.budget import target_bytes
 
 #: Pictures that are asked for together, and their bytes at the most: a GPU prepares several views in one go.
 _TOGETHER, _MOST_BYTES = 16, 1 << 28
@@ -60,7 +61,7 @@ class KeptPictures(Owner):
 
     def nbytes(self, numbers: Sequence[int]) -> int:
         """Bytes of some views' pictures."""
-        return sum(nbytes(self._cameras[number]) for number in numbers)
+        return sum(target_bytes(self._cameras[number]) for number in numbers)
 
     def fill(self, targets: Targets, sets: Iterable[Sequence[int]], together: bool = False) -> None:
         """Have those pictures of these targets that are kept.

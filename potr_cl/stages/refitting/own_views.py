@@ -24,11 +24,11 @@ from potr_cl.stages.refitting.coefficients import Coefficients, Vector
 from potr_cl.stages.refitting.fixed_point import gathered_scale
 from potr_cl.stages.refitting.kept_pictures import KeptPictures
 from potr_cl.stages.refitting.sweep import Sweep
-from potr_cl.stages.refitting.targets import Targets, nbytes
+from potr_cl.stages.refitting.targets import Targets
 from potr_cl.stages.refitting.view_errors import ViewErrors
 from potr_cl.stages.refitting.view_kernels import Picks, SweptSums, ViewKernels
 from potr_cl.views import plan as plans
-from potr_cl.views.budget import free_memory
+from potr_cl.views.budget import free_memory, target_bytes
 from potr_cl.views.engine import Launch, Ready, ViewEngine
 from potr_cl.views.reached import Reach
 from potr_cl.views.subsets import ListedSplats, Subset, WholeScene
@@ -91,7 +91,7 @@ class OwnViews(Owner):
         order = sorted(own_numbers, key=lambda each: (each % self.parts, -rooms[each], each))
         parts = [list(some) for _, some in itertools.groupby(order, lambda each: each % self.parts)]
         # To render a picture takes many times as long as to project a view, and it takes less room.
-        pictures = sum(nbytes(cameras[number]) for number in own_numbers)
+        pictures = sum(target_bytes(cameras[number]) for number in own_numbers)
         self._cache = ViewCache(device, free_memory(device) if memory is None else memory, pictures)
         self._memory = Memory(device)
         self._owned: list[Owner] = [self._cache, self._memory]

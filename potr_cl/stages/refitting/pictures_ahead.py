@@ -17,7 +17,7 @@ from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.stages.refitting.targets import Targets, targets_of
-from potr_cl.stages.refitting.targets import nbytes as bytes_of
+from potr_cl.views.budget import target_bytes
 from potr_cl.views.visibility import Visibility
 
 #: They take no more than this part of a device's memory: for a moment they lie there twice.
@@ -102,7 +102,7 @@ class _Pictures(Owner):
 
     def __init__(self, device: Device, cameras: Sequence[Camera], numbers: Sequence[int]) -> None:
         self._device = device
-        ends = np.cumsum([0, *(bytes_of(cameras[number]) for number in numbers)])
+        ends = np.cumsum([0, *(target_bytes(cameras[number]) for number in numbers)])
         self._places = {
             number: (int(start), int(end)) for number, start, end in zip(numbers, ends[:-1], ends[1:], strict=True)
         }
@@ -140,7 +140,7 @@ def _rendered(
     sights: Visibility | None,
 ) -> _Pictures | None:
     """Some views' pictures on a device; None: it has not much room, or the scene does not lie there."""
-    if sum(bytes_of(cameras[number]) for number in numbers) > _PART * device.info.memory:
+    if sum(target_bytes(cameras[number]) for number in numbers) > _PART * device.info.memory:
         return None
     scene = source.on(device)
     if not isinstance(scene, SceneBuffers):

@@ -18,6 +18,7 @@ from potr_cl.opencl.ferry import Cargo, Ferry
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
+from potr_cl.views.budget import target_bytes
 from potr_cl.views.pictures import SeenRasterizer
 from potr_cl.views.visibility import Visibility
 
@@ -130,9 +131,9 @@ class RememberedTargets(Owner):
 
     def __init__(self, device: Device, targets: Targets, cameras: Sequence[Camera]) -> None:
         self._ferry = Ferry(device)
-        self._ends = np.cumsum([0, *(nbytes(camera) // 4 for camera in cameras)])
+        self._ends = np.cumsum([0, *(target_bytes(camera) // 4 for camera in cameras)])
         self._pictures = mapped.array((int(self._ends[-1]),), np.float32, "pictures")
-        largest = max(map(nbytes, cameras))
+        largest = max(map(target_bytes, cameras))
         # On a GPU several at a time are rendered faster.
         together = 1 if device.family == "cpu" else min(max(_TOGETHER // largest, 1), len(cameras))
         with Memory(device) as memory, ThreadPoolExecutor(1) as thread:
@@ -165,11 +166,6 @@ class RememberedTargets(Owner):
 
     def _picture(self, number: int) -> FloatArray:
         return self._pictures[self._ends[number] : self._ends[number + 1]]
-
-
-def nbytes(camera: Camera) -> int:
-    """Bytes of a view's picture."""
-    return 12 * camera.width * camera.height
 
 
 class Photographs(Protocol):
