@@ -10,7 +10,13 @@
 #include "prediction.h"
 #include "steps.h"
 
-/* A linker that optimises all at once would fetch libc's, which asks the host for random numbers. Nobody calls it. */
+/* A linker that optimises all at once would fetch libc's, which ask the host for random numbers. Nobody calls these, but
+ * all three must be here: with one of them missing libc's come, and are there twice. */
+unsigned long __stack_chk_guard;
+void __init_ssp(void *entropy)
+{
+    (void)entropy;
+}
 _Noreturn void __stack_chk_fail(void)
 {
     __builtin_trap();
