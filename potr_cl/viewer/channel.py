@@ -3,9 +3,9 @@ views, dropped files.
 
 A connection is a tab's second one. It names the tab by a key that viser's page of that tab was given, and speaks JSON:
 
-- from the page: ``{"divider": 0.4}``, ``{"swap": true}``, ``{"fly": 3}``, ``{"rung": 2}``, ``{"mode": "heat map"}``,
-  ``{"cameras": true}`` to show or hide them, and ``{"file": {"name", "size", "as"}}``, after which the file follows
-  as binary messages;
+- from the page: ``{"divider": 0.4}``, ``{"swap": true}``, ``{"fly": 3}``, ``{"rung": 2, "asked": 5}`` (the fifth time),
+  ``{"mode": "heat map"}``, ``{"cameras": true}`` to show or hide them, and ``{"file": {"name", "size", "as"}}``, after
+  which the file follows as binary messages;
 - to the page: ``{"state": {…}}`` and ``{"upload": {…}}``.
 """
 
@@ -47,6 +47,9 @@ class Tab(Protocol):
 
     def climb(self, rung: int) -> None:
         """A rung of the ladder was clicked."""
+
+    def acknowledge(self, asked: int) -> None:
+        """How often a rung has been asked for by now."""
 
     def choose_mode(self, mode: str) -> None:
         """A key chose how to compare."""
@@ -169,7 +172,14 @@ class _Mail:
 def _obey(tab: Tab, content: dict[str, Any]) -> None:
     if "divider" in content:
         tab.divide(min(max(float(content["divider"]), 0.0), 1.0))
-    for name, act in (("swap", tab.swap), ("mode", tab.choose_mode), ("fly", tab.fly), ("rung", tab.climb)):
+    acts: tuple[tuple[str, Callable[[Any], None]], ...] = (
+        ("swap", tab.swap),
+        ("mode", tab.choose_mode),
+        ("fly", tab.fly),
+        ("rung", tab.climb),
+        ("asked", tab.acknowledge),
+    )
+    for name, act in acts:
         if name in content:
             act(content[name])
     if "cameras" in content:

@@ -119,6 +119,7 @@ _SAID: dict[str, Callable[[Any], bool]] = {
     "mode": lambda value: value in MODES,
     "fly": _is_place,
     "rung": _is_place,
+    "asked": _is_place,
     "cameras": lambda value: value is True,
     "file": lambda value: isinstance(value, dict),
     "cancel": lambda value: True,

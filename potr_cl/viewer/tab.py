@@ -64,6 +64,7 @@ class TabHandle:
         self._flights = 0
         self._lock = threading.Lock()
         self._here = True
+        self._asked = 0
         self._goal: int | None = None
         #: What the browser has said of its camera last, and when.
         self._told: tuple[Gaze, float] | None = None
@@ -143,6 +144,10 @@ class TabHandle:
     def climb(self, rung: int) -> None:
         self._house.climb(rung)
 
+    def acknowledge(self, asked: int) -> None:
+        self._asked = asked
+        self.restate()
+
     def dropped(self, which: Which, exhibit: Exhibit) -> None:
         self._house.put(which, exhibit)
 
@@ -168,6 +173,7 @@ class TabHandle:
 
     def restate(self, everything: bool = True) -> None:
         """Tell the page what it shows beside the picture: everything, or only what is this tab's own."""
+        asked = self._asked  # read before the rung, so that the page never takes an older rung for the answer
         pair, swapped = self._house.is_pair(), self.visitor.swapped
         names = ("B", "A") if swapped else ("A", "B")
         labels = {
@@ -179,7 +185,7 @@ class TabHandle:
         self._send(
             {
                 "state": {
-                    **(self._house.state() if everything else {}),
+                    **({**self._house.state(), "asked": asked} if everything else {}),
                     "mode": self.visitor.mode,
                     "divider": self.visitor.divider,
                     "labels": labels if pair else None,

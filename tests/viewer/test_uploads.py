@@ -75,10 +75,11 @@ def uploads_told(connection: Connection) -> list[dict[str, Any]]:
 
 def test_what_the_page_says_is_obeyed() -> None:
     tab, connection = spoken(
-        [{"divider": 0.25}, {"divider": 7}, {"swap": True}, {"fly": 3}, {"rung": 1}, {"mode": "heat map"}]
+        [{"divider": 0.25}, {"divider": 7}, {"swap": True}, {"fly": 3}, {"rung": 1, "asked": 4}, {"mode": "heat map"}]
     )
     assert tab.heard == [
-        ("divide", 0.25), ("divide", 1.0), ("swap", True), ("fly", 3), ("climb", 1), ("choose_mode", "heat map")
+        ("divide", 0.25), ("divide", 1.0), ("swap", True), ("fly", 3), ("climb", 1), ("acknowledge", 4),
+        ("choose_mode", "heat map")
     ]  # fmt: skip
     assert connection.sent[0] == {"state": {"a": 1, "b": 2}}, "what waits is told at once"
 

@@ -10,6 +10,7 @@
   const state = { mode: "divider", divider: 0.5, pair: false, labels: null, figures: null, scenes: [], views: [],
     at: null, ladder: null, error: "", heat: null };
   let socket = null, key = null, dragging = false, sending = null, swapped = false;
+  let asked = 0;  // how often a rung of the ladder was asked for on this connection
 
   const made = (tag, name, text) => {
     const element = document.createElement(tag);
@@ -18,6 +19,10 @@
     return element;
   };
   const say = message => { if (socket && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message)); };
+  const climb = rung => {
+    state.ladder.at = Math.min(Math.max(rung, 0), state.ladder.rungs.length - 1);
+    say({ rung: state.ladder.at, asked: ++asked });
+  };
 
   // Over the picture ------------------------------------------------------------------------------------------------
   const stage = made("div", "potr-stage");
@@ -156,7 +161,7 @@
         const dot = node("circle", { cx: x(bytes[k]), cy: y(psnr[k]), r: rung.n === ladder.at ? 6 : 4,
           class: rung.n === ladder.at ? "at" : "" });
         dot.append(node("title", {}, `q ${rung.q}: ${rung.size}, ${rung.psnr.toFixed(2)} dB`));
-        dot.addEventListener("click", () => say({ rung: rung.n }));
+        dot.addEventListener("click", () => climb(rung.n));
         svg.append(dot);
       });
     }
@@ -203,11 +208,14 @@
   // The channel -------------------------------------------------------------------------------------------------------
   function connect() {
     const scheme = location.protocol === "https:" ? "wss" : "ws";
+    asked = 0;
     socket = new WebSocket(`${scheme}://${location.host}/potr_cl/channel?key=${encodeURIComponent(key)}`);
     socket.addEventListener("message", event => {
       const message = JSON.parse(event.data);
       if (message.state) {
         if (dragging) delete message.state.divider;
+        // Told before the last key was known there: the key counts.
+        if (message.state.ladder && state.ladder && message.state.asked < asked) message.state.ladder.at = state.ladder.at;
         const changed = Object.keys(message.state).filter(
           name => JSON.stringify(message.state[name]) !== JSON.stringify(state[name]));
         Object.assign(state, message.state);
@@ -267,8 +275,7 @@
     if (rung === undefined) return;
     event.preventDefault();
     event.stopPropagation();
-    state.ladder.at = Math.min(Math.max(rung, 0), last);
-    say({ rung: state.ladder.at });
+    climb(rung);
   }, true);
   const quiet = event => { if (sliderOf(event) && event.key.startsWith("Arrow")) event.stopPropagation(); };
   addEventListener("keyup", event => { if (event.key === "f" || event.key === "F") flick(false); });
