@@ -53,11 +53,11 @@ def attack(formats: list[str], tmp_path: Path, count: int, seed: int) -> None:
 
 
 def test_some_changed_files(tmp_path):
-    attack(["potr", "ply", "spz", "transforms.json", "png"], tmp_path, 300, 1)
+    attack(["potr", "ply", "spz", "transforms.json", "png"], tmp_path, 100, 1)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("formats", "count"), [(FORMATS[:1], 4000), (FORMATS[1:], 300)], ids=["potr", "others"])
+@pytest.mark.parametrize(("formats", "count"), [(FORMATS[:1], 1500), (FORMATS[1:], 150)], ids=["potr", "others"])
 def test_many_changed_files(formats, count, tmp_path):
     """Most of the format that is our own; campaigns go further (docs/benchmarks/hostile_input.md)."""
     attack(formats, tmp_path, count, 11)
@@ -74,7 +74,7 @@ def test_bombs(formats, tmp_path):
 
 def test_some_messages_to_the_viewer(tmp_path):
     pytest.importorskip("viser", reason="the extra view is not installed")
-    (row,) = run("page", tmp_path, "--count", "1000", "--tabs", "2")
+    (row,) = run("page", tmp_path, "--count", "300", "--tabs", "2")
     assert row["bytes printed"] == 0
     assert row["answers to the honest tab"] > 0
 
@@ -84,15 +84,15 @@ def test_some_messages_to_the_viewer(tmp_path):
     [
         (["decode"], 6),
         pytest.param(
-            ["encode --report", "encode --ladder", "encode, preset smallest", "prune --order", "render"],
-            20,
+            ["encode --report", "encode, preset smallest", "render"],
+            12,
             marks=pytest.mark.slow,
         ),
     ],
     ids=["quick", "others"],
 )
 def test_signals(commands, moments, tmp_path):
-    """To commands that write one file, two, several, pictures, and to one that an interrupt may end early."""
+    """To commands that write one file, two, pictures, and to one that an interrupt may end early: each kind of signal."""
     rows = run("signals", tmp_path, "--moments", str(moments), *each("--command", commands))
     assert sum(row["moments"] for row in rows) == moments
     assert sum(row["wrong"] for row in rows) == 0
@@ -101,6 +101,6 @@ def test_signals(commands, moments, tmp_path):
 
 @pytest.mark.slow
 def test_files_are_the_same_the_second_time(tmp_path):
-    commands = ["encode, preset paper", "encode, preset smallest", "decode", "convert to spz"]
+    commands = ["encode, preset smallest", "convert to spz"]
     rows = run("determinism", tmp_path, *each("--command", commands))
     assert {row["command"]: row["same bytes"] for row in rows} == dict.fromkeys(commands, "yes")
