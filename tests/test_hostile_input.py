@@ -74,7 +74,7 @@ def test_bombs(formats, tmp_path):
 
 def test_some_messages_to_the_viewer(tmp_path):
     pytest.importorskip("viser", reason="the extra view is not installed")
-    (row,) = run("page", tmp_path, "--count", "300", "--tabs", "2")
+    (row,) = run("page", tmp_path, "--count", "1000", "--tabs", "2")
     assert row["bytes printed"] == 0
     assert row["answers to the honest tab"] > 0
 
@@ -84,15 +84,15 @@ def test_some_messages_to_the_viewer(tmp_path):
     [
         (["decode"], 6),
         pytest.param(
-            ["encode --report", "encode, preset smallest", "render"],
-            12,
+            ["encode --report", "encode --ladder", "encode, preset smallest", "prune --order", "render"],
+            20,
             marks=pytest.mark.slow,
         ),
     ],
     ids=["quick", "others"],
 )
 def test_signals(commands, moments, tmp_path):
-    """To commands that write one file, two, pictures, and to one that an interrupt may end early: each kind of signal."""
+    """To commands that write one file, two, several, pictures, and to one that an interrupt may end early."""
     rows = run("signals", tmp_path, "--moments", str(moments), *each("--command", commands))
     assert sum(row["moments"] for row in rows) == moments
     assert sum(row["wrong"] for row in rows) == 0
@@ -101,6 +101,6 @@ def test_signals(commands, moments, tmp_path):
 
 @pytest.mark.slow
 def test_files_are_the_same_the_second_time(tmp_path):
-    commands = ["encode, preset smallest", "convert to spz"]
+    commands = ["encode, preset paper", "encode, preset smallest", "decode", "convert to spz"]
     rows = run("determinism", tmp_path, *each("--command", commands))
     assert {row["command"]: row["same bytes"] for row in rows} == dict.fromkeys(commands, "yes")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 
 import numpy as np
 import pytest
@@ -37,10 +36,7 @@ def spoiled(monkeypatch, change) -> measures.Measures:
 
 
 @pytest.mark.slow
-def test_every_kernel_stays_within_what_rounding_explains(device, monkeypatch):
-    """In all cases made by hand, and a few that are searched for; whole fits and decodes in some of them."""
-    check_roads, number = views.check_roads, itertools.count()
-    monkeypatch.setattr(views, "check_roads", lambda *given: {} if next(number) % 4 else check_roads(*given))
+def test_every_kernel_stays_within_what_rounding_explains(device):
     result = run.run_device(device, examples=1)
     assert result["failures"] == {}
     assert set(result["worst"]) == set(measures.WHAT)
