@@ -55,25 +55,22 @@ def few(cameras, size=80):
     ]  # fmt: skip
 
 
-#: Ways of :func:`test_the_same_bytes` that are tried in the quick subset: each family once.
-QUICK = {("cpu", "nothing is kept of any view"), ("gpu", "a GPU decides itself")}
-
-
 @pytest.fixture(scope="module", params=FAMILIES)
 def family(request):
     return request.param
 
 
+#: Nothing is kept of any view, and a GPU decides itself.
+LITTLE_MEMORY, BY_THRESHOLD = OPTIONS.changed(memory=0), OPTIONS.changed(prune={"keep": None})
+
+
 @pytest.mark.parametrize(
     ("family", "options"),
     [
-        pytest.param(family, options, marks=() if (family, name) in QUICK else pytest.mark.slow)
-        for family in FAMILIES
-        for name, options in {
-            "by number": OPTIONS,
-            "nothing is kept of any view": OPTIONS.changed(memory=0),
-            "a GPU decides itself": OPTIONS.changed(prune={"keep": None}),
-        }.items()
+        ("cpu", LITTLE_MEMORY),
+        ("gpu", BY_THRESHOLD),
+        pytest.param("cpu", OPTIONS, marks=pytest.mark.slow),
+        pytest.param("gpu", LITTLE_MEMORY, marks=pytest.mark.slow),
     ],
 )
 def test_the_same_bytes(plush_excerpt, plush_excerpt_cameras, family, options):
@@ -147,6 +144,7 @@ def test_more_devices_than_views(plush_excerpt, plush_excerpt_cameras, family):
         assert encode(plush_excerpt, cameras, OPTIONS, device=devices[0], pool=pool).data == expected
 
 
+@pytest.mark.one_family
 def test_pruning_alone_removes_the_same_splats(plush_excerpt, plush_excerpt_cameras, family):
     """All that is known of the course, not only what is left: the order, and the sums of each iteration."""
     cameras = few(plush_excerpt_cameras)
@@ -181,8 +179,8 @@ def test_a_device_with_too_little_memory_leaves_its_views_to_others(plush_excerp
 @pytest.fixture(scope="module")
 def pruned_by_threshold(plush_excerpt, plush_excerpt_cameras):
     """Options with which a GPU decides itself, and the file that one device makes."""
-    options = OPTIONS.changed(prune={"keep": None})
-    return options, encode(plush_excerpt, few(plush_excerpt_cameras), options, device=open_device("gpu")).data
+    encoded = encode(plush_excerpt, few(plush_excerpt_cameras), BY_THRESHOLD, device=open_device("gpu"))
+    return BY_THRESHOLD, encoded.data
 
 
 @pytest.mark.slow

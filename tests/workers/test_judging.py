@@ -98,6 +98,7 @@ def test_the_same_figures(plush_excerpt, cameras, coded, family, kind):
     assert [device.allocated for device in devices] == [0] * 3
 
 
+@pytest.mark.one_family
 def test_a_scene_that_is_kept_is_not_sent_again(plush_excerpt, cameras, coded, family, monkeypatch):
     views = EvaluationViews.of(cameras)
     expected = judged(open_device(family), plush_excerpt, coded, views)
@@ -111,6 +112,7 @@ def test_a_scene_that_is_kept_is_not_sent_again(plush_excerpt, cameras, coded, f
 
 
 @pytest.mark.slow
+@pytest.mark.one_family
 def test_a_candidate_of_the_host_is_judged_too(plush_excerpt, cameras, coded, family):
     """As files are whose readers make no scene on a device; and pictures are remembered from one to the next."""
     views, worse = EvaluationViews.of(cameras), coded.output.read(coded.data)
@@ -125,6 +127,7 @@ def test_a_candidate_of_the_host_is_judged_too(plush_excerpt, cameras, coded, fa
         assert [device.allocated for device in devices] == [0] * 2
 
 
+@pytest.mark.one_family
 def test_views_of_the_same_name(plush_excerpt, cameras, coded, family):
     """As cameras made in Python may have it."""
     alike = [dataclasses.replace(camera, name="view", split="test") for camera in cameras[:4]]
@@ -196,6 +199,7 @@ def test_a_search_for_a_psnr_judges_together(plush_excerpt, cameras, monkeypatch
     assert [device.allocated for device in devices] == [0] * 2
 
 
+@pytest.mark.one_family
 def test_photographs_are_judged_by_together(plush_excerpt, cameras, coded, tmp_path, family):
     for camera in cameras[1:4]:
         with (tmp_path / f"{camera.name}.png").open("wb") as file:
@@ -229,6 +233,7 @@ def _small_groups(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_small_groups")
+@pytest.mark.one_family
 def test_views_of_a_large_scene_are_judged_by_what_they_see(family, monkeypatch):
     scene, cameras = street(5, 500, across=True)
     cameras = [dataclasses.replace(c, split="test" if k % 2 else "train") for k, c in enumerate(cameras)]
@@ -296,6 +301,7 @@ def test_with_little_memory_a_decoded_file_is_judged_by_what_views_see_too(famil
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_small_groups")
+@pytest.mark.one_family
 def test_an_encode_leaves_the_groups_that_it_has_found(family, monkeypatch):
     monkeypatch.setattr("potr_cl.views.visibility.LEAST_SPLATS", 1)
     scene, cameras = street(5, 500, across=True)
@@ -340,6 +346,7 @@ def test_pictures_of_what_views_see(family, where, rules):
     assert device.allocated == 0
 
 
+@pytest.mark.one_family
 def test_scenes_are_compared_together(plush_excerpt, cameras, coded, family, monkeypatch):
     """Scenes of the host and scenes of files."""
     alone = open_device(family)

@@ -74,9 +74,9 @@ def array_fields(scene):
     "options",
     [
         # The host decides, as it does on a CPU whatever the options.
-        pytest.param(OPTIONS, marks=pytest.mark.slow),
+        pytest.param(OPTIONS, marks=pytest.mark.one_family),
         # Nothing is kept of any view; tests/workers/test_host.py has that without slow ones.
-        pytest.param(OPTIONS.changed(memory=0, prune={"tolerance": 0.0}), marks=pytest.mark.slow),
+        pytest.param(OPTIONS.changed(memory=0, prune={"tolerance": 0.0}), marks=pytest.mark.one_family),
         OPTIONS.changed(prune={"keep": None}),  # a GPU decides itself, and what nobody sees stays
     ],
     ids=["by number", "little memory", "by threshold"],
@@ -112,6 +112,7 @@ def test_the_same_bytes(family, options, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.one_family
 def test_a_re_fit_sends_what_views_draw(family, monkeypatch):
     """Of a direction, each worker gets the coefficients of these splats alone; what it finds is the same."""
     scene, cameras = street(5, 500, across=True)
@@ -178,6 +179,7 @@ def test_a_re_fit_without_room_for_that_sends_all(monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.one_family
 def test_the_uncompressed_scene_travels_once(family, monkeypatch):
     """Where workers get all of it: of what is pruned, once unseen splats are set aside, they get the numbers."""
     monkeypatch.setattr(visibility, "LEAST_SPLATS", 1 << 40)
