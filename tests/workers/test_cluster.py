@@ -30,6 +30,7 @@ from potr_cl.views import visibility
 from potr_cl.workers.cluster import ClusterPool
 from potr_cl.workers.parts import Parts
 from potr_cl.workers.pool import Part, WorkerLost
+from tests.cases.cameras import small
 from tests.cases.streets import street
 
 distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
@@ -76,13 +77,7 @@ def scene(data):
 def cameras(data):
     """Five training views, small."""
     chosen = [c for c in load_cameras(data / "plush_excerpt_cameras.json") if c.split == "train"][:5]
-    factor = 80 / chosen[0].width
-    return [
-        dataclasses.replace(
-            c, width=80, height=round(c.height * factor), fx=c.fx * factor, fy=c.fy * factor, cx=40, cy=c.cy * factor
-        )
-        for c in chosen
-    ]
+    return [small(camera) for camera in chosen]
 
 
 @pytest.fixture(scope="module")

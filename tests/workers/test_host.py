@@ -28,6 +28,7 @@ from potr_cl.workers.host import HostPool
 from potr_cl.workers.opening import open_workers
 from potr_cl.workers.parts import Parts
 from potr_cl.workers.pool import Part
+from tests.cases.cameras import small
 from tests.cases.streets import street
 from tests.devices import FAMILIES, open_device
 
@@ -42,17 +43,10 @@ OPTIONS = EncodeOptions.for_preset(
 )
 
 
-def few(cameras, size=80):
+def few(cameras):
     """Five training views and a test view, small."""
     chosen = [c for c in cameras if c.split == "train"][:5] + [c for c in cameras if c.split == "test"][:1]
-    factor = size / chosen[0].width
-    return [
-        dataclasses.replace(
-            c, width=round(c.width * factor), height=round(c.height * factor), fx=c.fx * factor, fy=c.fy * factor,
-            cx=c.cx * factor, cy=c.cy * factor,
-        )
-        for c in chosen
-    ]  # fmt: skip
+    return [small(camera) for camera in chosen]
 
 
 @pytest.fixture(scope="module", params=FAMILIES)
@@ -160,7 +154,7 @@ def test_pruning_alone_removes_the_same_splats(plush_excerpt, plush_excerpt_came
     assert len(expected.history) > 1
 
 
-def small(device: Device, memory: int) -> Device:
+def poor(device: Device, memory: int) -> Device:
     """The same device with less memory."""
     return Device(dataclasses.replace(device.info, memory=memory), family=device.family)
 
@@ -169,7 +163,7 @@ def test_a_device_with_too_little_memory_leaves_its_views_to_others(plush_excerp
     cameras = few(plush_excerpt_cameras)
     first = Device(choose_device())
     expected = encode(plush_excerpt, cameras, OPTIONS, device=first).data
-    devices = [first, small(first, 100_000)]
+    devices = [first, poor(first, 100_000)]
     with HostPool(devices) as pool:
         assert encode(plush_excerpt, cameras, OPTIONS, device=first, pool=pool).data == expected
     assert "reassigning its views to 0:" in caplog.text
@@ -218,7 +212,7 @@ def test_a_device_that_fails_on_the_way(
 
 
 def test_no_device_has_enough_memory(plush_excerpt, plush_excerpt_cameras):
-    devices = [small(Device(choose_device()), 100_000) for _ in range(2)]
+    devices = [poor(Device(choose_device()), 100_000) for _ in range(2)]
     with HostPool(devices) as pool, pytest.raises(DeviceMemoryError):
         encode(plush_excerpt, few(plush_excerpt_cameras), OPTIONS, device=devices[0], pool=pool)
     assert [device.allocated for device in devices] == [0, 0]

@@ -27,6 +27,7 @@ from potr_cl.raster.scene_buffers import SceneBuffers, uploaded
 from potr_cl.views import pictures, visibility
 from potr_cl.views.pictures import SeenRasterizer, rasterizer_of
 from potr_cl.workers.host import HostPool
+from tests.cases.cameras import small
 from tests.cases.elsewhere import ElsewherePool
 from tests.cases.streets import street
 from tests.devices import FAMILIES, open_device
@@ -43,15 +44,10 @@ def family(request):
 @pytest.fixture(scope="module")
 def cameras(plush_excerpt_cameras):
     """Eleven views, small, five of which are held out."""
-    chosen = plush_excerpt_cameras[:11]
-    factor = 80 / chosen[0].width
     return [
-        dataclasses.replace(
-            c, width=80, height=round(c.height * factor), fx=c.fx * factor, fy=c.fy * factor, cx=40, cy=c.cy * factor,
-            split="test" if number % 2 else "train",
-        )
-        for number, c in enumerate(chosen)
-    ]  # fmt: skip
+        dataclasses.replace(small(camera), split="test" if number % 2 else "train")
+        for number, camera in enumerate(plush_excerpt_cameras[:11])
+    ]
 
 
 @pytest.fixture(scope="module")

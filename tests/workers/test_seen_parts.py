@@ -23,6 +23,7 @@ from potr_cl.stages.refitting.part import ColourPart
 from potr_cl.views import visibility
 from potr_cl.views.shares import ViewShares
 from potr_cl.views.visibility import Visibility
+from tests.cases.cameras import small
 from tests.cases.elsewhere import ElsewherePool
 from tests.cases.streets import street
 from tests.devices import FAMILIES, open_device
@@ -54,15 +55,6 @@ def with_a_house_that_nobody_sees(scene):
     together = (np.concatenate([getattr(each, f.name) for each in (scene, behind)]) for f in array_fields(scene))
     named = dict(zip([f.name for f in array_fields(scene)], together, strict=True))
     return dataclasses.replace(scene, **named)
-
-
-def smaller(camera, width):
-    factor = width / camera.width
-    height = round(camera.height * factor)
-    return dataclasses.replace(
-        camera, width=width, height=height, fx=camera.fx * factor, fy=camera.fy * factor, cx=width / 2,
-        cy=camera.cy * factor,
-    )  # fmt: skip
 
 
 def array_fields(scene):
@@ -138,7 +130,7 @@ def test_who_is_told_again_is_told_the_colours_of_then(lost_at, monkeypatch, plu
         "best", q=0.3, prune={"keep": 0.4, "iterations": 8}, refit={"at": (0.3, 0.6), "steps": 3, "drop": 1e-7},
         between=False,
     )  # fmt: skip
-    cameras = [smaller(camera, 80) for camera in plush_excerpt_cameras[:5]]
+    cameras = [small(camera) for camera in plush_excerpt_cameras[:5]]
     devices = [open_device("cpu") for _ in range(3)]
     expected = encode(plush_excerpt, cameras, options, device=devices[0]).data
     measure, asked = part.RemovalPart.changes, []
