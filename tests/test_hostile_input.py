@@ -72,13 +72,6 @@ def test_bombs(formats, tmp_path):
     assert {row["outcome"] for row in rows} <= {"read", "refused"}
 
 
-def test_some_messages_to_the_viewer(tmp_path):
-    pytest.importorskip("viser", reason="the extra view is not installed")
-    (row,) = run("page", tmp_path, "--count", "1000", "--tabs", "2")
-    assert row["bytes printed"] == 0
-    assert row["answers to the honest tab"] > 0
-
-
 @pytest.mark.parametrize(
     ("commands", "moments"),
     [

@@ -38,7 +38,6 @@ stress.fuzz         does any changed file do more than be refused or decode to f
 stress.bombs        what do files take that unpack to far more than they are, or claim to?
 stress.signals      what is left of a command that is told to end, at any moment?
 stress.determinism  does every command write the same bytes the second time?
-stress.page         is the viewer's server upset by any message, or by many?
 stress.long_life    does a process that encodes, renders and compares all day grow?
 stress.native       does the compiled decoder touch memory not its own, or differ from NumPy's, on changed files?
 ==================  ====================================================================================================
