@@ -36,7 +36,6 @@ stress.platforms    the rasterizer, the metrics and the re-fit on every OpenCL r
 stress.simulated    does Oclgrind see a race, an access out of bounds or an uninitialised read in any kernel?
 stress.fuzz         does any changed file do more than be refused or decode to finite numbers?
 stress.bombs        what do files take that unpack to far more than they are, or claim to?
-stress.signals      what is left of a command that is told to end, at any moment?
 stress.determinism  does every command write the same bytes the second time?
 stress.long_life    does a process that encodes, renders and compares all day grow?
 stress.native       does the compiled decoder touch memory not its own, or differ from NumPy's, on changed files?
