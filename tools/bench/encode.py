@@ -3,8 +3,8 @@
     python -m tools.bench.encode [SCENE …] [--device NAME] [--quick] [--stage NAME …] [--json FILE]
 
 For each stage the variants that exist: kernel family, compiler flags, sort, steps, entropy coder; each with its time
-and its error against float64 or against the full computation. (tools.bench.pruning has what the schedule may skip,
-tools.study.rate_distortion compares whole encodes of any options.) A variant is on the Pareto
+and its error against float64 or against the full computation. (tools.study.rate_distortion
+compares whole encodes of any options.) A variant is on the Pareto
 front if no other of its stage is at least as good in time, error and bytes and better in one by more than 5 %, the
 noise. Scenes: lego and plush by default; --quick takes the bundled excerpt at half size and the best device.
 

@@ -150,7 +150,7 @@ def with_exact_arrays() -> None:
 
     for module in (arrays, functions, bundles, octree, share, values):
         module.address = copied  # type: ignore[attr-defined]
-    bundles.BundledFile.work = work  # type: ignore[method-assign]
+    bundles.BundledFile.work = work  # type: ignore[assignment, method-assign]
 
 
 def sanitizers(library: Path, compiler: str | None = None) -> dict[str, str]:

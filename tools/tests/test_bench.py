@@ -18,7 +18,6 @@ from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor
 from tests.cases.ridges import channels, dense_weights, on_a_sphere, sparse_weights
 from tools.bench import encode, scaling
 from tools.bench.encode import STAGES, Row, on_front
-from tools.bench.pruning import pareto, skip_settings
 from tools.bench.scaling import Point, exponents, points
 from tools.workloads import excerpt
 
@@ -46,15 +45,6 @@ def test_the_front():
     assert [on_front(row, rows) for row in rows] == [True, True, False, True]
     rows = [Row("s", "a", 1, 1, nbytes=10), Row("s", "b", 2, 1, nbytes=5), Row("s", "c", 2, 1, nbytes=10)]
     assert [on_front(row, rows) for row in rows] == [True, True, False]
-    marks = {"a": (3, 50.0), "b": (1, 40.0), "c": (2, 39.0), "d": (2, 45.0), "e": (4, 50.0)}
-    found = pareto([{"skipped": n, "seconds": s, "equal": p} for n, (s, p) in marks.items()])
-    assert [r["skipped"] for r in found] == ["b", "d", "a"]
-
-
-def test_the_full_computation_comes_first_and_every_name_once():
-    settings = skip_settings([1, 4, 48])
-    assert (settings[0].name, settings[0].sweep.tolerance) == ("nothing", 0)
-    assert len({s.name for s in settings}) == len(settings)
 
 
 def test_ridge_errors_are_those_of_the_solution(plush_excerpt):
@@ -117,7 +107,7 @@ def test_ways_to_refit(tables, folder):
 
 @pytest.mark.slow
 def test_orders_of_pruning(tables, folder):
-    found = tables("pruning", folder, "--part", "curves", "--every", 2, "--iterations", 2, "--removed", 20, 50)
+    found = tables("pruning", folder, "--every", 2, "--iterations", 2, "--removed", 20, 50)
     curves = {row[0]: row[1:] for row in found["curves_excerpt"]}
     assert all(few > many for few, many in curves.values())
     assert curves["ours, 2 iterations"][1] > max(curves[name][1] for name in ("importance", "opacity", "random"))
