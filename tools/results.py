@@ -126,11 +126,6 @@ class Table:
         print(f"| {' | '.join(texts)} |", flush=True)
         self._keep()
 
-    def put(self, *cells: Cell) -> None:
-        """As :meth:`add`, but in place of the row that has the same first cell, where there is one."""
-        self._rows = [row for row in self._rows if row[0] != cells[0]]
-        self.add(*cells)
-
     def content(self, about: dict[str, Any]) -> dict[str, Any]:
         """What the JSON file holds of it; ``about`` is what :func:`circumstances` gives."""
         columns = [

@@ -43,7 +43,7 @@ class Asked:
     """A process that answers each line with one of JSON; its package is that of a folder, where one is given."""
 
     def __init__(self, command: list[str], folder: Path | None = None) -> None:
-        path = os.pathsep.join(filter(None, [folder and str(folder), os.environ.get("PYTHONPATH")]))
+        path = os.pathsep.join(str(each) for each in (folder, os.environ.get("PYTHONPATH")) if each)
         pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
         self._process = subprocess.Popen(command, cwd=folder, env={**os.environ, "PYTHONPATH": path}, **pipes)
 
