@@ -46,9 +46,7 @@ def _shaken(scene: Scene) -> Scene:
         means = (scene.means * (1 + 1e-3 * rng.normal(size=scene.means.shape))).astype(np.float32)
         sh = (scene.sh * (1 + 0.05 * rng.normal(size=scene.sh.shape))).astype(np.float32)
     return dataclasses.replace(
-        scene,
-        means=np.where(np.isfinite(means), means, scene.means),
-        sh=np.where(np.isfinite(sh), sh, scene.sh),
+        scene, means=np.where(np.isfinite(means), means, scene.means), sh=np.where(np.isfinite(sh), sh, scene.sh)
     )
 
 

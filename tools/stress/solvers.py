@@ -66,9 +66,7 @@ def check_refit(device: Device, case: RefitCase) -> Measures:
     if not np.isfinite(refitted.sh).all():
         return {"re-fit: loss": (np.inf, ULP)}
     before, after = refitted.errors
-    found = {
-        "re-fit: loss": (max(after - before, 0.0) / max(before, 1e-12), ULP),
-    }
+    found = {"re-fit: loss": (max(after - before, 0.0) / max(before, 1e-12), ULP)}
     try:
         true = Reference(case.scene, case.views, pictures, case.options.lam, case.options.prior)
     except ValueError:  # a pixel too near a threshold: whose pictures are meant?

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import importlib
+import itertools
 import json
 import sys
 
@@ -18,7 +19,7 @@ from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor
 from tests.cases.ridges import channels, dense_weights, on_a_sphere, sparse_weights
 from tools.bench import encode, scaling
 from tools.bench.encode import STAGES, Row, on_front
-from tools.bench.scaling import Point, exponents, points
+from tools.bench.scaling import exponents, points
 from tools.workloads import excerpt
 
 
@@ -127,16 +128,19 @@ def test_frames_and_decodes(tables, folder):
 
 
 def test_one_number_at_a_time():
-    found = [(p.splats, p.views, p.workers) for p in points([10, 20, 40], [3, 5], [1, 2])]
+    found = points([10, 20, 40], [3, 5], [1, 2])
     assert found == [(10, 3, 1), (20, 3, 1), (20, 5, 1), (20, 3, 2), (40, 3, 1)]
 
 
 def test_the_exponents():
-    measured = [Point(n, v, w, seconds=3e-6 * n**1.2 * v**0.5 / w) for n in (100, 400) for v in (5, 20) for w in (1, 4)]
-    found, deviation = exponents(measured, "seconds")
+    measured = [
+        {"splats": n, "views": v, "workers": w, "time": 3e-6 * n**1.2 * v**0.5 / w}
+        for n, v, w in itertools.product((100, 400), (5, 20), (1, 4))
+    ]
+    found, deviation = exponents(measured, "time")
     assert found == pytest.approx({"splats": 1.2, "views": 0.5, "workers": -1})
     assert deviation < 1e-9
-    alone, _ = exponents([point for point in measured if point.workers == 1], "seconds")
+    alone, _ = exponents([row for row in measured if row["workers"] == 1], "time")
     assert list(alone) == ["splats", "views"]
 
 
@@ -147,6 +151,6 @@ def test_encodes_of_cities(tables, folder):
     found = tables("scaling", folder, *words)
     assert [row[0] for row in found["points"]] == [2000, 2000, 4000]
     assert all(row[3] > 0 and row[7] > 0 and row[8] > 0 for row in found["points"])
-    assert {row[0] for row in found["exponents"]} == set(scaling.FIGURES.values())
+    assert {row[0] for row in found["exponents"]} == set(scaling.FIGURES)
     late = argparse.Namespace(size="64x48", limit=-1.0)
     assert not list(scaling.measured_in_turn(points([2000], [4], [1]), [str(folder)], late))
