@@ -7,7 +7,7 @@ How fast, how large, how much memory (``bench``):
 
 =====================  =================================================================================================
 bench.encode           run time against error of every stage and variant on every device: what is on the Pareto front?
-bench.rasterizer       frames a second, and time against splats, pixels and overlap
+bench.rasterizer       frames a second, and time by kernel
 bench.pruning          what does pruning keep, against other pruners?
 bench.refit            what does the re-fit of the colours bring, and what does it take?
 bench.fit              how fast are the fit's steps?

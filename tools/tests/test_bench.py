@@ -20,6 +20,7 @@ from tests.cases.ridges import channels, dense_weights, on_a_sphere, sparse_weig
 from tools.bench import encode, scaling
 from tools.bench.encode import STAGES, Row, on_front
 from tools.bench.scaling import exponents, points
+from tools.stress.solvers import ridge_errors
 from tools.workloads import excerpt
 
 
@@ -54,10 +55,10 @@ def test_ridge_errors_are_those_of_the_solution(plush_excerpt):
     options = CompactionOptions(lam=0.1, alpha=1)
     compacted = Compactor(Device()).compact(scene, centres, weights, options)
     seen = np.diff(weights.offsets) > 0
-    assert encode.ridge_errors(scene, compacted, centres, weights, options).max() < 2e-6
+    assert ridge_errors(scene, compacted, centres, weights, options).max() < 2e-6
     off = compacted.sh.copy()
     off[:, 0] += 0.01
-    errors = encode.ridge_errors(scene, dataclasses.replace(compacted, sh=off), centres, weights, options)
+    errors = ridge_errors(scene, dataclasses.replace(compacted, sh=off), centres, weights, options)
     assert len(errors) == seen.sum()
     # DC's basis value times the change of Y.
     scale = np.maximum(np.abs(channels(scene.sh)[seen]).max(axis=(1, 2)), 1)
