@@ -2,11 +2,11 @@
 
     python -m tools.bench.encode [SCENE …] [--device NAME] [--quick] [--stage NAME …] [--json FILE]
 
-For each stage the variants that exist: kernel family, compiler flags, sort, steps, entropy coder; each with its time
-and its error against float64 or against the full computation. (tools.study.rate_distortion
-compares whole encodes of any options.) A variant is on the Pareto
-front if no other of its stage is at least as good in time, error and bytes and better in one by more than 5 %, the
-noise. Scenes: lego and plush by default; --quick takes the bundled excerpt at half size and the best device.
+For each stage the variants that exist: kernel family, compiler flags, precision, steps, entropy coder; each with its
+time and its error against float64 or against the full computation. (tools.study.rate_distortion compares whole encodes
+of any options.) A variant is on the Pareto front if no other of its stage is at least as good in time, error and bytes
+and better in one by more than 5 %, the noise. Scenes: lego and plush by default; --quick takes the bundled excerpt at
+half size and the best device.
 
 Every device runs in a process of its own. Times of the rasterizer's kernels and of the ridge are the device's own, the
 others the clock's. Each is the best of some.
@@ -17,7 +17,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any, get_args
@@ -63,8 +63,6 @@ FLAGS: Mapping[str, tuple[str, ...]] = {
     "unsafe": ("-cl-unsafe-math-optimizations",),
     "fast relaxed": ("-cl-fast-relaxed-math",),
 }
-#: Keys that a GPU's work-group sorts in local memory at a time; 2048 is the default.
-CAPACITIES = (1024, 4096)
 #: Pixels of a view, and splats, that are computed in float64.
 PIXELS, SPLATS = 300, 150
 #: As in the tests: pixels that come no nearer, relatively, to a threshold cannot flip, nor splats in another order.
@@ -132,9 +130,9 @@ class Workload:
         """The device's own kernel family first."""
         return ("cpu", "gpu") if self.info.family == "cpu" else ("gpu",)
 
-    def profiled(self, family: Family, flags: Sequence[str] = (), **macros: int) -> Device:
-        """A device whose kernels are timed, with compiler flags and other values of the kernels' macros."""
-        return Device(self.info, profiling=True, family=family, build_options=flags, macros=macros)
+    def profiled(self, family: Family, flags: Sequence[str] = ()) -> Device:
+        """A device whose kernels are timed, with compiler flags."""
+        return Device(self.info, profiling=True, family=family, build_options=flags)
 
     def flagged(self, family: Family) -> Iterator[tuple[str, bool, Device]]:
         """Compiler flags: name, whether they are the default, device."""
@@ -156,29 +154,17 @@ KERNELS = {
 
 
 def rasterizer_rows(load: Workload) -> Iterator[Row]:
-    """All kernels of the rasterizer: family and flags; on GPU kernels also the sort's capacity and the exponential."""
+    """All kernels of the rasterizer: family and flags."""
     truth, first = RasterizerTruth(load), None
 
-    def variants() -> Iterator[tuple[str, bool, Device, Iterable[str]]]:
-        for family in load.families:
-            for flagged in load.flagged(family):
-                yield *flagged, KERNELS
-        for capacity in CAPACITIES:
-            if 8 * capacity <= load.info.local_memory:
-                device = load.profiled("gpu", SORT_CAPACITY=capacity)
-                yield f"gpu, sorts {capacity} at a time", False, device, ("sort",)
-        native = load.profiled("gpu").native_exp2
-        name = "polynomial" if native else "native exponential"
-        yield f"gpu, {name}", False, load.profiled("gpu", NATIVE_EXP2=int(not native)), ("composite",)
-
-    for name, default, device, stages in variants():
+    for name, default, device in (each for family in load.families for each in load.flagged(family)):
         runs = [stage_times(device, load.scene, load.some) for _ in range(load.repeats)]
         times = {kernel: min(run[kernel] for run in runs) for kernel in runs[0]}
         centre, wrong, pixel, pairs = truth.errors(device, load.scene)
         first = pairs if first is None else first
         errors = {"project": centre, "tile lists": len(first ^ pairs), "sort": wrong, "composite": pixel}
-        for stage in stages:
-            yield Row(stage, name, sum(times.get(kernel, 0) for kernel in KERNELS[stage]), errors[stage], default)
+        for stage, kernels in KERNELS.items():
+            yield Row(stage, name, sum(times.get(kernel, 0) for kernel in kernels), errors[stage], default)
 
 
 class RasterizerTruth:

@@ -84,7 +84,6 @@ def test_every_stage(folder, capsys):
     assert default["tile lists"] == default["sort"] == 0
     assert 0 < default["composite"] < 1e-4
     assert 0 < default["project"] < 1e-3
-    assert any("sorts 4096" in row.variant for row in rows)
     encode.report(encode.Results(None), "excerpt", rows)
     assert all(f"excerpt: {stage}:" in capsys.readouterr().out for stage in ["project"])
 
@@ -120,8 +119,8 @@ def test_frames_and_decodes(tables, folder):
     found = tables("rasterizer", folder, "--views", 2, "--passes", 1)
     assert found["frames"][0][:3] == ["excerpt", 1500, "240 x 180"]
     assert {"project", "composite"} <= {row[0] for row in found["kernels_excerpt"]}
-    assert len(tables("codec", "--part", "octree", "--splats", 1000)["octree"]) == 4
     if sys.platform == "linux":
+        assert len(tables("codec", "--part", "encode", "--splats", 1000)["encode"]) == 3
         found = tables("decode", "--splats", 3000, "--runs", 2, "--part", "speed", "--part", "memory")
         assert {row[0] for row in found["speed"]} == {"3000-best", "3000-fast"}
         assert all(value > 0 for row in found["speed"] for value in row[3:])
