@@ -25,7 +25,7 @@ from tools.workloads import SCENES, growth, in_process, plain_parser, read
 
 def as_it_is(preset: Preset, coder: EntropyCoder | None = None) -> EncodeOptions:
     """Options that keep every splat and every colour; coder: another than the preset's."""
-    options = EncodeOptions.for_preset(preset, prune=False, compact=False, refit=False)
+    options = EncodeOptions.for_preset(preset, prune=False, compact=False, refit=False, cameras_anyway=True)
     return options if coder is None else options.changed(code={"entropy": coder.name, "zstd_level": coder.level})
 
 
