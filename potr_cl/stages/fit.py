@@ -32,11 +32,10 @@ from potr_cl.stages.fitting.fit import (
     kept_pictures,
 )
 from potr_cl.stages.fitting.photographs import fit_to_photographs, longer
-from potr_cl.stages.fitting.pictures import TargetPictures
 from potr_cl.stages.fitting.settling import Looking, Settling, settle
 from potr_cl.stages.prune import Prune
-from potr_cl.stages.refitting.targets import RenderedTargets, Targets
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
+from potr_cl.views.targets import RenderedTargets, TargetPictures, Targets
 
 #: Times the threshold of pruning up to which a fit makes up for splats, about (docs/benchmarks/findings.md): for this
 #: threshold, and for others as much more as its root is larger, because a fit brings the more, the fewer splats are

@@ -29,7 +29,7 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.refitting.colour_refit import ColourRefit
 from potr_cl.stages.refitting.refit import active_coefficients
 from potr_cl.stages.refitting.refit_options import RefitOptions
-from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets, Targets
+from potr_cl.views.targets import PhotographTargets, RenderedTargets, Targets
 from tools.results import Cell, Results
 from tools.study.evaluation import EvaluatedScene
 from tools.study.rate_distortion import size_at
@@ -56,7 +56,7 @@ class Bench:
         self.targets: dict[str, Targets] = {"": RenderedTargets(rasterizer, self.train)}
         if (folder / "images").is_dir():
             truth = GroundTruth(folder / "images", self.train)
-            self.targets["ground_truth"] = GroundTruthTargets(device, truth, self.train)
+            self.targets["ground_truth"] = PhotographTargets(device, truth, self.train)
 
     def refitted(
         self, scene: Scene, options: EncodeOptions, refit: RefitOptions, how: str, chosen: bool

@@ -28,8 +28,8 @@ from potr_cl.raster.scene_buffers import SceneBuffers, uploaded
 from potr_cl.raster.surely_seen import Seen, surely_seen
 from potr_cl.stages.fitting.fit import FitOptions, fit_scene
 from potr_cl.stages.fitting.settling import Looking, Settling, settle
-from potr_cl.stages.refitting.targets import RenderedTargets
 from potr_cl.stages.stage import State, Workbench
+from potr_cl.views.targets import RenderedTargets
 from tools.stress.cases import Case
 from tools.stress.measures import Measures
 

@@ -32,9 +32,8 @@ from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from potr_cl.stages.fitting.files import TwoFiles
 from potr_cl.stages.fitting.judges import Judges
 from potr_cl.stages.fitting.parameters import UNROUNDED, Factors
-from potr_cl.stages.fitting.pictures import TargetPictures
 from potr_cl.stages.fitting.views import batches, share_out
-from potr_cl.stages.refitting.targets import Targets
+from potr_cl.views.targets import Room, TargetPictures, Targets
 
 logger = logging.getLogger("potr_cl")
 
@@ -228,7 +227,7 @@ def fit_scene(
         _pictures_of(device, cameras, targets, options.memory) as pictures,
     ):
         if options.memory is None and options.steps * options.batch >= len(fit_to):
-            pictures.prepare([*held_out, *(number for number in fit_to if number not in held_out)])
+            pictures.fill([(number,) for number in (*held_out, *fit_to)])
         rasterizer = derivatives.rasterizer
         rates = dataclasses.replace(options.rates, means=options.rates.means * _usual_size(scene))
         with (
@@ -273,7 +272,7 @@ def kept_pictures(
         memory: bytes of device memory that they may take; None: a quarter of what is free.
     """
     free = device.info.memory - device.allocated
-    return TargetPictures(device, cameras, targets, free * _SHARE if memory is None else memory)
+    return TargetPictures(device, cameras, Room(free * _SHARE if memory is None else memory), targets)
 
 
 def _pictures_of(

@@ -27,12 +27,11 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Rates
 from potr_cl.stages.fitting.fit import FitOptions, SupportsBool, fit_scene
 from potr_cl.stages.fitting.parameters import UNROUNDED, Factors, in_form_of_files
-from potr_cl.stages.fitting.pictures import TargetPictures
 from potr_cl.stages.fitting.views import share_out
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
-from potr_cl.stages.refitting.targets import RenderedTargets, Targets
 from potr_cl.stages.stage import State, Workbench
+from potr_cl.views.targets import RenderedTargets, TargetPictures, Targets
 
 #: Steps of the solution that coefficients are chosen by; the last solution, of the re-fit, takes more.
 _CHOICE_STEPS = 4
