@@ -50,8 +50,8 @@ from potr_cl.stages.pruning.schedule import Pruned
 from potr_cl.stages.pruning.unseen import Unseen
 from potr_cl.stages.refitting.refit import active_coefficients, refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
-from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets
 from potr_cl.stages.stage import Progress, Stage, State
+from potr_cl.views.targets import PhotographTargets, RenderedTargets
 
 #: Coefficients that round to 0 at so many steps a unit are 0, but for what storing R, G and B leaves of them.
 _ZERO_SF = 1e5
@@ -352,12 +352,12 @@ def refit(
     def work(device: Device, memory: int | None) -> Refitted:
         how = dataclasses.replace(options, memory=memory)
         with contextlib.ExitStack() as stack:
-            targets: RenderedTargets | GroundTruthTargets
+            targets: RenderedTargets | PhotographTargets
             if ground_truth is None:
                 rasterizer = stack.enter_context(Rasterizer(device, original, background=colour))
                 targets = RenderedTargets(rasterizer, views)
             else:
-                targets = GroundTruthTargets(device, ground_truth, views)
+                targets = PhotographTargets(device, ground_truth, views)
             active = active_coefficients(reduced.sh, _ZERO_SF)
             return refit_colours(
                 device, reduced, views, targets, how, active, colour,

@@ -379,7 +379,8 @@ class Judge:
             found = evaluator.judge(written.scene, lambda _, done: watch("evaluate", min(done, 0.99)), written.coded)
             quality = quality_report(self.views, *found)
             shown = views_to_show(quality, chosen) if pictures else []
-            pairs = evaluator.pictures(written.scene, [view["name"] for _, view in shown]) if shown else []
+            numbers = [self.views.named(view["name"]) for _, view in shown]
+            pairs = evaluator.pictures(written.scene, numbers) if shown else []
         watch("evaluate", 1.0)
         return quality, [
             PicturePair(title, view["name"], view["psnr"], *pair, self._photograph(view["name"]))
@@ -387,7 +388,7 @@ class Judge:
         ]
 
     def _photograph(self, name: str) -> FloatArray | None:
-        found = [] if self.ground_truth is None else self.ground_truth.of([self.views.named(name)])
+        found = [] if self.ground_truth is None else self.ground_truth.of([self.views.views[self.views.named(name)]])
         return self.ground_truth.picture(found[0]) if self.ground_truth is not None and found else None
 
 

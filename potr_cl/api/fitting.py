@@ -33,8 +33,8 @@ from potr_cl.pipeline.frame import check_frame
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.fit import FitOptions, Fitted, fit_scene
-from potr_cl.stages.refitting.targets import RenderedTargets
 from potr_cl.stages.stage import Progress
+from potr_cl.views.targets import RenderedTargets
 
 #: The most views between that may be asked for, for each training view.
 _MOST_BETWEEN = 100

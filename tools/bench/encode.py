@@ -41,7 +41,7 @@ from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
-from potr_cl.stages.refitting.targets import RenderedTargets
+from potr_cl.views.targets import RenderedTargets
 from tests.reference import raster as reference
 from tests.reference.removal import BruteForce
 from tools.bench.rasterizer import stage_times
