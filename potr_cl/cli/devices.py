@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
-from potr_cl.cli.options import Commands
 from potr_cl.cli.terminal import say, say_document
 from potr_cl.errors import DeviceError
 from potr_cl.report.devices import device_report, format_devices, works
+
+if TYPE_CHECKING:
+    from potr_cl.cli.options import Commands
 
 
 def _devices(args: argparse.Namespace) -> None:

@@ -165,7 +165,7 @@ def test_a_device_that_fails_while_judging_leaves_the_file(tmp_path, scene_path,
     def fail(*_args, **_named):
         raise DeviceError("device 'X' vanished")
 
-    monkeypatch.setattr("potr_cl.api.encoding.Evaluator", fail)
+    monkeypatch.setattr("potr_cl.api.encoder.Evaluator", fail)
     text = run(capsys, "encode", scene_path, "-o", potr, "--cameras", cameras, "--iterations", "2")
     assert "not judged: device 'X' vanished" in text
     assert load_scene(potr)

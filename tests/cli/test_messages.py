@@ -17,7 +17,8 @@ from types import SimpleNamespace
 import pytest
 
 from potr_cl import cli
-from potr_cl.cli import command_parser, scenes
+from potr_cl.api import inputs
+from potr_cl.cli import command_parser
 from potr_cl.cli.progress import Progress
 from potr_cl.cli.terminal import note, speak
 from potr_cl.errors import UsageError
@@ -134,7 +135,7 @@ def test_a_long_run_says_what_it_will_take(data, tmp_path, capsys, monkeypatch):
     def far_enough(*_, **__):
         raise UsageError("far enough")
 
-    monkeypatch.setattr("potr_cl.cli.encode.encode", far_enough)
+    monkeypatch.setattr("potr_cl.api.encoder.run_stages", far_enough)
     ply.save(tmp_path / "a.ply", random_scene(250_000, 0))
     cameras = data / "plush_excerpt_cameras.json"
     encode = ["encode", tmp_path / "a.ply", "--cameras", cameras, "-o", tmp_path / "a.potr"]
@@ -155,7 +156,7 @@ def test_a_long_stage_says_how_long_it_will_go_on(capsys, monkeypatch):
 @pytest.mark.slow
 def test_what_takes_long_to_read_is_named(encode, told, capsys, monkeypatch):
     assert "reading" not in told
-    monkeypatch.setattr(scenes, "_LONG_TO_READ", 100_000)
+    monkeypatch.setattr(inputs, "_LONG_TO_READ", 100_000)
     _, _, err = called(capsys, *encode)
     assert re.fullmatch(r"reading .*plush_excerpt\.ply, 0\.0 GB …", err.splitlines()[0])
 
