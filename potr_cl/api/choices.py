@@ -17,7 +17,7 @@ from potr_cl.errors import UsageError
 from potr_cl.outputs.output import Output
 from potr_cl.outputs.registry import OUTPUTS, output_of, output_of_suffix
 from potr_cl.pipeline.amounts import as_bytes, size_in_bytes
-from potr_cl.pipeline.keywords import stage_changes
+from potr_cl.pipeline.keywords import keyword_of, stage_changes
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.presets import DEFAULT as DEFAULT
 from potr_cl.pipeline.presets import PRESETS as PRESETS
@@ -183,7 +183,7 @@ def _check_coder(options: EncodeOptions) -> None:
         if getattr(code, name) != getattr(usual, name) and name not in options.output.choices:
             kind = options.output
             raise UsageError(
-                f"{flag.flag} means nothing for {kind.suffix} files: {kind.format.name} packs in its own way"
+                f"{flag.flag} does not apply to {kind.suffix} files: {kind.format.name} has its own coding"
             )
 
 
@@ -222,7 +222,7 @@ def output_choice(path: str | os.PathLike[str] | None, to: str | None, **choices
     """
     if path is not None:
         if to is not None:
-            raise UsageError(f"'{path}' tells its format itself: leave out 'to'")
+            raise UsageError(f"'{path}' already gives the format: leave out 'to'")
         return output_of(Path(path), **choices)
     given = any(choice is not None for choice in choices.values())
     return output_of_suffix(to or OUTPUTS[0].suffixes()[0], **choices) if to is not None or given else None
@@ -256,3 +256,15 @@ def default_of(kind: type[Stage], field: str) -> str | None:
 
 def _in_words(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _listed() -> str:
+    """The options of stages with their help, for ``help(potr_cl.EncodeChoices)``."""
+    lines = []
+    for kind in STAGES:
+        lines.append(f'\n    Options of the stage "{kind.name}":')
+        lines += [f"        {keyword_of(flag.flag)}: {flag.help}" for flag in flags(kind).values()]
+    return "\n".join(lines)
+
+
+EncodeChoices.__doc__ = f"{EncodeChoices.__doc__}{_listed()}\n"

@@ -481,7 +481,7 @@ def refit(
             found.reference_psnr - found.psnr[1],
         )
     elif found.psnr is None and photos is not None:
-        _log.warning("no view is held out, so nobody knows whether the colours fit the photographs too closely")
+        _log.warning("no view is held out: nothing shows whether the colours are overfitted to the photographs")
     return found
 
 

@@ -82,7 +82,7 @@ def scene_of(source: SceneSource, trust: bool = False, antialiased: bool | None 
 def _usable(scene: Scene) -> Scene:
     """A scene in memory, which nobody may have cleaned; mended where no splat has to go, so that numbers stay right."""
     if not len(scene):
-        raise DataError("the scene holds no splat")
+        raise DataError("the scene has no splats")
     clean, report = scene.cleaned()
     if report.non_finite:
         many = f"{report.non_finite:,} splats" if report.non_finite > 1 else "a splat"
@@ -251,7 +251,7 @@ def cameras_of(source: CamerasSource | None, virtual_views: int | None = None) -
         raise UsageError("the list of cameras is empty: leave it out, and virtual ones are placed")
     for camera in cameras:
         if not isinstance(camera, Camera):
-            raise UsageError(f"cameras are wanted, or the path of their file, not {type(camera).__name__}")
+            raise UsageError(f"expected cameras or the path of their file, not {type(camera).__name__}")
     return [camera for camera in cameras if isinstance(camera, Camera)]
 
 

@@ -71,7 +71,7 @@ class Viewpoints:
         """(3,) what is up; None for a guess.
 
         Raises:
-            UsageError: the text is no direction.
+            UsageError: the text is not a direction.
         """
         if self.up is None or self.up == "auto":
             return None
@@ -84,7 +84,7 @@ class Viewpoints:
         except ValueError:
             parts = ()
         if len(parts) != 3 or not np.isfinite(parts).all() or not any(parts):
-            raise UsageError(f"'{self.up}' is no direction: give --up={'|'.join(AXES)}, X,Y,Z or auto")
+            raise UsageError(f"'{self.up}' is not a direction: give --up={'|'.join(AXES)}, X,Y,Z or auto")
         return parts
 
     def placed(self, scene: Scene, device: Device | None = None) -> list[Camera]:

@@ -23,7 +23,7 @@ def _devices(args: argparse.Namespace) -> None:
     if args.check and not any(entry["chosen"] and works(entry) for entry in report):
         able = [str(entry["index"]) for entry in report if works(entry)]
         advice = f"choose another with --device: {', '.join(able)}" if able else "none works"
-        raise DeviceError(f"the device that would be taken fails the self-check, or there is none: {advice}")
+        raise DeviceError(f"the default device fails the self-check, or there is none: {advice}")
 
 
 def add_devices(commands: Commands) -> None:

@@ -306,7 +306,7 @@ class Scene:
         dropped = len(self) - int(np.count_nonzero(finite))
         scene = self.subset(finite) if dropped else self
         if len(scene) == 0:
-            raise DataError("the scene holds no splat with finite values: nothing to do")
+            raise DataError("the scene has no splat with finite values: nothing to do")
         zero = np.empty(len(scene), bool)
 
         def measure(start: int, stop: int) -> None:

@@ -157,7 +157,7 @@ def _training(judged: float | None, training: float, views: int) -> dict[str, An
     if judged is not None and training > judged + _APART:
         how = f"{training - judged:.1f} dB worse than training views" if math.isfinite(training) else "worse"
         said = (
-            f"the held-out views are matched {how}: they show much that the training views do not, or from elsewhere; "
+            f"the held-out views are matched {how}: they show parts or directions that the training views do not; "
             "give more cameras, or --views-between 3"
         )
     return {"psnr": training if math.isfinite(training) else None, "views": views, "said": said}
@@ -227,7 +227,7 @@ def format_encode_report(report: dict[str, Any]) -> str:
             if shown_by is not None and shown_by < _FEW:
                 lines.append(
                     f"           a quarter of the scene is shown by no more than {shown_by:.0f} of them: "
-                    "from elsewhere it may be matched far worse"
+                    "from other directions it may match far worse"
                 )
     if report.get("fit") is not None:
         lines.append(f"fit        {report['fit']['said']}")

@@ -394,7 +394,7 @@ def test_choices_of_stages_by_name() -> None:
     ("choices", "said"),
     [
         ({"iteration": 3}, "did you mean 'iterations'"),
-        ({"xyzzy": 3}, "there is no option 'xyzzy'"),
+        ({"xyzzy": 3}, "unknown option 'xyzzy'"),
         ({"entropy": "gzip"}, "choose one of"),
         ({"one_pass": 1}, "True or False"),
         ({"keep": "half"}, "no value"),

@@ -173,9 +173,9 @@ def test_render_without_cameras_places_views(tmp_path, scene_path, capsys):
         (["--virtual-views", "100000"], ["100000 views"]),
         (["--size", "0"], ["0 x 0"]),
         (["--size", "99999"], ["99999 x 99999"]),
-        (["--up", "sideways"], ["'sideways' is no direction", "--up=x|y|z|-x|-y|-z"]),
-        (["--up", "0,0,0"], ["'0,0,0' is no direction"]),
-        (["--up", "nan,0,1"], ["is no direction"]),
+        (["--up", "sideways"], ["'sideways' is not a direction", "--up=x|y|z|-x|-y|-z"]),
+        (["--up", "0,0,0"], ["'0,0,0' is not a direction"]),
+        (["--up", "nan,0,1"], ["is not a direction"]),
     ],
 )
 def test_wrong_views_to_place(tmp_path, scene_path, cameras_path, capsys, options, words):
