@@ -46,7 +46,6 @@ def refused(path: Path, message: str, kind: type[PotrError] = DataError) -> None
     assert len(str(caught.value)) < 600
 
 
-
 def pixel(camera: Camera, point: list[float]) -> tuple[float, float]:
     """Where a world point appears, by Camera's definition."""
     t = camera.rotation @ np.array(point) + camera.translation

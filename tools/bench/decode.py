@@ -122,7 +122,7 @@ def device(results: Results, files: Iterable[Path], args: argparse.Namespace) ->
         for path in files:
             data = path.read_bytes()
             works: dict[str, Callable[[], object]] = {
-                "host": lambda data=data: open_file(data, trust=True).scene(),
+                "host": partial(_on_the_host, data),
                 "both": partial(_by_way_of_the_host, data, opened),
                 "straight": partial(_straight, data, opened),
             }
@@ -135,6 +135,10 @@ def device(results: Results, files: Iterable[Path], args: argparse.Namespace) ->
                 path.stem, open_file(data, True).header.splats, opened.info.name, host, both - host, both, straight,
                 1e3 * min(walls["straight"]), 1e3 * sum(timed.stage_times().values()),
             )  # fmt: skip
+
+
+def _on_the_host(data: bytes) -> object:
+    return open_file(data, trust=True).scene()
 
 
 def _by_way_of_the_host(data: bytes, opened: Device) -> None:
