@@ -1,7 +1,7 @@
 """Short runs of the tools that attack the package; docs/benchmarks/hostile_input.md has long ones.
 
-Changed files and bombs to every reader, signals to commands that write, every command twice. The tools run in processes
-of their own, which what is wrong may end.
+Changed files and bombs to every reader, every command twice. The tools run in processes of their own, which what is
+wrong may end.
 """
 
 from __future__ import annotations
@@ -70,33 +70,6 @@ def test_bombs(formats, tmp_path):
     rows = run("bombs", tmp_path, *each("--format", formats))
     assert {row["format"] for row in rows} == set(formats)
     assert {row["outcome"] for row in rows} <= {"read", "refused"}
-
-
-def test_some_messages_to_the_viewer(tmp_path):
-    pytest.importorskip("viser", reason="the extra view is not installed")
-    (row,) = run("page", tmp_path, "--count", "1000", "--tabs", "2")
-    assert row["bytes printed"] == 0
-    assert row["answers to the honest tab"] > 0
-
-
-@pytest.mark.parametrize(
-    ("commands", "moments"),
-    [
-        (["decode"], 6),
-        pytest.param(
-            ["encode --report", "encode --ladder", "encode, preset smallest", "prune --order", "render"],
-            20,
-            marks=pytest.mark.slow,
-        ),
-    ],
-    ids=["quick", "others"],
-)
-def test_signals(commands, moments, tmp_path):
-    """To commands that write one file, two, several, pictures, and to one that an interrupt may end early."""
-    rows = run("signals", tmp_path, "--moments", str(moments), *each("--command", commands))
-    assert sum(row["moments"] for row in rows) == moments
-    assert sum(row["wrong"] for row in rows) == 0
-    assert sum(row["ended by the signal"] for row in rows) > 0
 
 
 @pytest.mark.slow

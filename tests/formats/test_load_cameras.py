@@ -62,7 +62,7 @@ def test_whole_plush(plush: Path) -> None:
 
 
 def test_folders(data: Path, tmp_path: Path) -> None:
-    refused(tmp_path, "holds no cameras, expected a COLMAP model .*, a cameras.json or a transforms.json", UsageError)
+    refused(tmp_path, "has no cameras, expected a COLMAP model .*, a cameras.json or a transforms.json", UsageError)
     shutil.copytree(data / "plush_sparse_binary", tmp_path / "sparse")
     assert len(load_cameras(tmp_path)) == 17
     shutil.copytree(data / "plush_sparse_binary", tmp_path / "another" / "sparse" / "0")
@@ -107,7 +107,7 @@ def test_any_file_name(data: Path, tmp_path: Path) -> None:
         (b"[" + b"9" * 5000 + b"]", "is not valid JSON|not a list of views"),
         (b"3", "is neither a cameras.json"),
         (b'{"a": 1}', "is neither a cameras.json"),
-        (b"[]", "holds no view"),
+        (b"[]", "has no views"),
         (b"[1]", "not a list of views"),
         (b"[{}]", "view 0: 'img_name' is missing"),
         (b'[{"img_name": "a"}]', "view 'a': 'width' is missing"),
@@ -125,6 +125,6 @@ def test_paths_of_no_known_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     (tmp_path / "notes.txt").write_bytes(b"")
     refused(tmp_path / "notes.txt", "unknown kind of cameras", UsageError)
     (tmp_path / "a.json").mkdir()
-    refused(tmp_path / "a.json", "holds no cameras", UsageError)
+    refused(tmp_path / "a.json", "has no cameras", UsageError)
     monkeypatch.setattr(view_files, "MAX_JSON_BYTES", 10)
     refused(write_json(tmp_path / "b.json", [view()]), "too large for a camera file")

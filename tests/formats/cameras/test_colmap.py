@@ -180,7 +180,7 @@ def test_unusable_values_in_a_binary_model(model: Path) -> None:
         (model / "images.bin").write_bytes(data[:at] + value + data[at + len(value) :])
         refused(model, message)
     (model / "images.bin").write_bytes(bytes(8))
-    refused(model, "holds no view")
+    refused(model, "has no views")
     os.remove(model / "images.bin")
     refused(model, r"cannot read '.*images\.bin': No such file", UsageError)
 

@@ -211,9 +211,9 @@ def test_a_double_too_large_for_float32_drops_its_splat(tmp_path: Path) -> None:
 
 def test_no_splat_left(tmp_path: Path) -> None:
     scene = random_scene(3, degree=0)
-    damaged(write(tmp_path / "none.ply", scene.subset(np.arange(0))), "holds no splat")
+    damaged(write(tmp_path / "none.ply", scene.subset(np.arange(0))), "has no splats")
     scene.means[:] = np.nan
-    damaged(write(tmp_path / "nan.ply", scene), "holds no splat with finite values")
+    damaged(write(tmp_path / "nan.ply", scene), "has no splat with finite values")
 
 
 # Saving -------------------------------------------------------------------------------------------------------------
