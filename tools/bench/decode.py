@@ -121,8 +121,8 @@ def device(results: Results, files: Iterable[Path], args: argparse.Namespace) ->
         opened, timed = Device(name), Device(name, profiling=True)
         for path in files:
             data = path.read_bytes()
-            works: dict[str, Callable[[], object]] = {
-                "host": lambda data=data: open_file(data, trust=True).scene(),
+            works: dict[str, Callable[[], None]] = {
+                "host": partial(_on_host, data),
                 "both": partial(_by_way_of_the_host, data, opened),
                 "straight": partial(_straight, data, opened),
             }
@@ -135,6 +135,10 @@ def device(results: Results, files: Iterable[Path], args: argparse.Namespace) ->
                 path.stem, open_file(data, True).header.splats, opened.info.name, host, both - host, both, straight,
                 1e3 * min(walls["straight"]), 1e3 * sum(timed.stage_times().values()),
             )  # fmt: skip
+
+
+def _on_host(data: bytes) -> None:
+    open_file(data, trust=True).scene()
 
 
 def _by_way_of_the_host(data: bytes, opened: Device) -> None:
