@@ -121,8 +121,8 @@ def device(results: Results, files: Iterable[Path], args: argparse.Namespace) ->
         opened, timed = Device(name), Device(name, profiling=True)
         for path in files:
             data = path.read_bytes()
-            works: dict[str, Callable[[], None]] = {
-                "host": partial(_on_host, data),
+            works: dict[str, Callable[[], object]] = {
+                "host": partial(_on_the_host, data),
                 "both": partial(_by_way_of_the_host, data, opened),
                 "straight": partial(_straight, data, opened),
             }
@@ -137,8 +137,8 @@ def device(results: Results, files: Iterable[Path], args: argparse.Namespace) ->
             )  # fmt: skip
 
 
-def _on_host(data: bytes) -> None:
-    open_file(data, trust=True).scene()
+def _on_the_host(data: bytes) -> object:
+    return open_file(data, trust=True).scene()
 
 
 def _by_way_of_the_host(data: bytes, opened: Device) -> None:

@@ -41,7 +41,7 @@ from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
-from potr_cl.stages.refitting.targets import RenderedTargets
+from potr_cl.views.targets import RenderedTargets
 from tests.reference import raster as reference
 from tests.reference.removal import BruteForce
 from tools.bench.rasterizer import stage_times
@@ -189,7 +189,7 @@ class RasterizerTruth:
         centres = np.abs(lists.shapes[self.projected.index[listed], :2] - self.projected.centre[listed])
         inside = (self.projected.centre[listed] >= 0).all(axis=1)
         inside &= (self.projected.centre[listed] < (self.camera.width, self.camera.height)).all(axis=1)
-        tiles = np.repeat(np.arange(len(lists.offsets) - 1), lists.offsets[1:] - lists.offsets[:-1])
+        tiles = np.repeat(np.arange(len(lists.offsets) - 1), np.diff(lists.offsets).astype(np.int64))
         order = np.lexsort((lists.intersections, lists.shapes[lists.intersections, 6], tiles))
         wrong = int(np.count_nonzero(lists.intersections[order] != lists.intersections))
         ours = np.concatenate([lists.image, lists.transmittance[:, None]], axis=1)

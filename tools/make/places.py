@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.formats import load_scene
+from potr_cl.formats import load_scene, save_scene
 from potr_cl.model.camera import Camera
 from potr_cl.model.quaternions import quaternions_of
 from potr_cl.model.scene import Scene, joined
@@ -286,7 +286,7 @@ def main() -> None:
         args.kind, [load_scene(path) for path in args.scenes], int(args.splats), args.views, args.degree
     )
     args.output.mkdir(parents=True, exist_ok=True)
-    scene.save(args.output / "point_cloud.ply")
+    save_scene(args.output / "point_cloud.ply", scene)
     write_cameras(args.output, cameras)
     print(f"{len(scene):,} splats and {len(cameras)} views in {args.output}")
 

@@ -18,8 +18,8 @@ from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.fit import FitOptions, fit_scene
 from potr_cl.stages.fitting.settling import Looking, Settling, settle
-from potr_cl.stages.refitting.targets import RenderedTargets
 from potr_cl.stages.stage import State, Workbench
+from potr_cl.views.targets import RenderedTargets
 from tools.stress.cases import Case
 from tools.stress.measures import Measures
 

@@ -71,8 +71,8 @@ from potr_cl.stages.refitting.exchange import Exchange
 from potr_cl.stages.refitting.layout import Layout
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
-from potr_cl.stages.refitting.targets import RenderedTargets
 from potr_cl.views import reached
+from potr_cl.views.targets import RenderedTargets
 from potr_cl.views.visibility import Visibility
 from tests.reference import raster as reference
 from tests.reference.scenes import plain_splats, random_splats, straight_camera, tilted_camera

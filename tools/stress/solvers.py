@@ -10,7 +10,7 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor
 from potr_cl.stages.compaction.view_weights import ViewWeights
 from potr_cl.stages.refitting.refit import refit_colours
-from potr_cl.stages.refitting.targets import RenderedTargets
+from potr_cl.views.targets import RenderedTargets
 from tests.reference.refit import Reference, to_ycocg
 from tests.reference.ridge import YCOCG, Ridges, triangles
 from tools.stress.cases import RefitCase, RidgeCase

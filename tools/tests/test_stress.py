@@ -36,11 +36,11 @@ def spoiled(monkeypatch, change) -> measures.Measures:
 
 @pytest.mark.slow
 def test_every_kernel_stays_within_what_rounding_explains(device):
-    result = run.run_device(device, examples=12)
+    result = run.run_device(device, examples=1)
     assert result["failures"] == {}
     assert set(result["worst"]) == set(measures.WHAT)
     for worst in result["worst"].values():
-        assert worst["checked"] > 40
+        assert worst["checked"] > 15
         assert np.isfinite(worst["error"])
 
 
