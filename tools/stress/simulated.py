@@ -117,8 +117,8 @@ def long_lists(device: Device) -> None:
 
 
 def all_stages(device: Device) -> None:
-    """A whole encode: pruning that a GPU steers, the fit with its roundings, compaction, re-fit and judging."""
-    changes = {"prune": {"iterations": 3}, "fit": {"steps": 6}, "compact": True, "refit": {"steps": 1}}
+    """Whole encodes: pruning that a GPU steers, the fit with its roundings, compaction and judging."""
+    changes = {"prune": {"iterations": 3}, "fit": {"steps": 3}, "compact": True, "refit": False}
     options = EncodeOptions.for_preset("smallest", between=False, cameras_anyway=True, **changes)
     for degree in (1, 3):
         encode(random_splats(60, degree, seed=2), _views(5), options, device=device)
