@@ -77,6 +77,8 @@ def encode(
     output: str | os.PathLike[str] | None = None,
     to: str | None = None,
     spz_version: int | None = None,
+    title: str | None = None,
+    author: str | None = None,
     report: str | os.PathLike[str] | None = None,
     report_view: str | None = None,
     background: ColourSource | None = None,
@@ -110,6 +112,7 @@ def encode(
             existing one is only replaced by what a decoder takes.
         to: the suffix of the kind of file, ".spz", where there is no ``output`` to tell it; .potr by default.
         spz_version: of an .spz file, 2, 3 or 4.
+        title, author: shown on a page (.html).
         report: a page of HTML to write: sizes, quality by view, pictures before and after, and the course of pruning.
         report_view: a view to show there besides the worst and the median one.
         background: R, G, B from 0 to 1, or a colour's name; black by default.
@@ -130,7 +133,7 @@ def encode(
         DeviceError: no device does the work.
     """
     began = time.perf_counter()
-    kind = output_choice(output, to, version=spz_version)
+    kind = output_choice(output, to, version=spz_version, title=title, author=author)
     settings = encode_options(
         options, preset, choices, output=kind, q=q, background=background, memory=memory, threads=threads,
         source_bytes=bytes_of_source(scene), cameras_anyway=cameras_anyway,

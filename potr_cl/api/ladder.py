@@ -58,6 +58,8 @@ def encode_ladder(
     virtual_views: int | None = None,
     to: str | None = None,
     spz_version: int | None = None,
+    title: str | None = None,
+    author: str | None = None,
     background: ColourSource | None = None,
     memory: float | None = None,
     threads: int | None = None,
@@ -78,7 +80,7 @@ def encode_ladder(
         ladder: the qualities, 0 to 1: a list, or a text such as "0.1,0.3,0.5".
         cameras, options, progress, device, cluster, preset, virtual_views, background, memory, threads, trust,
             antialiased, cameras_anyway, choices: as of :func:`potr_cl.encode`.
-        to, spz_version: the kind of files, as of :func:`potr_cl.encode`.
+        to, spz_version, title, author: the kind of files, as of :func:`potr_cl.encode`.
         tell: told a line about each file that is written.
 
     Raises:
@@ -87,8 +89,8 @@ def encode_ladder(
     """
     steps = qualities(ladder)
     settings = encode_options(
-        options, preset, choices, output=output_choice(None, to, version=spz_version), background=background,
-        memory=memory, threads=threads,
+        options, preset, choices, output=output_choice(None, to, version=spz_version, title=title, author=author),
+        background=background, memory=memory, threads=threads,
         source_bytes=bytes_of_source(scene), cameras_anyway=cameras_anyway,
     )  # fmt: skip
     given = cameras_of(cameras, virtual_views)

@@ -26,9 +26,10 @@ from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
 from potr_cl.cli.scenes import (
     add_antialiased_option,
+    add_format_options,
     add_from_option,
-    add_spz_version_option,
     add_trust_option,
+    format_choices,
     read_scene,
     size_of_file,
 )
@@ -76,7 +77,7 @@ def _options(args: argparse.Namespace, source_bytes: int | None = None, output: 
 
 def _output(args: argparse.Namespace) -> Output:
     """The kind of file that is made of one scene."""
-    choices = {"version": args.spz_version}
+    choices = format_choices(args)
     if isinstance(args.output, StandardOutput):
         return output_of_suffix(args.to, **choices)
     return output_of(args.output, **choices)
@@ -84,7 +85,7 @@ def _output(args: argparse.Namespace) -> Output:
 
 def _output_of_ladder(args: argparse.Namespace) -> Output:
     """The kind of file that a ladder has for each quality: what ``-o`` names is a folder."""
-    return output_of_suffix(args.to or OUTPUTS[0].suffixes()[0], version=args.spz_version)
+    return output_of_suffix(args.to or OUTPUTS[0].suffixes()[0], **format_choices(args))
 
 
 def _looks(args: argparse.Namespace, options: EncodeOptions) -> bool:
@@ -315,7 +316,7 @@ def add_encode(commands: Commands) -> None:
         help=f'{suffixes_encoded()}, a folder, or "-" for standard output; .potr is the smallest',
     )
     add_batch_options(p)
-    add_spz_version_option(p)
+    add_format_options(p)
     goal = p.add_mutually_exclusive_group()
     goal.add_argument(
         "-q", "--quality", type=float, default=0.5, metavar="Q", help="0 (smallest) to 1 (best); default 0.5"

@@ -1,6 +1,8 @@
-"""Build the npm package of the decoder for browsers (web/), and what pages are made of (potr_cl/outputs/page.html).
+"""Build the npm package of the decoder for browsers (web/), and the viewer of pages.
 
     python -m tools.make.web [--only-wasm]
+
+The package goes to web/dist, the viewer to potr_cl/formats/scenes/page.html.
 
 The C is compiled to WebAssembly by Zig's C compiler, which PyPI has (pip install ziglang), or by clang, wasi-libc and
 lld of Debian, whichever is there. All else is npm's: web/package-lock.json says what is installed.
