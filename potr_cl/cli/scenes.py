@@ -8,28 +8,18 @@ import os
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from potr_cl.api.inputs import drawable_to_judge
+from potr_cl.api.inputs import scene_of
 from potr_cl.cli.guard import StandardInput, StandardOutput
 from potr_cl.cli.outputs import not_streamed
-from potr_cl.cli.terminal import note
 from potr_cl.errors import UsageError
-from potr_cl.formats import load_scene, scene_writer
+from potr_cl.formats import scene_writer
 from potr_cl.formats.scene_size import bytes_of_scene
 from potr_cl.formats.scenes import spz
 from potr_cl.formats.streams import received, send
 from potr_cl.host.standard_files import closed
 from potr_cl.model.scene import Scene
-
-# What computes on a device is imported where it is needed: other commands do without.
-if TYPE_CHECKING:
-    from potr_cl.opencl.device import Device
-    from potr_cl.outputs.coded_scene import CodedScene
-    from potr_cl.raster.scene_buffers import Drawable
-
-#: Files of so many bytes are read for seconds.
-_LONG_TO_READ = 1 << 28
 
 FROM_HELP = 'format of "-", standard input: .ply, .spz …; default: detected'
 TO_HELP = "output format if the file name does not give it: .ply, .spz …"
@@ -92,30 +82,7 @@ def read_scene(args: argparse.Namespace, path: Path) -> Scene:
         As :func:`potr_cl.formats.load_scene`.
     """
     with as_file(path) as file:
-        if (nbytes := bytes_of_scene(file) or 0) >= _LONG_TO_READ:
-            note(f"reading {path}, {nbytes / 1e9:.1f} GB …")
-        return load_scene(file, **trust(args), antialiased=ANTIALIASED[args.antialiased])
-
-
-@contextlib.contextmanager
-def read_to_draw(
-    args: argparse.Namespace, path: Path, device: Device, coded: CodedScene | None = None
-) -> Iterator[tuple[Drawable, Scene]]:
-    """The same to be rendered on a device, and a scene on the host by which cameras can be judged.
-
-    Args:
-        args, path: as of :func:`read_scene`.
-        device: to render on.
-        coded: what the file holds, where it has been read.
-
-    Raises:
-        As :func:`potr_cl.api.inputs.drawable_to_judge`.
-    """
-    with (
-        as_file(path) as file,
-        drawable_to_judge(file, device, args.trust, ANTIALIASED[args.antialiased], coded) as found,
-    ):
-        yield found
+        return scene_of(file, args.trust, ANTIALIASED[args.antialiased])
 
 
 def write_scene(path: Path, scene: Scene, to: str | None = None, **choices: Any) -> int:

@@ -158,7 +158,7 @@ def _from_folder(folder: Path) -> list[Camera]:
         for subfolder in entry.subfolders:
             if entry.is_in(folder / subfolder):
                 return entry.load_folder(folder / subfolder)
-    raise UsageError(f"the folder '{folder}' holds no cameras, expected {registry.cameras_read()}")
+    raise UsageError(f"the folder '{folder}' has no cameras, expected {registry.cameras_read()}")
 
 
 #: The same under the names that go with what the readers' messages say; neither name is better than the other.
