@@ -90,10 +90,10 @@ def changed(data: bytes, chance: random.Random) -> bytes:
     return bytes(with_sums(out) if chance.random() < 0.8 else out)
 
 
-def alike(ours: str, theirs: str) -> bool:
-    """Whether both mean the same. Libraries differ in which changed Zstandard frames they refuse, and in what words."""
+def frame_differs(ours: str, theirs: str) -> bool:
+    """Whether a Zstandard frame was changed and summed anew: decoders differ in which of these they refuse, and how."""
     frames = ("decompress", "describes its contexts at an impossible length", "describes impossible contexts")
-    return ours == theirs or any(words in ours for words in frames)
+    return "does not decompress" in theirs or any(words in ours for words in frames)
 
 
 @pytest.mark.parametrize("build", ["simd", "general"])
@@ -106,11 +106,13 @@ def test_says_what_python_says(build: str, tmp_path: Path) -> None:
         names.append(tmp_path / f"{number}.potr")
         names[-1].write_bytes(data)
     found = json.loads(run("test/judge.mjs", build, *map(str, names)))
-    wrong = [
+    differ = [
         (path.name, ours, theirs)
         for path, data, ours in zip(names, files, found, strict=True)
-        if not alike(ours, theirs := judged(data))
+        if ours != (theirs := judged(data))
     ]
+    wrong = [each for each in differ if not frame_differs(*each[1:])]
     assert found[: len(GOLDEN)] == [judged(data) for data in files[: len(GOLDEN)]]
     assert not wrong, json.dumps(wrong, indent=1)
+    assert len(differ) < len(files) / 10, json.dumps(differ, indent=1)
     assert sum(" " in words for words in found) > len(files) / 4, "hardly a change was noticed"
