@@ -89,7 +89,7 @@ class Device:
         self._lock = threading.RLock()  # of the two that follow
         self.allocated = 0
         self._unfinished: dict[int, list[list[cl.Buffer]]] = {}  # by thread
-        self._profiling = profiling
+        self.profiling = profiling
         self._build_options = tuple(build_options)
         self._variants = dict(variants or {})
         for path in self._variants.values():
@@ -325,22 +325,6 @@ class Device:
             with self.errors("failed while computing"):
                 cl.enqueue_copy(self.queue, array, buffer, src_offset=start, is_blocking=True)
         return array
-
-    def launch(
-        self,
-        kernel: Kernel,
-        items: tuple[int, ...],
-        group: tuple[int, ...] | None = None,
-        queue: cl.CommandQueue | None = None,
-    ) -> None:
-        """Enqueue ``kernel`` with the arguments it has; in another queue than the device's own if one is given."""
-        try:
-            event = cl.enqueue_nd_range_kernel(queue or self.queue, kernel.handle, items, group)
-        except (cl.Error, MemoryError):
-            with self.errors(f"failed to run {kernel.name}"):
-                raise
-        if self._profiling:
-            self.timings.append((kernel.name, event))
 
     def stage_times(self) -> dict[str, float]:
         """Seconds each kernel took on the device since :attr:`timings` was last cleared, summed by name.

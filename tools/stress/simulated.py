@@ -369,7 +369,7 @@ def simulate(family: str, width: int, names: list[str], told: Path) -> None:
     freed: list[cl.Buffer] = []
     info = next(d for d in list_devices() if "oclgrind" in d.platform.lower())
     simulated = dataclasses.replace(info, vector_width=width)
-    make, launch = Device.kernel, Device.launch
+    make, launch = Device.kernel, Kernel.launch
     kept: list[Kernel] = []
 
     def made(device: Device, source: str, name: str, **defines: str | int | float) -> Kernel:
@@ -377,15 +377,15 @@ def simulate(family: str, width: int, names: list[str], told: Path) -> None:
         sources[id(kept[-1])] = source
         return kept[-1]
 
-    def launched(device: Device, kernel: Kernel, *given: Any, **more: Any) -> None:
+    def launched(kernel: Kernel, *given: Any, **more: Any) -> None:
         run.add(f"{sources[id(kernel)]}: {kernel.name}")
-        launch(device, kernel, *given, **more)
+        launch(kernel, *given, **more)
 
     with ExitStack() as patches:
         patches.enter_context(patch.object(cl, "enqueue_fill_buffer", fill))
         patches.enter_context(patch.object(cl, "enqueue_copy", copy))
         patches.enter_context(patch.object(Device, "kernel", made))
-        patches.enter_context(patch.object(Device, "launch", launched))
+        patches.enter_context(patch.object(Kernel, "launch", launched))
         patches.enter_context(patch.object(Device, "free", lambda _, buffer: freed.append(buffer)))
         for module in (coefficients, sliced_arrays):
             patches.enter_context(patch.object(module, "DOT_ITEMS", _DOT_ITEMS))

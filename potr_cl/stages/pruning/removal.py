@@ -171,6 +171,7 @@ class RemovalSweep(Owner):
     def measure_on_device(self) -> None:
         """Bring :attr:`totals` up to date."""
         streamed, resident = self._streamed, self._resident
+        resident.list_stale()
         resident.sweep()
         if self._local:
             if streamed.are_stale():

@@ -85,14 +85,39 @@ class ResidentSweep(Owner):
                     self._kernels.append(bound)
             self.list_everything()
 
-    def sweep(self) -> None:
-        """Measure the tiles that are listed."""
+    def list_stale(self) -> None:
+        """List the tiles that the next measurement sweeps, unless the device has."""
         if self._counts is None:
             self._survivors.settle()
             self._take_marks()
             self._choose(self._schedule.choose(self._measurements, self._staleness()))
         self._measurements += 1
-        self._sweep_listed()
+
+    def sweep(self) -> None:
+        """Measure the tiles that are listed."""
+        counts, self._counts = self._counts or [], [0] * len(self._sets) if self.device_lists else None
+        work = [(count, place) for place, count in enumerate(counts) if count]
+        if self._engine.plan.copies_rest:  # there is room for one copy at a time
+            by_copy: dict[int, list[tuple[int, int]]] = {}
+            for count, place in work:
+                by_copy.setdefault(id(self._sets[place].subset), []).append((count, place))
+            parts = list(by_copy.values())
+        else:
+            parts = [work] if work else []
+        for part in parts:
+            # The longest first, so that nothing long begins at the end.
+            part.sort(key=lambda each: -each[0])
+            for (count, place), queue in self._queues.dealt(part):
+                self._engine.project(self._sets[place])
+                self._kernels[place].sweep(self._firsts[place], count, queue)
+            self._queues.wait()
+            if self._engine.plan.copies_rest:
+                self._engine.source.rest(self._sets[part[0][1]].subset)
+        self.tiles_swept += sum(counts)
+        if not self._targets_known and self._measurements:
+            for kernels in self._kernels:
+                kernels.target_is_known()
+            self._targets_known = True
 
     def sweep_changed(self) -> None:
         """Measure every tile that has lost anything since its last sweep."""
@@ -101,7 +126,7 @@ class ResidentSweep(Owner):
         else:
             self._settle()
             self._choose(self._schedule.changed(self._staleness()))
-        self._sweep_listed()
+        self.sweep()
 
     def prepare_removal(self) -> None:
         """To be called before splats are marked as removed by the host."""
@@ -122,7 +147,7 @@ class ResidentSweep(Owner):
                 kernels.note_removal(queue)
             self._counts = None
             return
-        self._sweep_listed()
+        self.sweep()
         above = self._options.tolerance if tolerance is None else tolerance
         self._device.fill(self._listed, np.uint32(0))
         for kernels, queue in self._queues.dealt(self._kernels):
@@ -158,7 +183,7 @@ class ResidentSweep(Owner):
     def _settle(self) -> None:
         """Sweep what the device has listed, and have host and device agree on the splats that are left."""
         if self._counts is not None and self._targets_known:
-            self._sweep_listed()
+            self.sweep()
         self._survivors.settle()
         self._take_marks()
 
@@ -183,31 +208,6 @@ class ResidentSweep(Owner):
     def _write(self, buffer: cl.Buffer, values: NDArray[Any]) -> None:
         with self._device.errors("failed while computing"):
             cl.enqueue_copy(self._device.queue, buffer, values, is_blocking=True)
-
-    def _sweep_listed(self) -> None:
-        counts, self._counts = self._counts or [], [0] * len(self._sets) if self.device_lists else None
-        work = [(count, place) for place, count in enumerate(counts) if count]
-        if self._engine.plan.copies_rest:  # there is room for one copy at a time
-            by_copy: dict[int, list[tuple[int, int]]] = {}
-            for count, place in work:
-                by_copy.setdefault(id(self._sets[place].subset), []).append((count, place))
-            parts = list(by_copy.values())
-        else:
-            parts = [work] if work else []
-        for part in parts:
-            # The longest first, so that nothing long begins at the end.
-            part.sort(key=lambda each: -each[0])
-            for (count, place), queue in self._queues.dealt(part):
-                self._engine.project(self._sets[place])
-                self._kernels[place].sweep(self._firsts[place], count, queue)
-            self._queues.wait()
-            if self._engine.plan.copies_rest:
-                self._engine.source.rest(self._sets[part[0][1]].subset)
-        self.tiles_swept += sum(counts)
-        if not self._targets_known and self._measurements:
-            for kernels in self._kernels:
-                kernels.target_is_known()
-            self._targets_known = True
 
     def close(self) -> None:
         self._memory.close()

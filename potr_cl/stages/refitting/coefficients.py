@@ -100,10 +100,6 @@ class Coefficients(SlicedArrays):
         with np.errstate(invalid="ignore"):  # infinities of both signs: the callers look at the result
             return float(parts[0].sum(dtype=np.float64)), float(parts[1].max())
 
-    def add_fixed(self, x: Vector, sums: cl.Buffer, unit: float, constant: bool = False) -> None:
-        """As :meth:`add_sums`; with ``constant``, only the constant coefficients' columns, which come first."""
-        self.add_sums(x, sums, unit, 3 * self.layout.stride if constant else None)
-
     def add_ridge(self, sums: Vector, x: Vector, ridge: Ridge) -> None:
         """sums += (lam on AC + prior) x on the active coefficients; the others' sums become 0."""
         for part in self.slices((sums, x, self.active), (sums,)):

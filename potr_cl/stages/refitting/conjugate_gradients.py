@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
 
 from potr_cl.stages.refitting.coefficients import Vector
@@ -33,16 +34,17 @@ class Vectors(Protocol):
         ...
 
 
-class System(Protocol):
-    """Linear equations with a symmetric positive matrix H."""
+@dataclass(frozen=True)
+class System:
+    """Linear equations with a symmetric positive matrix H.
 
-    def precondition(self, residual: Vector, result: Vector) -> None:
-        """result = about H⁻¹ residual, by a symmetric positive matrix."""
-        ...
+    Attributes:
+        product: of a direction and a result: result = H direction.
+        precondition: of a residual and a result: result = about H⁻¹ residual, by a symmetric positive matrix.
+    """
 
-    def product(self, direction: Vector, result: Vector) -> None:
-        """result = H direction."""
-        ...
+    product: Callable[[Vector, Vector], None]
+    precondition: Callable[[Vector, Vector], None]
 
 
 class ConjugateGradients:

@@ -8,7 +8,7 @@ coefficients (cl/refit/gather.cl). W weighs pixels so that all views count the s
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,6 +38,32 @@ _CHANGE, _TOTALS = 16, 32
 #: Views are divided into so many parts, every second one in each, where each has as many as are enough: with 62 in
 #: each, steps by one part lost 0.01 dB on a captured scene, and 0.03 on its pictures a third as wide.
 _PARTS, ENOUGH = 2, 80
+
+
+@dataclass(frozen=True)
+class Look:
+    """What views are looked at with, and what is added up.
+
+    Attributes:
+        x: (3 M, stride) float32 on the device, coefficients or a direction; None: black, for blocks alone.
+        targets: what pictures of coefficients should show; None: x is a direction.
+        at: the coefficients, where x is a direction. unit: it is multiplied by this.
+        constant: only constant coefficients: leave the sums of others alone; a direction's others are all 0.
+        part: of the views; None: all.
+        blocks: (M (M + 1) / 2, n) int64, to which n splats' own blocks are added. first_block: the first of these.
+        drawn: (stride,) uint8, becomes 1 for each splat that any of the views draws; not where each view has splats of
+            its own. None: it is not wanted.
+    """
+
+    x: cl.Buffer | None = None
+    targets: Targets | None = None
+    at: Vector | None = None
+    unit: float | None = None
+    constant: bool = False
+    part: int | None = None
+    blocks: cl.Buffer | None = None
+    first_block: int = 0
+    drawn: cl.Buffer | None = None
 
 
 class OwnViews(Owner):
@@ -149,107 +175,50 @@ class OwnViews(Owner):
         """
         self._targets.fill(targets, [each.launch.numbers for each in self._launches])
 
-    def gradient(
-        self,
-        x: cl.Buffer,
-        targets: Targets,
-        blocks: cl.Buffer | None,
-        constant: bool = False,
-        drawn: cl.Buffer | None = None,
-    ) -> None:
-        """Enqueue :meth:`potr_cl.stages.refitting.colour_map.ColourMap.gradient` of these views.
+    def add_up(self, look: Look) -> None:
+        """Enqueue what adds to :attr:`sums`, and to blocks, what views give."""
+        kernels, targets = self._kernels, look.targets
+        background = (0.0, 0.0, 0.0) if targets is None else self._background
+        if look.x is None:
+            self._coefficients.zero(self._change)  # black, and no channel is free
+        for gathered in itertools.chain(*(self._gathered if look.part is None else [self._gathered[look.part]])):
+            every = range(gathered[0].views.start, gathered[-1].views.stop)
+            for slot, own in zip(self._slots, gathered, strict=False):
+                with self._engine.ready(own.launch) as ready:
+                    views, picks, (shapes, colours) = ready.views, own.picks(ready), ready.geometry
+                    swept, target = slot.change, None
+                    if targets is not None:
+                        kernels.colour(views, picks, look.x, colours, colours)
+                        swept, target = colours, self._targets.of(targets, own.launch.numbers)
+                    elif look.x is not None:
+                        assert look.at is not None
+                        anew = ready.shares or own.launch.resident is None
+                        if anew and picks is None:  # which colours are cut is not known any more
+                            at = self._coefficients.on_device(look.at, 1)
+                            kernels.colour(views, picks, at, colours, colours)
+                        kernels.colour(views, picks, look.x, slot.change, colours, look.unit, look.constant)
+                    scale, errors = self._fixed_points[ready.numbers[0]], self._errors.latest
+                    weights = look.blocks is not None
+                    self._sweep.run(views, shapes, swept, background, target, scale, errors, slot.totals, weights)
+                    if targets is not None:
+                        if look.drawn is not None:
+                            kernels.mark_drawn(views, look.drawn)
+                        # Which of them are cut, the gathering asks.
+                        self._copy(slot.change, colours, _CHANGE * views.stride * len(own.views))
+                        self._errors.keep(own.views)
+                    place = TABLE_ENTRY * (own.views.start - every.start)
+                    self._copy(self._tables, views.table, TABLE_ENTRY * len(own.views), place)
+            found = SweptSums(
+                self._totals, self._change, ready.views.stride, ready.subset.numbers, self._tables, every
+            )  # fmt: skip
+            kernels.gather(found, self.sums, look.constant, look.blocks, look.first_block)
 
-        Args:
-            x, targets, constant: as there.
-            blocks: (M (M + 1) / 2, n) int64, the same of the first n splats' own blocks; None: they are not wanted.
-            drawn: (stride,) uint8, becomes 1 for each splat that any of these views draws; not where each view has
-                splats of its own. None: it is not wanted.
-        """
-
-        def sweep(own: _Own, ready: Ready[_Attached], slot: _Slot) -> None:
-            views, (_, colours) = ready.views, ready.geometry
-            self._kernels.colour(views, own.picks(ready), x, colours, colours)
-            pictures = self._targets.of(targets, own.launch.numbers)
-            self._enqueue_sweep(ready, colours, pictures, blocks is not None, slot)
-            if drawn is not None:
-                self._kernels.mark_drawn(views, drawn)
-            # Which of them are cut, the gathering asks.
-            nbytes = _CHANGE * views.stride * len(own.views)
-            cl.enqueue_copy(self._device.queue, slot.change, colours, byte_count=nbytes)
-            self._errors.keep(own.views)
-
-        self._add_up(sweep, constant=constant, blocks=blocks)
+    def _copy(self, target: cl.Buffer, source: cl.Buffer, nbytes: int, to: int = 0) -> None:
+        cl.enqueue_copy(self._device.queue, target, source, byte_count=nbytes, dst_offset=to)
 
     def found_errors(self) -> dict[int, float]:
-        """The squared error by W of each of these views after :meth:`gradient`, by number."""
+        """The squared error by W of each of these views after a look at coefficients, by number."""
         return self._errors.found()
-
-    def blocks(self, blocks: cl.Buffer, first: int) -> None:
-        """Enqueue the blocks' part of :meth:`gradient` alone, of the splats from one on."""
-        self._coefficients.zero(self._change)  # black, and no channel is free
-
-        def sweep(own: _Own, ready: Ready[_Attached], slot: _Slot) -> None:
-            self._enqueue_sweep(ready, slot.change, None, True, slot)
-
-        self._add_up(sweep, blocks=blocks, first_block=first)
-
-    def normal(
-        self, direction: cl.Buffer, at: Vector, unit: float, constant: bool = False, part: int | None = None
-    ) -> None:
-        """Enqueue :meth:`potr_cl.stages.refitting.colour_map.ColourMap.normal` of these views.
-
-        Args:
-            direction, at, constant, part: as there; the direction on the device.
-            unit: the direction is multiplied by this.
-        """
-
-        def sweep(own: _Own, ready: Ready[_Attached], slot: _Slot) -> None:
-            views, picks, (_, colours) = ready.views, own.picks(ready), ready.geometry
-            anew = ready.shares or own.launch.resident is None
-            if anew and picks is None:  # which colours are cut is not known any more
-                self._kernels.colour(views, picks, self._coefficients.on_device(at, 1), colours, colours)
-            self._kernels.colour(views, picks, direction, slot.change, colours, unit, constant)
-            self._enqueue_sweep(ready, slot.change, None, False, slot)
-
-        self._add_up(sweep, part, constant)
-
-    def _add_up(
-        self,
-        sweep: Callable[[_Own, Ready[_Attached], _Slot], None],
-        part: int | None = None,
-        constant: bool = False,
-        blocks: cl.Buffer | None = None,
-        first_block: int = 0,
-    ) -> None:
-        """Enqueue what adds the sums of views to :attr:`sums`, and to blocks.
-
-        Args:
-            sweep: enqueues a group's sweep, given where its sums go.
-            part: of the views; None: all.
-            constant, blocks, first_block: as of :meth:`ViewKernels.gather`.
-        """
-        for of_part in self._gathered if part is None else [self._gathered[part]]:
-            for gathered in of_part:
-                views = range(gathered[0].views.start, gathered[-1].views.stop)
-                for slot, own in zip(self._slots, gathered, strict=False):
-                    with self._engine.ready(own.launch) as ready:
-                        sweep(own, ready, slot)
-                        start, size = TABLE_ENTRY * (own.views.start - views.start), TABLE_ENTRY * len(own.views)
-                        cl.enqueue_copy(
-                            self._device.queue, self._tables, ready.views.table, byte_count=size, dst_offset=start
-                        )
-                picks, stride = ready.subset.numbers, ready.views.stride
-                found = SweptSums(self._totals, self._change, stride, picks, self._tables, views)
-                self._kernels.gather(found, self.sums, constant, blocks, first_block)
-
-    def _enqueue_sweep(
-        self, ready: Ready[_Attached], colours: cl.Buffer, target: cl.Buffer | None, weights: bool,
-        slot: _Slot,
-    ) -> None:  # fmt: skip
-        """Enqueue a group's sweep; without a target colours are a change, and black is behind them."""
-        background = (0.0, 0.0, 0.0) if target is None else self._background
-        views, (shapes, _), scale = ready.views, ready.geometry, self._fixed_points[ready.numbers[0]]
-        self._sweep.run(views, shapes, colours, background, target, scale, self._errors.latest, slot.totals, weights)
 
     def close(self) -> None:
         """Give all device memory back."""

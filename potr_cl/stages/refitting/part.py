@@ -26,7 +26,7 @@ from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.coming_scene import AnyScene, arrived, colourless
 from potr_cl.stages.refitting.exchange import Exchange, SentVector
 from potr_cl.stages.refitting.layout import Layout
-from potr_cl.stages.refitting.own_views import OwnViews
+from potr_cl.stages.refitting.own_views import Look, OwnViews
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.stages.refitting.sweep import Sweep
 from potr_cl.stages.refitting.targets import Targets, targets_of
@@ -153,7 +153,8 @@ class ColourPart(Part):
             if tell_drawn and self._reach is None:
                 marks = memory.allocate(layout.stride, "the splats that views draw")
                 self._device.fill(marks, np.uint8(0))
-            self._views.gradient(self._x, self._targets, self._block_sums, constant, marks)
+            look = Look(self._x, self._targets, constant=constant, blocks=self._block_sums, drawn=marks)
+            self._views.add_up(look)
             if tell_drawn:
                 drawn = self._drawn(marks)
         lent = None
@@ -210,7 +211,7 @@ class ColourPart(Part):
         """
         self._forget_blocks()
         self._exchange.take_floats(self._direction, direction)
-        self._views.normal(self._direction, self._x, unit, constant, part)
+        self._views.add_up(Look(self._direction, None, self._x, unit, constant, part))
         return self._exchange.send_sums(self._views.sums)
 
     def close(self) -> None:

@@ -78,7 +78,7 @@ class Slice:
 
     def run(self, kernel: Kernel) -> None:
         """Launch a bound kernel over the splats."""
-        self.layout.over_splats(kernel, stride=len(self.splats))
+        kernel.launch(*self.layout.items(len(self.splats)))
 
 
 class SlicedArrays(Owner):
@@ -293,17 +293,17 @@ class SlicedArrays(Owner):
 
     # ------------------------------------------------------------------------------------------ sums
 
-    def add_sums(self, x: Array, sums: cl.Buffer, unit: float, count: int | None = None) -> None:
+    def add_sums(self, x: Array, sums: cl.Buffer, unit: float, constant: bool = False) -> None:
         """x += unit times integers, which become 0.
 
         Args:
             x: with as many columns as vectors have.
             sums: (columns, stride) int64 in the device's memory.
             unit: in single precision.
-            count: of the values, the first ones, where all others are 0; None: all.
+            constant: only the constant coefficients' columns, which come first; all other sums are 0.
         """
         # Of zeros all are written: they only stand for them.
-        count = None if isinstance(x, HostArray) and x.zero else count
+        count = 3 * self.layout.stride if constant and not (isinstance(x, HostArray) and x.zero) else None
         for first, some, (piece,) in self.pieces(x, count=count, written=True):
             self._add_fixed(piece, sums, first, some, unit)
 

@@ -108,7 +108,7 @@ class ViewKernels:
             colours=result,
         )
         together = _TOGETHER if picks is None else 1
-        self._layout.over_splats(kernel, -(-len(views.views) // together), stride=views.stride)
+        kernel.launch(*self._layout.items(views.stride, -(-len(views.views) // together)))
 
     def mark_drawn(self, views: ViewSet, drawn: cl.Buffer) -> None:
         """Enqueue: (stride,) uint8 become 1 for each splat that any of some views draws, which have all splats."""
@@ -141,29 +141,28 @@ class ViewKernels:
             first_block: number of the first of them.
         """
         layout = self._layout
-        if blocks is None:
-            self._gather(found, sums, constant)
-            return
-        own = {"first_block": first_block, "block_stride": blocks.size // (8 * layout.triangle), "blocks": blocks}
-        if layout.lanes > 1:
-            self._gather(found, sums, False, own)
-            return
-        # A work-item of a GPU would write a whole block for each view: its blocks have a kernel of their own.
-        kernel = self._kernel("gather_blocks", found, WEIGHTS=0, SOME_BLOCKS=0, **layout.macros)
-        items = own["block_stride"] if found.picks is None else found.stride
-        for arguments in self._arguments(found):
-            kernel.bind(**arguments, **own)
-            kernel.launch((-(-items // _GROUP) * _GROUP, (layout.sh_count + 1) // 2), (_GROUP, 1))
-        self._gather(found, sums, False)
-
-    def _gather(self, found: SweptSums, sums: cl.Buffer, constant: bool, blocks: dict[str, Any] | None = None) -> None:
-        layout = self._layout
-        own = blocks or {"first_block": 0, "block_stride": layout.stride, "blocks": sums}
-        weights, some = int(blocks is not None), int(own["block_stride"] < layout.stride)
+        own = {"first_block": 0, "block_stride": layout.stride, "blocks": sums}
+        weights = some = 0
+        if blocks is not None:
+            of_blocks = {
+                "first_block": first_block, "block_stride": blocks.size // (8 * layout.triangle), "blocks": blocks,
+            }  # fmt: skip
+            if layout.lanes > 1:
+                own, weights, some = of_blocks, 1, int(of_blocks["block_stride"] < layout.stride)
+            else:
+                # A work-item of a GPU would write a whole block for each view: its blocks have a kernel of their own.
+                self._gather_blocks(found, of_blocks)
         kernel = self._kernel("gather", found, WEIGHTS=weights, SOME_BLOCKS=some, **layout.some(constant))
+        items = layout.items(found.stride)
         for arguments in self._arguments(found):
-            kernel.bind(**arguments, **own, free=found.free, result=sums)
-            layout.over_splats(kernel, stride=found.stride)
+            kernel.bind(**arguments, **own, free=found.free, result=sums).launch(*items)
+
+    def _gather_blocks(self, found: SweptSums, blocks: dict[str, Any]) -> None:
+        kernel = self._kernel("gather_blocks", found, WEIGHTS=0, SOME_BLOCKS=0, **self._layout.macros)
+        splats = blocks["block_stride"] if found.picks is None else found.stride
+        items = -(-splats // _GROUP) * _GROUP, (self._layout.sh_count + 1) // 2
+        for arguments in self._arguments(found):
+            kernel.bind(**arguments, **blocks).launch(items, (_GROUP, 1))
 
     def _kernel(self, name: str, found: SweptSums, **macros: int) -> Kernel:
         return self._device.shared_kernel("refit/gather.cl", name, PICKED=int(found.picks is not None), **macros)
