@@ -20,7 +20,7 @@ from potr_cl.stages.pruning.measured import Measured, Removal, measurement
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import LARGEST_LIMIT, RemovalSweep
 from potr_cl.stages.pruning.schedule import Course, Pruned, PruningOptions
-from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.stages.pruning.staleness import SweepOptions
 from potr_cl.stages.pruning.unseen import (
     CHOICES,
     Unseen,
@@ -53,7 +53,7 @@ class Prune(Stage):
             (:mod:`potr_cl.model.unseen`). With ``keep`` or ``count`` they go first in any case. "protect", and "keep"
             where views were placed: what no view has resolved stays as it is (:mod:`potr_cl.placement.guard`).
         tolerance, turns, transmittance_threshold: of the measurements
-            (:class:`potr_cl.stages.pruning.sweep_options.SweepOptions`).
+            (:class:`potr_cl.stages.pruning.staleness.SweepOptions`).
 
     Raises:
         UsageError: a value is out of range.

@@ -226,15 +226,14 @@ class NamedSplats(_Parted):
             self._foreseen = picks, {group: place for place, group in enumerate(groups)}
             try:
                 yield
-                with self.device.errors("failed while computing"):
-                    self.device.queue.finish()
+                self.device.finish()
             finally:
                 self._foreseen = None
 
     def replace_sh(self, sh: FloatArray) -> None:
         former, self._other_sh = self._other_sh, self._whole.other_sh(self._memory, sh)
         if former is not None:
-            self.device.queue.finish()
+            self.device.finish()
             self._memory.free(former)
 
     def close(self) -> None:
@@ -345,5 +344,5 @@ class CopiedSplats(_Parted):
 
     def rest(self, subset: Subset) -> None:
         if subset.scene is not None:
-            self.device.queue.finish()
+            self.device.finish()
             subset.scene.rest()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from potr_cl.stages.refitting.conjugate_gradients import ConjugateGradients, System
+from potr_cl.stages.refitting.solver import ConjugateGradients, System
 
 
 class ArrayVectors:

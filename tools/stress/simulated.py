@@ -59,14 +59,12 @@ from potr_cl.stages.compaction.view_weights import ViewWeights
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from potr_cl.stages.fitting.fit import FitOptions, fit_scene
 from potr_cl.stages.fitting.parameters import UNROUNDED, Factors, in_form_of_files
-from potr_cl.stages.pruning.alive_packing import AlivePacking
-from potr_cl.stages.pruning.changed_totals import AddedChanges, ChangedTotals
 from potr_cl.stages.pruning.on_device import prune_scene
-from potr_cl.stages.pruning.planned import planned_sweep
-from potr_cl.stages.pruning.removal import RemovalSweep
+from potr_cl.stages.pruning.removal import RemovalSweep, planned_sweep
 from potr_cl.stages.pruning.schedule import PruningOptions
+from potr_cl.stages.pruning.staleness import SweepOptions
 from potr_cl.stages.pruning.survivors import Survivors
-from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.stages.pruning.travelling_totals import AddedChanges, AlivePacking, ChangedTotals
 from potr_cl.stages.refitting import coefficients, sliced_arrays
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.exchange import Exchange

@@ -11,11 +11,9 @@ from numpy.typing import NDArray
 
 from potr_cl.raster.kept_scene import lying_on, whole_on_device
 from potr_cl.raster.scene_buffers import SceneBuffers
-from potr_cl.stages.pruning.part import RemovalPart
-from potr_cl.stages.pruning.planned import planned_sweep
-from potr_cl.stages.pruning.removal import RemovalSweep
-from potr_cl.stages.pruning.shared_removal import SharedRemoval
-from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.stages.pruning.removal import RemovalSweep, planned_sweep
+from potr_cl.stages.pruning.shared_removal import RemovalPart, SharedRemoval
+from potr_cl.stages.pruning.staleness import SweepOptions
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.views.shares import ViewShares
 from potr_cl.views.visibility import Visibility

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.host.threads import in_background
@@ -129,9 +128,7 @@ class _Controller(Owner):
         )
         self._launch(self._mark)
         gone = np.empty(1, np.uint32)
-        with self._device.errors("failed while computing"):
-            place = bytes_before(_STATE, "gone")
-            cl.enqueue_copy(self._device.queue, gone, self._state, src_offset=place, is_blocking=True)
+        self._device.copy(gone, self._state, of=bytes_before(_STATE, "gone"))
         return int(gone[0])
 
     def _launch(self, kernel: Kernel) -> None:

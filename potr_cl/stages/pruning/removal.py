@@ -7,16 +7,16 @@ totals a splat, in units that follow from all views. So it makes no difference t
 together, with which splats, and which of them stay on the device: that is the plan's matter
 (:mod:`potr_cl.views.plan`), and the engine's (:mod:`potr_cl.views.engine`).
 
-The parts: sweep_options.py (what may be traded for speed), resident.py and streamed.py (measuring views that stay on
-the device and views that do not), prepared_set.py (what is kept of them), ledger.py (who numbers splats how),
-launcher.py (the kernels of either family), staleness.py (which tiles the host has swept again), survivors.py (which
-splats are left) and fixed_point.py (the totals' units).
+The parts: staleness.py (what may be traded for speed, and which tiles the host has swept again), resident.py and
+streamed.py (measuring views that stay on the device and views that do not), prepared_set.py (what is kept of them, and
+who numbers splats how), launcher.py (the kernels of either family), survivors.py (which splats are left) and
+fixed_point.py (the totals' units).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 
 import numpy as np
 import pyopencl as cl
@@ -24,24 +24,25 @@ from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera
-from potr_cl.model.scene import FloatArray
+from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
 from potr_cl.raster.view_set import ViewSet
 from potr_cl.stages.pruning.fixed_point import FixedPoint
 from potr_cl.stages.pruning.launcher import launchers
-from potr_cl.stages.pruning.ledger import Ledger
-from potr_cl.stages.pruning.prepared_set import PreparedSet
-from potr_cl.stages.pruning.queues import Queues
-from potr_cl.stages.pruning.resident import ResidentSweep
+from potr_cl.stages.pruning.prepared_set import Ledger, PreparedSet
+from potr_cl.stages.pruning.resident import Queues, ResidentSweep
+from potr_cl.stages.pruning.staleness import SweepOptions
 from potr_cl.stages.pruning.streamed import StreamedSweep
 from potr_cl.stages.pruning.survivors import Bits, Survivors
-from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.views import plan as plans
 from potr_cl.views.budget import default_memory, tiles_of
 from potr_cl.views.engine import ViewEngine
 from potr_cl.views.plan import ViewPlan
-from potr_cl.views.subsets import SplatSource, Subset, WholeScene
+from potr_cl.views.subsets import CopiedSplats, NamedSplats, SplatSource, Subset, WholeScene
+from potr_cl.views.visibility import Visibility
 
 F64 = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -145,8 +146,7 @@ class RemovalSweep(Owner):
         if self._spared is not None:
             first = np.zeros((self.splats, 2), np.int64)
             first[self._spared, 0] = _SPARED
-            with self.device.errors("cannot hold the removal effects to begin with"):
-                cl.enqueue_copy(self.device.queue, self.totals, first, is_blocking=True)
+            self.device.copy(self.totals, first)
 
     @property
     def sweeps(self) -> float:
@@ -313,3 +313,56 @@ class RemovalSweep(Owner):
     def close(self) -> None:
         """Give all device memory back."""
         self._owned.close()
+
+
+@contextmanager
+def planned_sweep(
+    device: Device,
+    drawable: Drawable,
+    cameras: Sequence[Camera],
+    options: SweepOptions,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    visibility: Visibility | None = None,
+    numbers: Sequence[int] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    scene: Scene | None = None,
+    spared: NDArray[np.bool_] | None = None,
+) -> Iterator[RemovalSweep]:
+    """A removal sweep over some views, as long as the context lasts.
+
+    Args:
+        device: that computes.
+        drawable: the uncompressed scene, perhaps on the device.
+        cameras, options, numbers, progress, spared: as of :class:`~potr_cl.stages.pruning.removal.RemovalSweep`.
+        background: R, G, B behind the scene.
+        visibility: what the views may draw, where each had better be looked at with that; None: with all splats.
+        scene: the uncompressed scene on the host; None: it is there only if ``drawable`` is.
+
+    Raises:
+        DeviceError: the scene or a view does not fit the device.
+    """
+    scene = drawable if isinstance(drawable, Scene) else scene
+    memory = default_memory(device) if options.memory is None else options.memory
+    meant = range(len(cameras)) if numbers is None else numbers
+    with ExitStack() as owned:
+        source: Rasterizer | SplatSource
+        plan = None
+        if visibility is not None and isinstance(drawable, SceneBuffers) and _can_name(device, options):
+            source = owned.enter_context(NamedSplats(drawable, visibility.groups.group_of, background))
+            plan = plans.by_view(visibility, cameras, meant, memory, 16 * drawable.stride)
+        elif visibility is not None and scene is not None:
+            clusters = visibility.clusters(numbers)
+            source = owned.enter_context(CopiedSplats(device, scene, drawable, background))
+            if device.family == "cpu":
+                plan = plans.as_drawn(source, cameras, clusters, memory, progress)
+                progress = None  # that was most of it
+            else:
+                plan = plans.by_cluster(clusters, memory, scene.nbytes // max(len(scene), 1))
+        else:
+            source = owned.enter_context(Rasterizer(device, drawable, background=background))
+        yield owned.enter_context(RemovalSweep(source, cameras, options, progress, numbers, plan, spared))
+
+
+def _can_name(device: Device, options: SweepOptions) -> bool:
+    """Whether splats can be named by their numbers: GPU kernels can, where staleness alone chooses tiles."""
+    return device.family == "gpu" and options.only_by_tolerance

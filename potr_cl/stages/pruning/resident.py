@@ -8,24 +8,58 @@ many they are; for CPU kernels, and where views take turns, the host chooses whe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TypeVar
 
 import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
+from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.stages.pruning.fixed_point import FixedPoint
-from potr_cl.stages.pruning.launcher import SetKernels, SweepLauncher, launcher_for, launchers
-from potr_cl.stages.pruning.ledger import Ledger
-from potr_cl.stages.pruning.prepared_set import PreparedSet
-from potr_cl.stages.pruning.queues import Queues
-from potr_cl.stages.pruning.staleness import TileSchedule, by_set
+from potr_cl.stages.pruning.launcher import SetKernels, SweepBuffers, SweepLauncher, launcher_for, launchers
+from potr_cl.stages.pruning.prepared_set import Ledger, PreparedSet
+from potr_cl.stages.pruning.staleness import SweepOptions, TileSchedule, by_set
 from potr_cl.stages.pruning.survivors import Survivors
-from potr_cl.stages.pruning.sweep_buffers import SweepBuffers
-from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.views.engine import ViewEngine
+
+T = TypeVar("T")
+
+
+class Queues:
+    """The device's own queue, or several others.
+
+    Args:
+        device: that the work is for.
+        most: queues to open, where the device takes more than its own.
+    """
+
+    def __init__(self, device: Device, most: int) -> None:
+        self._device = device
+        self._queues = [device.queue]
+        if most > 1 and device.several_queues:
+            properties = device.queue.properties
+            self._queues = [cl.CommandQueue(device.context, device.info.handle, properties) for _ in range(most)]
+
+    def dealt(self, work: Iterable[T]) -> Iterator[tuple[T, cl.CommandQueue]]:
+        """Each piece of work with the queue that it goes to, after what the device's own has; :meth:`wait` for all."""
+        self._device.finish()
+        for piece, queue in zip(work, itertools.cycle(self._queues)):
+            yield piece, queue
+            with self._device.errors("failed while computing"):
+                queue.flush()
+
+    def wait(self) -> None:
+        """Return once all is done.
+
+        Raises:
+            DeviceError: the device failed.
+        """
+        with self._device.errors("failed while computing"):
+            for queue in self._queues:
+                queue.finish()
 
 
 class ResidentSweep(Owner):
@@ -162,7 +196,7 @@ class ResidentSweep(Owner):
         self._settle()
         counts = [ready.views.tiles for ready in self._sets]
         if self.device_lists:
-            self._write(self._tiles, np.concatenate([np.arange(count, dtype=np.uint32) for count in counts]))
+            self._device.copy(self._tiles, np.concatenate([np.arange(count, dtype=np.uint32) for count in counts]))
             self._counts = counts
         self._device.fill(self._stale, np.float32(0 if self.device_lists else np.inf))
 
@@ -200,14 +234,10 @@ class ResidentSweep(Owner):
         """List tiles of all sets, numbered through, ascending."""
         listed, self._counts = by_set(tiles, self._firsts)
         if len(tiles):
-            self._write(self._tiles, listed)
+            self._device.copy(self._tiles, listed)
             stale = self._staleness()
             self._schedule.note_swept(stale, tiles)
-            self._write(self._stale, stale)
-
-    def _write(self, buffer: cl.Buffer, values: NDArray[Any]) -> None:
-        with self._device.errors("failed while computing"):
-            cl.enqueue_copy(self._device.queue, buffer, values, is_blocking=True)
+            self._device.copy(self._stale, stale)
 
     def close(self) -> None:
         self._memory.close()

@@ -157,8 +157,7 @@ class Coefficients(SlicedArrays):
             some = memory.allocate(4 * width * min(len(sh), _TURNED), "the SH coefficients")
             for first in range(0, len(sh), _TURNED):
                 rows = np.ascontiguousarray(sh[first : first + _TURNED], np.float32).reshape(-1, width)
-                with device.errors("cannot hold the SH coefficients"):
-                    cl.enqueue_copy(device.queue, some, rows, is_blocking=True)
+                device.copy(some, rows)
                 turn.bind(rows=some, first=first, width=width, stride=stride, result=columns).launch((len(rows),))
 
     def read_sh(self, x: Vector) -> FloatArray:
@@ -227,8 +226,7 @@ class Coefficients(SlicedArrays):
 
     def restore_flags(self, words: NDArray[np.uint32]) -> None:
         """Set the flags to what they were."""
-        with self.device.errors("failed while computing"):
-            cl.enqueue_copy(self.device.queue, self.active, words, is_blocking=True)
+        self.device.copy(self.active, words)
 
     def close(self) -> None:
         """Give all device memory back, that of the vectors included."""

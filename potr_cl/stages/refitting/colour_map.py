@@ -98,14 +98,14 @@ class ColourMap:
             coefficients.add_sums(result, own.sums, unit, constant)
             if blocks is not None:
                 blocks.set_fixed(ranges[0], sums, unit)
-                coefficients.device.queue.finish()  # before their memory is given back
+                coefficients.device.finish()  # before their memory is given back
         for splats in ranges[1:]:
             with Memory(coefficients.device) as memory:
                 sums = self._block_sums(memory, splats)
                 own.add_up(Look(blocks=sums, first_block=splats.start))
                 assert blocks is not None
                 blocks.set_fixed(splats, sums, unit)
-                coefficients.device.queue.finish()
+                coefficients.device.finish()
         return math.fsum(errors[number] for number in sorted(errors))
 
     def normal(

@@ -15,23 +15,70 @@ import numpy as np
 import pyopencl as cl
 
 from potr_cl.model.camera import Camera
+from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.view_cache import ViewCache
 from potr_cl.raster.view_set import TABLE_ENTRY, ViewSet
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.refitting.coefficients import Coefficients, Vector
-from potr_cl.stages.refitting.fixed_point import gathered_scale
 from potr_cl.stages.refitting.kept_pictures import KeptPictures
-from potr_cl.stages.refitting.sweep import Sweep
 from potr_cl.stages.refitting.targets import Targets
-from potr_cl.stages.refitting.view_errors import ViewErrors
-from potr_cl.stages.refitting.view_kernels import Picks, SweptSums, ViewKernels
+from potr_cl.stages.refitting.view_kernels import Picks, Sweep, SweptSums, ViewKernels, gathered_scale
 from potr_cl.views import plan as plans
-from potr_cl.views.budget import free_memory, target_bytes
+from potr_cl.views.budget import free_memory, target_bytes, tiles_of
 from potr_cl.views.engine import Launch, Ready, ViewEngine
 from potr_cl.views.reached import Reach
 from potr_cl.views.subsets import ListedSplats, Subset, WholeScene
+
+
+class ViewErrors(Owner):
+    """Each tile's error, of all launches of a gradient.
+
+    They are asked for once, when all is enqueued: while one thread waits for what it downloads, some drivers let no
+    other one use that device, and others may want to read from it what they need to begin with their views.
+
+    Args:
+        device: that computes.
+        cameras: all views. weights: what a pixel of each counts.
+        launches: numbers of the views that each launch does.
+
+    Attributes:
+        latest: (tiles,) float32 on the device, where a sweep writes what it finds.
+
+    Raises:
+        DeviceError: the device has no room.
+    """
+
+    def __init__(
+        self, device: Device, cameras: Sequence[Camera], weights: Sequence[float], launches: Sequence[Sequence[int]]
+    ) -> None:
+        self._device, self._weights = device, list(weights)
+        self._numbers = [number for each in launches for number in each]
+        self._ends = [0, *itertools.accumulate(tiles_of(cameras[number]) for number in self._numbers)]
+        most = max((sum(tiles_of(cameras[number]) for number in each) for each in launches), default=0)
+        self._memory = Memory(device)
+        with device.all_or_nothing():
+            self.latest = self._memory.allocate(4 * most, "the tiles' errors")
+            self._all = self._memory.allocate(4 * self._ends[-1], "the tiles' errors")
+
+    def keep(self, views: range) -> None:
+        """Enqueue that what the last sweep has found is kept until :meth:`found`; views by their place in launches."""
+        first, end = self._ends[views.start], self._ends[views.stop]
+        self._device.copy(self._all, self.latest, 4 * (end - first), to=4 * first)
+
+    def found(self) -> dict[int, float]:
+        """The squared error by W of each view, by its number among all; waits for the device."""
+        tiles = self._device.download(self._all, (self._ends[-1],), np.float32)
+        return {
+            number: self._weights[number] * float(tiles[first:end].sum(dtype=np.float64))
+            for number, (first, end) in zip(self._numbers, itertools.pairwise(self._ends), strict=True)
+        }
+
+    def close(self) -> None:
+        """Give the device's memory back."""
+        self._memory.close()
+
 
 #: Bytes a splat and view of a sweep's own buffers: the colours' change and the sums.
 _CHANGE, _TOTALS = 16, 32
@@ -125,6 +172,8 @@ class OwnViews(Owner):
             plan = plans.in_launches(parts, rooms, self._cache, sweep.most_views, _CHANGE + _TOTALS)
             self._engine: ViewEngine[_Attached] = ViewEngine(source, cameras, plan, _Attached, sweep.most_views)
             self._owned.append(self._engine)
+            if memory is not None:  # pictures are kept in what streamed views leave
+                self._cache.room = max(self._cache.room - self._engine.passing, 0)
             rasterizer.rest()
             launches = sorted(self._engine.walk(), key=lambda each: each.numbers[0] % self.parts)
             ends = [0, *itertools.accumulate(len(each.numbers) for each in launches)]
@@ -204,17 +253,14 @@ class OwnViews(Owner):
                         if look.drawn is not None:
                             kernels.mark_drawn(views, look.drawn)
                         # Which of them are cut, the gathering asks.
-                        self._copy(slot.change, colours, _CHANGE * views.stride * len(own.views))
+                        self._device.copy(slot.change, colours, _CHANGE * views.stride * len(own.views))
                         self._errors.keep(own.views)
                     place = TABLE_ENTRY * (own.views.start - every.start)
-                    self._copy(self._tables, views.table, TABLE_ENTRY * len(own.views), place)
+                    self._device.copy(self._tables, views.table, TABLE_ENTRY * len(own.views), place)
             found = SweptSums(
                 self._totals, self._change, ready.views.stride, ready.subset.numbers, self._tables, every
             )  # fmt: skip
             kernels.gather(found, self.sums, look.constant, look.blocks, look.first_block)
-
-    def _copy(self, target: cl.Buffer, source: cl.Buffer, nbytes: int, to: int = 0) -> None:
-        cl.enqueue_copy(self._device.queue, target, source, byte_count=nbytes, dst_offset=to)
 
     def found_errors(self) -> dict[int, float]:
         """The squared error by W of each of these views after a look at coefficients, by number."""

@@ -145,8 +145,7 @@ class SlicedArrays(Owner):
         elif isinstance(x, HostArray):
             self._to_device(x, y)
         else:
-            with self.device.errors("failed while computing"):
-                cl.enqueue_copy(self.device.queue, y, x, byte_count=min(x.size, y.size))
+            self.device.copy(y, x)
 
     def _to_device(self, x: HostArray, buffer: cl.Buffer, first: int = 0, count: int | None = None) -> None:
         if x.zero:
@@ -229,7 +228,7 @@ class SlicedArrays(Owner):
             if written and isinstance(arrays[0], HostArray):
                 self._ferry.to_host([Cargo(arrays[0].values.reshape(-1)[first : first + some])], buffers[0])
             elif written:
-                self._copy(arrays[0], buffers[0], some, to=first)
+                self.device.copy(arrays[0], buffers[0], 4 * some, to=4 * first)
         if written:
             _changed(arrays[0])
 
@@ -244,14 +243,8 @@ class SlicedArrays(Owner):
             self._to_device(x, buffer, first, count)
         else:
             # Not a part of the buffer: NVIDIA's driver carries these to the host and back.
-            self._copy(buffer, x, count, of=first)
+            self.device.copy(buffer, x, 4 * count, of=4 * first)
         return buffer
-
-    def _copy(self, target: cl.Buffer, source: cl.Buffer, count: int, to: int = 0, of: int = 0) -> None:
-        with self.device.errors("failed while computing"):
-            cl.enqueue_copy(
-                self.device.queue, target, source, byte_count=4 * count, dst_offset=4 * to, src_offset=4 * of
-            )
 
     def _place(self, columns: int, number: int) -> cl.Buffer:
         if (columns, number) not in self._places:
