@@ -138,6 +138,24 @@ class SplatSource(Owner):
         """Give all device memory back that is its own."""
 
 
+class NoSplats(SplatSource):
+    """Of a device that looks at no view itself.
+
+    Args:
+        device: the device.
+        splats: N.
+    """
+
+    def __init__(self, device: Device, splats: int) -> None:
+        self.device, self.splats, self.stride = device, splats, stride_of(splats)
+
+    def open(self, stack: ExitStack, memory: Memory, group: ViewGroup, left: Left | None = None) -> None:
+        return None
+
+    def replace_sh(self, sh: FloatArray) -> None:
+        """There is nothing to colour."""
+
+
 class WholeScene(SplatSource):
     """All splats for all groups.
 

@@ -17,7 +17,7 @@ from potr_cl.opencl.kernel import Kernel
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.opencl.structs import bytes_before, struct_dtype
 from potr_cl.raster.macros import totals_limits
-from potr_cl.stages.pruning.measured import Removal
+from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import Course, Indices, Iteration, Pruned, PruningOptions, prune
 
 _SOURCE = "prune/choose_gpu.cl"
@@ -28,7 +28,7 @@ _REMOVED, _STATE = struct_dtype(_SOURCE, "Removed"), struct_dtype(_SOURCE, "Stat
 
 
 def prune_scene(
-    removal: Removal,
+    removal: RemovalSweep,
     options: PruningOptions,
     progress: Callable[[int, int], None] | None = None,
     after_iteration: Callable[[int], None] | None = None,
@@ -56,7 +56,7 @@ class _Controller(Owner):
         DeviceError: the device has no room for the state.
     """
 
-    def __init__(self, removal: Removal, options: PruningOptions, spared: NDArray[np.bool_] | None) -> None:
+    def __init__(self, removal: RemovalSweep, options: PruningOptions, spared: NDArray[np.bool_] | None) -> None:
         self._removal, self._options = removal, options
         self._device = device = removal.device
         self._splats = removal.splats
