@@ -19,16 +19,18 @@ from potr_cl.api.inputs import (
     coded_scene,
     colour_of,
     drawable_of,
+    drawable_to_judge,
     name_of,
     rules_of,
     scene_of,
 )
 from potr_cl.api.pictures import png_bytes
-from potr_cl.api.views import Viewpoints, told
+from potr_cl.api.views import Viewpoints, told, warn_of_frame
 from potr_cl.errors import UsageError
 from potr_cl.formats.images import Colour, write_png
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.camera import Camera, within_photographs
+from potr_cl.opencl.discovery import list_devices
 from potr_cl.plain_text import plain
 from potr_cl.quality.compare import (
     Comparison,
@@ -44,9 +46,8 @@ from potr_cl.quality.compare import (
     size_report,
 )
 from potr_cl.quality.figures import ViewFigures
-from potr_cl.quality.judging import Looks
+from potr_cl.quality.judging import Judging, Looks
 from potr_cl.quality.metrics import Lpips
-from potr_cl.quality.shared_judging import SharedJudging
 from potr_cl.raster.rules import RULES, RasterRules
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.report.labels import U8, comparison_picture, shrunk
@@ -219,10 +220,16 @@ def compare(
         there = given or points.judging(scene_of(source_a), workers.device)
         chosen = chosen_views(there, views, split)
         coded = [coded_for(workers, each, trust) if antialiased is None else None for each in (source_a, b)]
-        scene_a, scene_b = (
-            stack.enter_context(drawable_of(each, workers.device, trust, antialiased, read))
-            for each, read in zip((source_a, b), coded, strict=True)
-        )
+        drawables = []
+        for source, shown, read in zip((a, b), (source_a, b), coded, strict=True):
+            how = shown, workers.device, trust, antialiased, read
+            if given is None:
+                drawables.append(stack.enter_context(drawable_of(*how)))
+            else:
+                drawable, judged = stack.enter_context(drawable_to_judge(*how))
+                warn_of_frame(source, judged, chosen)
+                drawables.append(drawable)
+        scene_a, scene_b = drawables
         comparison = compare_scenes(
             (named(a, scene_a), scene_a),
             (named(b, scene_b), scene_b),
@@ -233,12 +240,24 @@ def compare(
             truth=None if truth is None else Path(truth),
             lpips=lpips,
             progress=progress,
-            notes=[] if given else [f"no cameras: {told(there)}"],
+            notes=[]
+            if given
+            else [f"no --cameras given: {told(there)}; files encoded with cameras look best from those"],
             coded=coded,
         )
     if output is not None:
         comparison.save(output)
     return comparison
+
+
+def compare_sizes(
+    a: SceneSource, b: SceneSource, trust: bool = False, antialiased: bool | None = None
+) -> tuple[dict[str, Any], str] | None:
+    """Facts and a table of two scenes where there is no OpenCL device; None where there is one."""
+    if list_devices():
+        return None
+    files = [named(each, scene_of(each, trust, antialiased)) for each in (a, b)]
+    return size_report(*files), format_sizes(*files)
 
 
 def named(source: SceneSource, scene: Drawable) -> SceneFile:
@@ -299,11 +318,11 @@ def compare_scenes(
     opened, tell, stage = workers.device, progress or (lambda _stage, _done: None), comparing(len(views))
     looks = Looks(background, rules, ground_truth, metric)
     tell(stage, 0.0)
-    with SharedJudging(opened, a[1], views, looks, workers.pool, anyway=True, coded=coded[0]) as judging:
-        found = judging.figures(b[1], views, coded[1], lambda done: tell(stage, done / len(views)))
+    with Judging(opened, a[1], views, looks, workers.pool, anyway=True, coded=coded[0]) as judging:
+        found = judging.figures(b[1], None, coded[1], lambda done: tell(stage, done))
         figures = comparison_of(found)
         worst = figures.views[figures.worst]
-        ((picture_a, picture_b),) = judging.pictures(b[1], [views[figures.worst]])
+        ((picture_a, picture_b),) = judging.pictures(b[1], [figures.worst])
     psnr = None if worst.identical else worst.figures["b_against_a"].psnr
     picture, factor = comparison_picture(picture_a, picture_b, worst.name, psnr, (a[0].path.name, b[0].path.name))
     called = next((name for name, known in RULES.items() if known == rules), "own")

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-#: Work-items of a work-group.
+#: Y, Co and Cg.
+CHANNELS = 3
+#: Splats of a work-group.
 _GROUP = 64
 
 
@@ -44,9 +46,9 @@ class Layout:
         """The same for kernels that look at all coefficients, or at the constant ones, whose columns come first."""
         return {**self.macros, "SH_COUNT": 1} if constant else self.macros
 
-    def items(self, stride: int, *others: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    def items(self, stride: int, *others: int, group: int = _GROUP) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Work-items, and those of a group, for so many splats, and in the second dimension for ``others``."""
-        return (stride // self.lanes, *others), (max(_GROUP // self.lanes, 1), *(1 for _ in others))
+        return (stride // self.lanes, *others), (max(group // self.lanes, 1), *(1 for _ in others))
 
 
 @dataclass(frozen=True)

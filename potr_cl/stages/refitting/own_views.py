@@ -22,14 +22,13 @@ from potr_cl.raster.view_cache import ViewCache
 from potr_cl.raster.view_set import TABLE_ENTRY, ViewSet
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.refitting.coefficients import Coefficients, Vector
-from potr_cl.stages.refitting.kept_pictures import KeptPictures
-from potr_cl.stages.refitting.targets import Targets
 from potr_cl.stages.refitting.view_kernels import Picks, Sweep, SweptSums, ViewKernels, gathered_scale
 from potr_cl.views import plan as plans
 from potr_cl.views.budget import free_memory, target_bytes, tiles_of
 from potr_cl.views.engine import Launch, Ready, ViewEngine
 from potr_cl.views.reached import Reach
 from potr_cl.views.subsets import ListedSplats, Subset, WholeScene
+from potr_cl.views.targets import TargetPictures, Targets
 
 
 class ViewErrors(Owner):
@@ -205,7 +204,7 @@ class OwnViews(Owner):
             ratios = [self.one * weights[each] / self._fixed_points[each] for some in sets for each in some]
             scales = self._memory.upload(np.array(ratios, np.float32), "the views' scales")
             self._kernels = ViewKernels(device, layout, rasterizer.parameters.means, scales)
-            self._targets = KeptPictures(device, cameras, self._cache, sets)
+            self._targets = TargetPictures(device, cameras, self._cache, sets=sets)
             self._owned.append(self._targets)
         except BaseException:
             self.close()
@@ -222,7 +221,7 @@ class OwnViews(Owner):
         Raises:
             DeviceError: the device failed. What the targets raise.
         """
-        self._targets.fill(targets, [each.launch.numbers for each in self._launches])
+        self._targets.fill([each.launch.numbers for each in self._launches], targets)
 
     def add_up(self, look: Look) -> None:
         """Enqueue what adds to :attr:`sums`, and to blocks, what views give."""
@@ -238,7 +237,7 @@ class OwnViews(Owner):
                     swept, target = slot.change, None
                     if targets is not None:
                         kernels.colour(views, picks, look.x, colours, colours)
-                        swept, target = colours, self._targets.of(targets, own.launch.numbers)
+                        swept, target = colours, self._targets.of(own.launch.numbers, targets)
                     elif look.x is not None:
                         assert look.at is not None
                         anew = ready.shares or own.launch.resident is None

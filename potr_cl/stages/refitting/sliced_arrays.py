@@ -76,9 +76,9 @@ class Slice:
     def __getitem__(self, array: Array) -> cl.Buffer:
         return self.buffers[array]
 
-    def run(self, kernel: Kernel) -> None:
-        """Launch a bound kernel over the splats."""
-        kernel.launch(*self.layout.items(len(self.splats)))
+    def run(self, kernel: Kernel, *others: int, **group: int) -> None:
+        """Launch a bound kernel over the splats, with work-items as :meth:`.layout.Layout.items` has them."""
+        kernel.launch(*self.layout.items(len(self.splats), *others, **group))
 
 
 class SlicedArrays(Owner):

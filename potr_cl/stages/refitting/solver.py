@@ -27,7 +27,7 @@ from potr_cl.stages.refitting.coefficients import Coefficients, Vector
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.layout import Ridge
 from potr_cl.stages.refitting.refit_options import Descent, Selection
-from potr_cl.stages.refitting.targets import Targets
+from potr_cl.views.targets import Targets
 
 #: Steps end where the residual's square, as the preconditioner measures it, has shrunk by this: single precision has no
 #: more digits, and what is left of them leads astray.
