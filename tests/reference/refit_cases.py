@@ -113,8 +113,7 @@ class Pictures:
         self.device, self.pictures = device, pictures
         self.buffers = [device.upload(np.ascontiguousarray(p, np.float32), "a picture") for p in pictures]
 
-    def into(self, numbers: Sequence[int], buffer: cl.Buffer) -> None:
-        start = 0
+    def into(self, numbers: Sequence[int], buffer: cl.Buffer, start: int = 0) -> None:
         for number in numbers:
             picture = self.buffers[number]
             cl.enqueue_copy(self.device.queue, buffer, picture, byte_count=picture.size, dst_offset=start)
