@@ -17,6 +17,7 @@ do with the same options (docs/python.md has examples):
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
 
 # As typing has it, which takes long to import: until the program handles signals, Ctrl-C ends in a traceback.
@@ -25,14 +26,23 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
+    from potr_cl.api.choices import EncodeChoices
     from potr_cl.api.comparing import SceneComparison, compare
     from potr_cl.api.describing import SceneInfo, info
-    from potr_cl.api.editing import CompactedScene, PrunedScene, RefittedScene, compact, prune, refit
+    from potr_cl.api.editing import (
+        CompactedScene,
+        EditChoices,
+        FittedScene,
+        PrunedScene,
+        RefittedScene,
+        compact,
+        fit,
+        prune,
+        refit,
+    )
     from potr_cl.api.effects import RemovalEffects, removal_effects
-    from potr_cl.api.encoding import encode
+    from potr_cl.api.encoding import encode, encode_ladder
     from potr_cl.api.files import convert, decode, decode_to_device, save
-    from potr_cl.api.fitting import FittedScene, fit
-    from potr_cl.api.ladder import encode_ladder
     from potr_cl.api.pictures import Rendering, Renderings, preview, render
     from potr_cl.api.viewing import view
     from potr_cl.errors import (
@@ -62,6 +72,8 @@ __all__ = [
     "DataError",
     "DeviceError",
     "DeviceMemoryError",
+    "EditChoices",
+    "EncodeChoices",
     "EncodeOptions",
     "Encoded",
     "FittedScene",
@@ -112,9 +124,11 @@ _HOMES = {
     "DataError": "errors",
     "DeviceError": "errors",
     "DeviceMemoryError": "errors",
+    "EditChoices": "api.editing",
+    "EncodeChoices": "api.choices",
     "EncodeOptions": "pipeline.options",
     "Encoded": "pipeline.encoded",
-    "FittedScene": "api.fitting",
+    "FittedScene": "api.editing",
     "PotrError": "errors",
     "PrunedScene": "api.editing",
     "RefittedScene": "api.editing",
@@ -134,9 +148,9 @@ _HOMES = {
     "decode": "api.files",
     "decode_to_device": "api.files",
     "encode": "api.encoding",
-    "encode_ladder": "api.ladder",
+    "encode_ladder": "api.encoding",
     "encode_to_target": "pipeline.search",
-    "fit": "api.fitting",
+    "fit": "api.editing",
     "info": "api.describing",
     "load_cameras": "formats",
     "load_scene": "formats",
@@ -165,3 +179,15 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return __all__
+
+
+def _show_scenes_in_notebooks() -> None:
+    """Have a notebook show scenes as pictures: arrays themselves know nothing of rendering."""
+    ipython = sys.modules.get("IPython")
+    shell = None if ipython is None else ipython.get_ipython()
+    if shell is not None:
+        pictures = shell.display_formatter.formatters["image/png"]
+        pictures.for_type_by_name("potr_cl.model.scene", "Scene", lambda scene: __getattr__("preview")(scene))
+
+
+_show_scenes_in_notebooks()

@@ -19,16 +19,18 @@ from potr_cl.api.inputs import (
     coded_scene,
     colour_of,
     drawable_of,
+    drawable_to_judge,
     name_of,
     rules_of,
     scene_of,
 )
 from potr_cl.api.pictures import png_bytes
-from potr_cl.api.views import Viewpoints, told
+from potr_cl.api.views import Viewpoints, told, warn_of_frame
 from potr_cl.errors import UsageError
 from potr_cl.formats.images import Colour, write_png
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.camera import Camera, within_photographs
+from potr_cl.opencl.discovery import list_devices
 from potr_cl.plain_text import plain
 from potr_cl.quality.compare import (
     Comparison,
@@ -218,10 +220,16 @@ def compare(
         there = given or points.judging(scene_of(source_a), workers.device)
         chosen = chosen_views(there, views, split)
         coded = [coded_for(workers, each, trust) if antialiased is None else None for each in (source_a, b)]
-        scene_a, scene_b = (
-            stack.enter_context(drawable_of(each, workers.device, trust, antialiased, read))
-            for each, read in zip((source_a, b), coded, strict=True)
-        )
+        drawables = []
+        for source, shown, read in zip((a, b), (source_a, b), coded, strict=True):
+            how = shown, workers.device, trust, antialiased, read
+            if given is None:
+                drawables.append(stack.enter_context(drawable_of(*how)))
+            else:
+                drawable, judged = stack.enter_context(drawable_to_judge(*how))
+                warn_of_frame(source, judged, chosen)
+                drawables.append(drawable)
+        scene_a, scene_b = drawables
         comparison = compare_scenes(
             (named(a, scene_a), scene_a),
             (named(b, scene_b), scene_b),
@@ -232,12 +240,24 @@ def compare(
             truth=None if truth is None else Path(truth),
             lpips=lpips,
             progress=progress,
-            notes=[] if given else [f"no cameras: {told(there)}"],
+            notes=[]
+            if given
+            else [f"no --cameras given: {told(there)}; files encoded with cameras look best from those"],
             coded=coded,
         )
     if output is not None:
         comparison.save(output)
     return comparison
+
+
+def compare_sizes(
+    a: SceneSource, b: SceneSource, trust: bool = False, antialiased: bool | None = None
+) -> tuple[dict[str, Any], str] | None:
+    """Facts and a table of two scenes where there is no OpenCL device; None where there is one."""
+    if list_devices():
+        return None
+    files = [named(each, scene_of(each, trust, antialiased)) for each in (a, b)]
+    return size_report(*files), format_sizes(*files)
 
 
 def named(source: SceneSource, scene: Drawable) -> SceneFile:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.api.encoding import views_or_placed
 from potr_cl.api.inputs import (
     CamerasSource,
     ColourSource,
@@ -18,6 +17,7 @@ from potr_cl.api.inputs import (
     device_of,
     scene_of,
 )
+from potr_cl.api.views import views_or_placed
 from potr_cl.model.camera import train_views
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.amounts import as_bytes
@@ -86,9 +86,9 @@ def removal_effects(
     given, what = cameras_of(cameras, virtual_views), scene_of(scene, trust, antialiased)
     check_frame(what, given, cameras_anyway)
     opened = device_of(device)
-    views = train_views(views_or_placed(what, given, virtual_views))
-    groups = [[number] for number in range(len(views))] if by_view else [list(range(len(views)))]
     tell: Progress = progress or (lambda _what, _done: None)
+    views = train_views(views_or_placed(scene, what, given, virtual_views, opened, tell))
+    groups = [[number] for number in range(len(views))] if by_view else [list(range(len(views)))]
 
     def work(device: Device, memory: int | None) -> _Totals:
         with Rasterizer(device, what, background=colour) as rasterizer:

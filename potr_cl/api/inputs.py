@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 from potr_cl.codec.container import MAGIC
 from potr_cl.codec.decoder import PotrFile, decode, open_file
@@ -17,7 +18,6 @@ from potr_cl.model.scene import Scene
 
 # What reads files, colours and devices is imported where it is needed: to decode takes less time than to import it.
 if TYPE_CHECKING:
-    from potr_cl.api.editing import Edited
     from potr_cl.formats.images import Colour
     from potr_cl.opencl.device import Device
     from potr_cl.opencl.discovery import DeviceInfo
@@ -26,9 +26,23 @@ if TYPE_CHECKING:
     from potr_cl.raster.rules import RasterRules
     from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
 
+
+_log = logging.getLogger("potr_cl")
+
+#: Files of so many bytes are read for seconds.
+_LONG_TO_READ = 1 << 28
+
+
+class HasScene(Protocol):
+    """What a stage or an encode has made."""
+
+    @property
+    def scene(self) -> Scene: ...
+
+
 #: A scene, or what one is taken from: a path of any format that is read, the result of a stage or of an encode, or a
 #: .potr file's bytes.
-SceneSource: TypeAlias = "Scene | str | os.PathLike[str] | Edited | Encoded | bytes"
+SceneSource: TypeAlias = "Scene | str | os.PathLike[str] | HasScene | bytes"
 #: Cameras, or what they are read from.
 CamerasSource: TypeAlias = "Sequence[Camera] | str | os.PathLike[str]"
 #: A colour as numbers from 0 to 1, or as the command line takes it.
@@ -59,6 +73,8 @@ def scene_of(source: SceneSource, trust: bool = False, antialiased: bool | None 
     if isinstance(source, (str, os.PathLike)):
         from potr_cl.formats import load_scene
 
+        if (nbytes := bytes_of_source(source) or 0) >= _LONG_TO_READ:
+            _log.info("reading %s, %.1f GB …", source, nbytes / 1e9)
         return load_scene(source, **_trusting(trust)).rendered(antialiased)
     raise UsageError(f"expected a scene or the path of one, not {type(source).__name__}")
 
@@ -66,7 +82,7 @@ def scene_of(source: SceneSource, trust: bool = False, antialiased: bool | None 
 def _usable(scene: Scene) -> Scene:
     """A scene in memory, which nobody may have cleaned; mended where no splat has to go, so that numbers stay right."""
     if not len(scene):
-        raise DataError("the scene holds no splat")
+        raise DataError("the scene has no splats")
     clean, report = scene.cleaned()
     if report.non_finite:
         many = f"{report.non_finite:,} splats" if report.non_finite > 1 else "a splat"
@@ -235,7 +251,7 @@ def cameras_of(source: CamerasSource | None, virtual_views: int | None = None) -
         raise UsageError("the list of cameras is empty: leave it out, and virtual ones are placed")
     for camera in cameras:
         if not isinstance(camera, Camera):
-            raise UsageError(f"cameras are wanted, or the path of their file, not {type(camera).__name__}")
+            raise UsageError(f"expected cameras or the path of their file, not {type(camera).__name__}")
     return [camera for camera in cameras if isinstance(camera, Camera)]
 
 

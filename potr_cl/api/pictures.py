@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import io
+import logging
 import os
 import re
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, overload
@@ -24,21 +26,25 @@ from potr_cl.api.inputs import (
     colour_of,
     device_of,
     drawable_of,
+    drawable_to_judge,
     rules_of,
     scene_of,
 )
-from potr_cl.api.views import Viewpoints, told
+from potr_cl.api.views import Viewpoints, told, warn_of_frame
 from potr_cl.errors import DataError, DeviceError, UsageError
-from potr_cl.formats.images import to_8_bits, write_png
+from potr_cl.formats.images import Colour, to_8_bits, write_png
 from potr_cl.host.atomic_write import replacing
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
+from potr_cl.opencl.device import Device
 from potr_cl.quality.pictures import Renderer
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import RasterRules
 from potr_cl.report.labels import U8, contact_sheet
 from potr_cl.views.pictures import rasterizer_for
+
+_log = logging.getLogger("potr_cl")
 
 #: Pixels along a side of each of a preview's pictures.
 _PREVIEW = 200
@@ -222,25 +228,102 @@ def render(
             Rasterizer(opened, drawable, wanted, colour) as rasterizer,
         ):
             return Rendering(*rasterizer.render(cameras))
-    given = cameras_of(cameras)
-    if given is not None:
-        points.refuse_with_cameras()
-    # Views are placed in a scene that the host has.
-    source = scene if given is not None else scene_of(scene, trust, antialiased)
-    opened = device_of(device)
-    there = given or points.placed(scene_of(source), opened)
-    note = "" if given else told(there)
-    chosen = chosen_views(there, views, split or (None if views is not None else "all"))
-    paths = picture_files(Path(output), chosen) if output is not None else []
-    with (
-        drawable_of(source, opened, trust, antialiased) as drawable,
-        rasterizer_for(opened, drawable, chosen, wanted, colour) as rasterizer,
-    ):
-        pictures = [Rendering(*rasterizer.render(camera)) for camera in chosen]
-    result = Renderings(chosen, pictures, note)
-    if paths and output is not None:
+    views_of = _Views(scene, cameras, points, views, split, device_of(device), trust, antialiased)
+    if output is not None:
+        picture_files(Path(output), views_of.chosen)  # names that cannot be written are reported before the work
+    with views_of.rasterizer(wanted, colour) as rasterizer:
+        pictures = [Rendering(*rasterizer.render(camera)) for camera in views_of.chosen]
+    result = Renderings(views_of.chosen, pictures, views_of.note)
+    if output is not None:
         result.save(output)
     return result
+
+
+def render_to_files(
+    scene: SceneSource,
+    output: Path,
+    cameras: CamerasSource | None = None,
+    device: DeviceSource = None,
+    rules: RasterRules | str = "inria",
+    background: ColourSource = "black",
+    *,
+    points: Viewpoints,
+    views: Sequence[str | int] | None = None,
+    split: str | None = None,
+    trust: bool = False,
+    antialiased: bool | None = None,
+    check: Callable[[Sequence[Camera], Sequence[Path]], None] = lambda cameras, files: None,
+    progress: Callable[[str, float], None] = lambda stage, done: None,
+) -> str:
+    """The same, but few pictures are in memory at a time; for the command ``render``.
+
+    Args:
+        output: the folder.
+        points: how to look at the scene without cameras.
+        check: called with all cameras and the files that will be written, before any is.
+        progress: called with what is done and the part of it that is done.
+
+    Returns:
+        What was done, in a line.
+    """
+    colour, wanted = colour_of(background), rules_of(rules)
+    of = _Views(scene, cameras, points, views, split, device_of(device), trust, antialiased)
+    if of.note:
+        _log.info("no --cameras given: %s", of.note)
+    files = picture_files(output, of.chosen)
+    check(of.there, files)
+    make_folder(output)
+    stage = f"rendering {len(of.chosen)} view{'s' if len(of.chosen) > 1 else ''}"
+    with of.rasterizer(wanted, colour, warn=cameras is not None) as rasterizer:
+        progress(stage, 0.0)
+        for done, _ in enumerate(written_pictures(rasterizer, of.chosen, files), 1):
+            progress(stage, done / len(of.chosen))
+    return f"{len(of.chosen)} image{'s' if len(of.chosen) > 1 else ''}, rendered on {of.device.info}"
+
+
+class _Views:
+    """A scene and the views that are rendered of it.
+
+    Attributes:
+        there: all views, given or placed.
+        chosen: those that are rendered.
+        note: what views were placed, in a line, if any were.
+    """
+
+    def __init__(
+        self,
+        scene: SceneSource,
+        cameras: CamerasSource | None,
+        points: Viewpoints,
+        views: Sequence[str | int] | str | int | None,
+        split: str | None,
+        device: Device,
+        trust: bool,
+        antialiased: bool | None,
+    ) -> None:
+        given = cameras_of(cameras)
+        if given is not None:
+            points.refuse_with_cameras()
+        self.device, self._trust, self._antialiased = device, trust, antialiased
+        # Views are placed in a scene that the host has.
+        self._source = scene if given is not None else scene_of(scene, trust, antialiased)
+        self.there = given or points.placed(scene_of(self._source), device)
+        self.note = "" if given else told(self.there)
+        self.chosen = chosen_views(self.there, views, split or (None if views is not None else "all"))
+
+    @contextmanager
+    def rasterizer(self, rules: RasterRules, background: Colour, warn: bool = False) -> Iterator[Renderer]:
+        """What renders them, as long as the context lasts; ``warn``: of views that do not fit the scene."""
+        how = self._source, self.device, self._trust, self._antialiased
+        with ExitStack() as stack:
+            if warn:
+                drawable, scene = stack.enter_context(drawable_to_judge(*how))
+                warn_of_frame(self._source, scene, self.chosen)
+            else:
+                drawable = stack.enter_context(drawable_of(*how))
+            rasterizer = rasterizer_for(self.device, drawable, self.chosen, rules, background)
+            stack.callback(rasterizer.close)
+            yield rasterizer
 
 
 def preview(scene: SceneSource) -> bytes | None:

@@ -1,19 +1,34 @@
-"""The views to look at a scene from where a user wants pictures: cameras that are given, or views placed for it."""
+"""The views to look at a scene from: cameras that are given, or views placed for it."""
 
 from __future__ import annotations
 
+import logging
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
-from potr_cl.api.inputs import placed_beside_cameras
+from potr_cl.api.inputs import SceneSource, name_of, placed_beside_cameras
 from potr_cl.errors import UsageError
+from potr_cl.formats.registry import cameras_beside
+from potr_cl.model.agreement import judge_cameras
 from potr_cl.model.camera import Camera, camera_centres, focus
 from potr_cl.model.scene import Scene
+from potr_cl.model.virtual_cameras import describe
 from potr_cl.opencl.device import Device
-from potr_cl.placement.viewpoints import AXES, SIZE, VIEWS, look_around, turntable
-from potr_cl.placement.virtual import judging_views
+from potr_cl.opencl.discovery import DEVICE_VARIABLE as DEVICE_VARIABLE
+from potr_cl.placement.viewpoints import AXES as AXES
+from potr_cl.placement.viewpoints import SIZE as SIZE
+from potr_cl.placement.viewpoints import VIEWS as VIEWS
+from potr_cl.placement.viewpoints import look_around, turntable
+from potr_cl.placement.virtual import judging_views, place_cameras
+from potr_cl.quality.evidence import evidence_of
+from potr_cl.raster.rules import RULES as RULES
+from potr_cl.stages.stage import Progress
+
+_log = logging.getLogger("potr_cl")
 
 
 @dataclass(frozen=True)
@@ -56,7 +71,7 @@ class Viewpoints:
         """(3,) what is up; None for a guess.
 
         Raises:
-            UsageError: the text is no direction.
+            UsageError: the text is not a direction.
         """
         if self.up is None or self.up == "auto":
             return None
@@ -69,7 +84,7 @@ class Viewpoints:
         except ValueError:
             parts = ()
         if len(parts) != 3 or not np.isfinite(parts).all() or not any(parts):
-            raise UsageError(f"'{self.up}' is no direction: give --up={'|'.join(AXES)}, X,Y,Z or auto")
+            raise UsageError(f"'{self.up}' is not a direction: give --up={'|'.join(AXES)}, X,Y,Z or auto")
         return parts
 
     def placed(self, scene: Scene, device: Device | None = None) -> list[Camera]:
@@ -95,6 +110,39 @@ class Viewpoints:
         """
         if self.asked_for:
             raise placed_beside_cameras(self.asked_for[0])
+
+
+def views_or_placed(
+    source: SceneSource,
+    scene: Scene,
+    cameras: Sequence[Camera] | None,
+    count: int | None = None,
+    device: Device | None = None,
+    progress: Progress = lambda what, done: None,
+) -> Sequence[Camera]:
+    """The cameras; or virtual ones for a scene that comes from ``source``, which the log is told."""
+    if cameras is None:
+        progress("place cameras", 0.0)
+        cameras = place_cameras(scene, count, device=device)
+        progress("place cameras", 1.0)
+        log_placed(source, cameras)
+    return cameras
+
+
+def log_placed(source: SceneSource, cameras: Sequence[Camera]) -> None:
+    """Report that virtual cameras stand in for those that a user may have."""
+    folder = cameras_beside(Path(source)) if isinstance(source, (str, os.PathLike)) else None
+    better = "with the real cameras the file would be smaller"
+    better = better if folder is None else f"--cameras beside takes those in '{folder}'"
+    _log.info("no --cameras given: %s; %s", describe(cameras), better)
+
+
+def warn_of_frame(source: SceneSource, scene: Scene, views: Sequence[Camera]) -> None:
+    """Log a warning if views that were given do not seem to be in a scene's frame; where nothing is thrown away."""
+    judged = judge_cameras(scene, views, evidence_of(scene, views))
+    finding = judged.finding if judged.suspicious else judged.doubt
+    if finding is not None:
+        _log.warning("%s: %s", name_of(source), finding)
 
 
 def told(cameras: Sequence[Camera]) -> str:

@@ -25,7 +25,7 @@ COMMANDS = {
     "prune": "edit",
     "compact": "edit",
     "refit": "edit",
-    "fit": "fit",
+    "fit": "edit",
     "decode": "files",
     "info": "files",
     "convert": "convert",

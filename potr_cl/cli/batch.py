@@ -76,7 +76,7 @@ def jobs(args: argparse.Namespace, kind: type[WrittenFile], suffix: str | None) 
         raise UsageError(f"{len(sources)} scenes need a folder, and '{output}' is a file")
     else:
         if to is not None:
-            raise UsageError(f"'{output}' tells its format itself: --to is for folders and standard output")
+            raise UsageError(f"'{output}' already gives the format: --to is for folders and standard output")
         targets = [kind(output)]
         check_file(kind(output))
     if isinstance(output, StandardOutput) and wanted is None:

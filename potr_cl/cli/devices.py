@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
-from potr_cl.cli.options import Commands
 from potr_cl.cli.terminal import say, say_document
 from potr_cl.errors import DeviceError
 from potr_cl.report.devices import device_report, format_devices, works
+
+if TYPE_CHECKING:
+    from potr_cl.cli.options import Commands
 
 
 def _devices(args: argparse.Namespace) -> None:
@@ -20,7 +23,7 @@ def _devices(args: argparse.Namespace) -> None:
     if args.check and not any(entry["chosen"] and works(entry) for entry in report):
         able = [str(entry["index"]) for entry in report if works(entry)]
         advice = f"choose another with --device: {', '.join(able)}" if able else "none works"
-        raise DeviceError(f"the device that would be taken fails the self-check, or there is none: {advice}")
+        raise DeviceError(f"the default device fails the self-check, or there is none: {advice}")
 
 
 def add_devices(commands: Commands) -> None:

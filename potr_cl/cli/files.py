@@ -6,15 +6,13 @@ import argparse
 import time
 from typing import TYPE_CHECKING
 
-from potr_cl.api.files import decode_block_by_block
+from potr_cl.api.files import decode, decode_block_by_block
 from potr_cl.cli.batch import add_batch_options, for_each_scene, jobs
 from potr_cl.cli.guard import StandardOutput, read_file
 from potr_cl.cli.outputs import WrittenScene, place
 from potr_cl.cli.scenes import add_from_option, add_trust_option, as_file, trust, write_scene
 from potr_cl.cli.terminal import say, say_document, say_done
-from potr_cl.codec.decoder import decode
 from potr_cl.formats.registry import suffixes_read, suffixes_written
-from potr_cl.model.box import Box
 from potr_cl.model.scene import SH_COEFFICIENTS
 
 if TYPE_CHECKING:
@@ -34,7 +32,7 @@ def _decode_one(args: argparse.Namespace) -> None:
                 seconds = time.perf_counter() - started
                 say_done(f"{args.output}: {splats:,} splats, decoded and written in {seconds:.2f} s")
                 return
-        scene = decode(file, **trust(args), sh_degree=args.sh_degree, box=args.box and Box.of(args.box))
+        scene = decode(file, args.trust, args.sh_degree, box=args.box)
     decoded = time.perf_counter()
     write_scene(args.output, scene, args.to)
     written = time.perf_counter()

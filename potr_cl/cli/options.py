@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TypeAlias
 
-from potr_cl.opencl.discovery import DEVICE_VARIABLE
-from potr_cl.raster.rules import RULES
+from potr_cl.api.views import DEVICE_VARIABLE, RULES
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 

@@ -70,7 +70,7 @@ def check(args: argparse.Namespace) -> None:
     to = getattr(args, "to", None)
     for name, path in vars(args).items():
         if to is not None and isinstance(path, WrittenScene):
-            raise UsageError(f"'{path}' tells its format itself: --to is for standard output")
+            raise UsageError(f"'{path}' already gives the format: --to is for standard output")
         if isinstance(path, StandardOutput):
             _check_standard_output(args)
         elif isinstance(path, WrittenFolder):

@@ -67,8 +67,8 @@ class CommandParser(argparse.ArgumentParser):
     def _refuse_option(self, name: str) -> NoReturn:
         near = difflib.get_close_matches(name, self._option_string_actions, 1)
         if not near:
-            self.error(f"there is no option '{_shown(name)}'")
-        self.error(f"there is no option '{_shown(name)}': is {_usage(self._option_string_actions[near[0]])} meant?")
+            self.error(f"unknown option '{_shown(name)}'")
+        self.error(f"unknown option '{_shown(name)}': did you mean {_usage(self._option_string_actions[near[0]])}?")
 
     def _get_value(self, action: argparse.Action, arg_string: str) -> Any:
         try:
@@ -86,16 +86,16 @@ class CommandParser(argparse.ArgumentParser):
             choices = [str(each) for each in action.choices or ()]
             near = difflib.get_close_matches(str(value), choices, 1)
             if action is not self._commands:
-                meant = f"; is {near[0]} meant?" if near else ""
+                meant = f"; did you mean {near[0]}?" if near else ""
                 self.error(f"{_name(action)} is '{_shown(value)}', it must be {_one_of(choices)}{meant}")
             elif near:
-                self.error(f"there is no command '{_shown(value)}': is {near[0]} meant?")
+                self.error(f"unknown command '{_shown(value)}': did you mean {near[0]}?")
             elif "." in str(value):
                 self.error(
                     f"'{_shown(value)}' stands where a command should: {_one_of(choices)}; to compress a scene: "
                     f"{self.prog} encode {_shown(value)} -o OUT.potr"
                 )
-            self.error(f"there is no command '{_shown(value)}': it must be {_one_of(choices)}")
+            self.error(f"unknown command '{_shown(value)}': it must be {_one_of(choices)}")
 
     def _match_argument(self, action: argparse.Action, arg_strings_pattern: str) -> int:
         try:

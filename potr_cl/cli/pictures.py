@@ -3,22 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
+from collections.abc import Sequence
 from pathlib import Path
 
-from potr_cl.api.comparing import SceneComparison, coded_for, compare_scenes, named
-from potr_cl.api.inputs import chosen_views
-from potr_cl.api.pictures import make_folder, picture_files, written_pictures
-from potr_cl.api.views import Viewpoints, told
-from potr_cl.cli.guard import (
-    ReadCameras,
-    ReadFile,
-    ReadPhotographs,
-    StandardInput,
-    WrittenFolder,
-    check_files,
-    check_photographs,
-)
+from potr_cl.api.comparing import compare, compare_sizes
+from potr_cl.api.pictures import render_to_files
+from potr_cl.api.views import AXES, SIZE, VIEWS, Viewpoints
+from potr_cl.cli.guard import ReadCameras, ReadFile, ReadPhotographs, WrittenFolder, check_files, check_photographs
 from potr_cl.cli.options import (
     CAMERAS_HELP,
     SEVERAL,
@@ -30,22 +21,11 @@ from potr_cl.cli.options import (
 from potr_cl.cli.outputs import WrittenPicture
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
-from potr_cl.cli.scenes import ANTIALIASED, add_antialiased_option, add_trust_option, read_scene, read_to_draw
+from potr_cl.cli.scenes import ANTIALIASED, add_antialiased_option, add_trust_option
 from potr_cl.cli.terminal import note, say, say_document, say_done
-from potr_cl.cli.views import read_cameras, warn_of_frame
-from potr_cl.errors import UsageError, WriteError
-from potr_cl.formats.images import parse_colour
+from potr_cl.cli.views import read_cameras
 from potr_cl.formats.registry import suffixes_read
-from potr_cl.host.atomic_write import replacing
-from potr_cl.opencl.device import Device
-from potr_cl.opencl.discovery import list_devices
-from potr_cl.outputs.coded_scene import CodedScene
-from potr_cl.placement.viewpoints import AXES, SIZE, VIEWS
-from potr_cl.quality.compare import format_sizes, size_report
-from potr_cl.raster.rules import RULES
-from potr_cl.raster.scene_buffers import Drawable
-from potr_cl.views.pictures import rasterizer_for
-from potr_cl.workers.opening import Workers, open_workers
+from potr_cl.model.camera import Camera
 
 
 def _add_viewpoints(p: argparse.ArgumentParser) -> None:
@@ -79,33 +59,19 @@ def _viewpoints(args: argparse.Namespace) -> Viewpoints:
 
 
 def _render(args: argparse.Namespace) -> None:
-    background = parse_colour(args.background)  # a wrong option is told before anything is read
+    def check(cameras: Sequence[Camera], files: Sequence[Path]) -> None:
+        check_files(args, files)
+        check_photographs(args, cameras, files)
+
     points = _viewpoints(args)
     cameras = None if args.cameras is None else read_cameras(args)
-    scene, device = None, Device(args.device)
-    if cameras is None:
-        scene = read_scene(args, args.scene)
-        cameras = points.placed(scene, device)
-        note(f"no --cameras given: {told(cameras)}")
-    views = chosen_views(cameras, args.views, None if args.views is not None else args.split or "all")
-    written = picture_files(args.output, views)
-    check_files(args, written)
-    check_photographs(args, cameras, written)
-    make_folder(args.output)
-    stage = f"rendering {len(views)} view{'s' if len(views) > 1 else ''}"
-    with contextlib.ExitStack() as stack:
-        if scene is not None:
-            drawable: Drawable = scene
-        else:
-            drawable, judged = stack.enter_context(read_to_draw(args, args.scene, device))
-            warn_of_frame(args.scene, judged, views)
-        rasterizer = rasterizer_for(device, drawable, views, RULES[args.rules], background)
-        stack.callback(rasterizer.close)
-        progress = stack.enter_context(Progress())
-        progress(stage, 0.0)
-        for done, _ in enumerate(written_pictures(rasterizer, views, written), 1):
-            progress(stage, done / len(views))
-    say_done(f"{args.output}: {len(views)} image{'s' if len(views) > 1 else ''}, rendered on {device.info}")
+    with Progress() as progress:
+        done = render_to_files(
+            args.scene, args.output, cameras, args.device, args.rules, args.background, points=points, views=args.views,
+            split=args.split, trust=args.trust, antialiased=ANTIALIASED[args.antialiased], check=check,
+            progress=progress,
+        )  # fmt: skip
+    say_done(f"{args.output}: {done}")
 
 
 def add_render(commands: Commands) -> None:
@@ -124,64 +90,30 @@ def add_render(commands: Commands) -> None:
 
 
 def _compare(args: argparse.Namespace) -> None:
-    background = parse_colour(args.background)
     points = _viewpoints(args)
-    if args.cameras is None and args.truth is not None:
-        raise UsageError("--truth needs --cameras, the views that the photographs show")
     given = [args.views, args.split, args.output, args.device, args.cluster]
     pictures_asked_for = any(each is not None for each in given) or points.asked_for
     cameras = None if args.cameras is None else read_cameras(args)
-    if cameras is None and not pictures_asked_for and not list_devices():
+    read = {"trust": args.trust, "antialiased": ANTIALIASED[args.antialiased]}
+    if cameras is None and args.truth is None and not pictures_asked_for:
         # Sizes need no device, and may be all that is wanted of a machine without one.
-        files = [named(path, read_scene(args, path)) for path in (args.a, args.b)]
-        _tell(args, size_report(*files), format_sizes(*files))
-        note("warning: sizes only: there is no OpenCL device to compare pictures on", "warning")
-        return
-    comparison: SceneComparison | None = None
+        sizes = compare_sizes(args.a, args.b, **read)
+        if sizes is not None:
+            _tell(args, *sizes)
+            note("warning: sizes only: there is no OpenCL device to compare pictures on", "warning")
+            return
+    with Progress() as progress:
+        comparison = compare(
+            args.a, args.b, cameras, truth=args.truth, lpips=args.lpips, views=args.views, split=args.split,
+            virtual_views=args.virtual_views, turntable=args.turntable, up=args.up, size=args.size, device=args.device,
+            cluster=args.cluster, rules=args.rules, background=args.background, progress=progress, **read,
+        )  # fmt: skip
     try:
-        with contextlib.ExitStack() as stack:
-            drawables: list[Drawable] = []
-            coded: list[CodedScene | None] = []
-            if cameras is None:
-                scenes = [read_scene(args, path) for path in (args.a, args.b)]
-                workers = stack.enter_context(open_workers(args.device, args.cluster))
-                cameras = points.judging(scenes[0], workers.device)
-                note(f"no --cameras given: {told(cameras)}. A scene encoded with cameras looks best from those.")
-                drawables += scenes
-                views = chosen_views(cameras, args.views, args.split)
-                coded += [_coded(args, path, workers) for path in (args.a, args.b)]
-            else:
-                views = chosen_views(cameras, args.views, args.split)
-                workers = stack.enter_context(open_workers(args.device, args.cluster))
-                for path in (args.a, args.b):
-                    coded.append(_coded(args, path, workers))
-                    drawable, judged = stack.enter_context(read_to_draw(args, path, workers.device, coded[-1]))
-                    warn_of_frame(path, judged, views)
-                    drawables.append(drawable)
-            a, b = drawables
-            picture = stack.enter_context(replacing(args.output)) if args.output is not None else None
-            progress = stack.enter_context(Progress())
-            comparison = compare_scenes(
-                (named(args.a, a), a), (named(args.b, b), b), views,
-                workers=workers, rules=RULES[args.rules], background=background, truth=args.truth, lpips=args.lpips,
-                progress=progress,
-                coded=coded,
-            )  # fmt: skip
-            if picture is not None:
-                comparison.write_picture(picture)
-    except WriteError:
-        if comparison is not None:  # the figures are not lost with the picture
-            _tell(args, comparison.report(), str(comparison))
-        raise
-    if args.output is not None:
-        comparison.notes.append(f"{args.output}: {comparison.caption}")
-    _tell(args, comparison.report(), str(comparison))
-
-
-def _coded(args: argparse.Namespace, path: Path, workers: Workers) -> CodedScene | None:
-    """The file for other computers, where it may be sent to them as it is."""
-    as_it_says = ANTIALIASED[args.antialiased] is None and not isinstance(path, StandardInput)
-    return coded_for(workers, path, args.trust) if as_it_says else None
+        if args.output is not None:
+            comparison.save(args.output)
+            comparison.notes.append(f"{args.output}: {comparison.caption}")
+    finally:
+        _tell(args, comparison.report(), str(comparison))  # the figures are not lost with the picture
 
 
 def _tell(args: argparse.Namespace, report: dict[str, object], text: str) -> None:

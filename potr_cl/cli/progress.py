@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
-from potr_cl.cli.terminal import is_quiet, is_terminal, note
+from potr_cl.cli.terminal import duration, is_quiet, is_terminal, note
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -73,10 +73,6 @@ class Progress:
             elif stage in self._began and stage not in self._foretold and done >= _ENOUGH:
                 self._foretell(stage, done)
 
-    def tell(self, line: str) -> None:
-        """Print a line of its own."""
-        note(line)
-
     def _tick(self) -> None:
         while not self._closed.wait(1.0):
             with self._lock:
@@ -117,11 +113,3 @@ class Progress:
         if self._bar is not None:
             self._bar.close()
             self._bar = None
-
-
-def duration(seconds: float) -> str:
-    """As roughly as it is known: "40 s", "2.5 min", "3.1 h"."""
-    for unit, name in ((3600, "h"), (60, "min")):
-        if seconds >= 2 * unit:
-            return f"{seconds / unit:.1f} {name}" if seconds < 10 * unit else f"{seconds / unit:.0f} {name}"
-    return f"{max(seconds, 1):.0f} s"

@@ -8,28 +8,18 @@ import os
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from potr_cl.api.inputs import drawable_to_judge
+from potr_cl.api.inputs import scene_of
 from potr_cl.cli.guard import StandardInput, StandardOutput
 from potr_cl.cli.outputs import not_streamed
-from potr_cl.cli.terminal import note
 from potr_cl.errors import UsageError
-from potr_cl.formats import load_scene, scene_writer
+from potr_cl.formats import scene_writer
 from potr_cl.formats.scene_size import bytes_of_scene
 from potr_cl.formats.scenes import spz
 from potr_cl.formats.streams import received, send
 from potr_cl.host.standard_files import closed
 from potr_cl.model.scene import Scene
-
-# What computes on a device is imported where it is needed: other commands do without.
-if TYPE_CHECKING:
-    from potr_cl.opencl.device import Device
-    from potr_cl.outputs.coded_scene import CodedScene
-    from potr_cl.raster.scene_buffers import Drawable
-
-#: Files of so many bytes are read for seconds.
-_LONG_TO_READ = 1 << 28
 
 FROM_HELP = 'format of "-", standard input: .ply, .spz …; default: detected'
 TO_HELP = "output format if the file name does not give it: .ply, .spz …"
@@ -61,8 +51,8 @@ def add_antialiased_option(p: argparse._ActionsContainer) -> None:
     )
 
 
-def add_spz_version_option(p: argparse._ActionsContainer) -> None:
-    """``--spz-version``, for commands that write scenes in formats of other programs."""
+def add_format_options(p: argparse._ActionsContainer) -> None:
+    """What some formats leave to choose, for commands that write scenes in formats of other programs."""
     p.add_argument(
         "--spz-version",
         type=int,
@@ -71,6 +61,13 @@ def add_spz_version_option(p: argparse._ActionsContainer) -> None:
         help=f"of .spz files: {', '.join(f'{version}, {what}' for version, what in spz.VERSIONS.items())}; default "
         f"{spz.FORMAT.versions[0]}",
     )
+    p.add_argument("--title", metavar="TEXT", help="of .html pages: shown on the page")
+    p.add_argument("--author", metavar="TEXT", help="of .html pages: shown on the page")
+
+
+def format_choices(args: argparse.Namespace) -> dict[str, Any]:
+    """What the options of :func:`add_format_options` say, None where they are not given."""
+    return {"version": args.spz_version, "title": args.title, "author": args.author}
 
 
 def trust(args: argparse.Namespace) -> dict[str, Any]:
@@ -85,40 +82,17 @@ def read_scene(args: argparse.Namespace, path: Path) -> Scene:
         As :func:`potr_cl.formats.load_scene`.
     """
     with as_file(path) as file:
-        if (nbytes := bytes_of_scene(file) or 0) >= _LONG_TO_READ:
-            note(f"reading {path}, {nbytes / 1e9:.1f} GB …")
-        return load_scene(file, **trust(args), antialiased=ANTIALIASED[args.antialiased])
+        return scene_of(file, args.trust, ANTIALIASED[args.antialiased])
 
 
-@contextlib.contextmanager
-def read_to_draw(
-    args: argparse.Namespace, path: Path, device: Device, coded: CodedScene | None = None
-) -> Iterator[tuple[Drawable, Scene]]:
-    """The same to be rendered on a device, and a scene on the host by which cameras can be judged.
-
-    Args:
-        args, path: as of :func:`read_scene`.
-        device: to render on.
-        coded: what the file holds, where it has been read.
-
-    Raises:
-        As :func:`potr_cl.api.inputs.drawable_to_judge`.
-    """
-    with (
-        as_file(path) as file,
-        drawable_to_judge(file, device, args.trust, ANTIALIASED[args.antialiased], coded) as found,
-    ):
-        yield found
-
-
-def write_scene(path: Path, scene: Scene, to: str | None = None, version: int | None = None) -> int:
+def write_scene(path: Path, scene: Scene, to: str | None = None, **choices: Any) -> int:
     """Write a scene to a file, in the format that its suffix tells, or to standard output.
 
     Args:
         path: of the file, or standard output.
         scene: to write.
         to: the suffix of the format for standard output; ".ply" by default.
-        version: of the format.
+        choices: of the format, as of :func:`potr_cl.formats.scene_writer`.
 
     Returns:
         The number of bytes, of all files where the format has several.
@@ -128,8 +102,8 @@ def write_scene(path: Path, scene: Scene, to: str | None = None, version: int | 
     """
     if isinstance(path, StandardOutput):
         suffix = to or ".ply"
-        return send(path.stream, suffix, lambda file: scene_writer(file, version)(scene))
-    scene_writer(path, version)(scene)
+        return send(path.stream, suffix, lambda file: scene_writer(file, **choices)(scene))
+    scene_writer(path, **choices)(scene)
     return bytes_of_scene(path) or os.stat(path).st_size
 
 

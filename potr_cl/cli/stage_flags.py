@@ -8,10 +8,9 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
+from potr_cl.api.choices import STAGES, Flag, Stage, default_of, flags
 from potr_cl.cli.guard import ReadPhotographs
 from potr_cl.cli.parser import whole_number
-from potr_cl.pipeline.presets import DEFAULT, PRESETS, stages_of
-from potr_cl.stages.stage import Flag, Stage, flags
 
 #: What the command line takes more exactly than stages do: the folders that they name hold photographs.
 _TYPES: dict[Any, Any] = {Path: ReadPhotographs, int: whole_number}
@@ -26,7 +25,7 @@ def add_stage_flags(
         stages: those of the default preset unless some are given.
         without: fields that a command has no use for.
     """
-    for kind in stages_of(DEFAULT) if stages is None else stages:
+    for kind in STAGES if stages is None else stages:
         group = parser.add_argument_group(kind.title)
         exclusive: dict[str, argparse._MutuallyExclusiveGroup] = {}
         for field, flag in flags(kind).items():
@@ -43,7 +42,7 @@ def add_stage_flags(
 def stage_choices(args: argparse.Namespace, stages: Collection[type[Stage]] | None = None) -> dict[str, dict[str, Any]]:
     """What was chosen of stages, as :meth:`potr_cl.pipeline.options.EncodeOptions.changed` takes it."""
     chosen = {}
-    for kind in stages_of(DEFAULT) if stages is None else stages:
+    for kind in STAGES if stages is None else stages:
         given = {field: getattr(args, _dest(kind, field), None) for field in flags(kind)}
         changes = kind.from_flags({field: value for field, value in given.items() if value is not None})
         if changes:
@@ -73,21 +72,7 @@ def _add(place: argparse._ActionsContainer, kind: type[Stage], field: str, flag:
         settings["metavar"] = flag.metavar
     if flag.many:
         settings["nargs"] = "+"
-    said = flag.default or (_by_preset(kind, field) if default is not None else None)
-    if said:
-        settings["help"] += f"; default: {said}"
+    usual = default_of(kind, field)
+    if usual:
+        settings["help"] += f"; default: {usual}"
     place.add_argument(flag.flag, **settings)
-
-
-def _by_preset(kind: type[Stage], field: str) -> str:
-    """The default that the default preset has, and those of presets that differ from it."""
-    values = {
-        preset: getattr(stage, field) for preset, stages in PRESETS.items() for stage in stages if type(stage) is kind
-    }
-    own = values.get(DEFAULT, getattr(kind, field))
-    others = [f"{preset}: {_plain(value)}" for preset, value in values.items() if value != own]
-    return _plain(own) + (f" ({', '.join(others)})" if others else "")
-
-
-def _plain(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)

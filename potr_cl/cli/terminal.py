@@ -46,7 +46,7 @@ def speak(loudness: Loudness) -> None:
         if isinstance(handler, _Notes):
             logger.removeHandler(handler)
     logger.addHandler(_Notes())
-    logger.setLevel(logging.DEBUG if loudness == "verbose" else logging.INFO)
+    logger.setLevel({"quiet": logging.WARNING, "normal": logging.INFO, "verbose": logging.DEBUG}[loudness])
 
 
 def is_quiet() -> bool:
@@ -147,7 +147,8 @@ class _Notes(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         kinds: dict[int, Kind] = {logging.DEBUG: "detail", logging.INFO: "news"}
-        note(self.format(record), kinds.get(record.levelno, "warning"))
+        kind = kinds.get(record.levelno, "warning")
+        note(f"warning: {self.format(record)}" if kind == "warning" else self.format(record), kind)
 
 
 def _takes_colours(stream: TextIO) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 
 from potr_cl.api.inputs import placed_beside_cameras
@@ -13,14 +12,7 @@ from potr_cl.cli.parser import whole_number
 from potr_cl.cli.terminal import note
 from potr_cl.formats import load_cameras
 from potr_cl.formats.registry import cameras_beside
-from potr_cl.model.agreement import judge_cameras
 from potr_cl.model.camera import Camera
-from potr_cl.model.scene import Scene
-from potr_cl.model.virtual_cameras import describe
-from potr_cl.opencl.device import Device
-from potr_cl.placement.virtual import place_cameras
-from potr_cl.quality.evidence import evidence_of
-from potr_cl.stages.stage import Progress
 
 #: What ``--cameras`` takes in the place of a path.
 BESIDE = "beside"
@@ -67,6 +59,7 @@ def given_cameras(args: argparse.Namespace) -> list[Camera] | None:
         return read_cameras(args)
     folder = None if isinstance(args.scene, StandardInput) else cameras_beside(args.scene)
     if folder is None:
+        note(f"no cameras beside '{args.scene}'", "warning")
         return None
     found = argparse.Namespace(**{**vars(args), "cameras": ReadCameras(folder)})
     cameras = read_cameras(found)
@@ -82,29 +75,4 @@ def read_cameras(args: argparse.Namespace) -> list[Camera]:
     """
     cameras = load_cameras(args.cameras)
     check_photographs(args, cameras)
-    return cameras
-
-
-def warn_of_frame(path: Path, scene: Scene, views: Sequence[Camera]) -> None:
-    """Say so if the views of a file do not seem to be in a scene's frame; for commands that throw nothing away."""
-    judged = judge_cameras(scene, views, evidence_of(scene, views))
-    said = judged.finding if judged.suspicious else judged.doubt
-    if said is not None:
-        note(f"warning: {path}: {said}", "warning")
-
-
-def virtual_cameras(args: argparse.Namespace, scene: Scene, progress: Progress, device: Device) -> list[Camera]:
-    """Virtual cameras, and a line that says so."""
-    progress("place cameras", 0.0)
-    cameras = place_cameras(scene, args.virtual_views, device=device)
-    progress("place cameras", 1.0)
-    scene_file = getattr(args, "scene", None)
-    folder = None if scene_file is None or isinstance(scene_file, StandardInput) else cameras_beside(scene_file)
-    better = (
-        f"--cameras beside takes those in '{folder}'" if folder else "with the real cameras the file would be smaller"
-    )
-    if getattr(args, "cameras", None) is not None:  # "beside", where there are none
-        note(f"no cameras beside '{scene_file}': {describe(cameras)}; {better}", "warning")
-    else:
-        note(f"no --cameras given: {describe(cameras)}; {better}")
     return cameras

@@ -310,7 +310,7 @@ def read_header(data: bytes | memoryview, file_bytes: int, trust: bool = False) 
     if flags not in OF_FLAGS or quantiser not in QUANTISERS or reserved:
         raise DataError(f"a file with flags {flags} and quantiser {quantiser} is unknown: update potr_cl")
     if degree >= len(SH_COEFFICIENTS) or count < 1 or own > MOST_SECTIONS:
-        raise DataError(f"the header makes no sense: {count} blocks, SH degree {degree}")
+        raise DataError(f"invalid header: {count} blocks, SH degree {degree}")
     if not trust:  # before a long table is looked at
         _check_number(count, FREE_SPLATS + MOST_A_BYTE * file_bytes, f"a file of {file_bytes} bytes")
     table = _Table(data, _FIXED.size, size - _CRC.size, size, file_bytes)
@@ -381,7 +381,7 @@ class _Table:
         for _ in range(count):
             name, stored, raw, crc = self._next(_ENTRY)
             if not _NAME.fullmatch(name):
-                raise DataError(f"{where} has a section whose name is no name: get the file again")
+                raise DataError(f"{where} has a section with an invalid name: get the file again")
             section = Section(name.decode(), stored, raw, crc, self._offset - start)
             what = f"section '{section.title}'"
             if section.kind in known:
@@ -406,15 +406,15 @@ class _Table:
         if coder not in tuple(Coder) or (coder == Coder.BUNDLES and not alike.rules.colour_steps):
             raise DataError(f"{what} is of coder {coder}, which is unknown: update potr_cl")
         if not 1 <= splats <= MOST_SPLATS or depth > MOST_LEVELS or count > MOST_SECTIONS:
-            raise DataError(f"{what} makes no sense: {splats} splats, octree of {depth} levels, {count} sections")
+            raise DataError(f"{what} is invalid: {splats} splats, octree of {depth} levels, {count} sections")
         if not all(map(math.isfinite, corners)) or any(a > b for a, b in zip(corners, corners[3:], strict=False)):
-            raise DataError(f"{what} makes no sense: its box is {corners}")
+            raise DataError(f"{what} is invalid: its box is {corners}")
         if not all(map(math.isfinite, origin)) or not 0 <= side <= 2 * _LARGEST_FLOAT32:
-            raise DataError(f"{what} makes no sense: its root cube is not finite")
+            raise DataError(f"{what} is invalid: its root cube is not finite")
         if not all(np.float32(1e-3) <= x <= 1e9 for x in factors):
-            raise DataError(f"{what} makes no sense: a scale factor outside 0.001 to 1e9")
+            raise DataError(f"{what} is invalid: a scale factor outside 0.001 to 1e9")
         if not 0 <= error < math.inf or (before is not None and not 0 <= before.level - level <= 1):
-            raise DataError(f"{what} makes no sense: level {level}, error {error}")
+            raise DataError(f"{what} is invalid: level {level}, error {error}")
         offset, known = self._offset, [prop for prop in ORDER if (prop.degree or 0) <= alike.sh_degree]
         sections = self.sections(count, known, what)
         first = before.first + before.splats if before is not None and before.level == level else 0

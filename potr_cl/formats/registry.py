@@ -94,7 +94,7 @@ def format_of(path: Path) -> SceneFormat:
     if os.path.isdir(path):
         inside = _scene_in(path)
         found = f"; give the file in it: '{inside}'" if inside is not None else ""
-        raise UsageError(f"the folder '{path}' holds no scene that can be read as a folder: it has no {names}{found}")
+        raise UsageError(f"the folder '{path}' has no scene that can be read as a folder: it has no {names}{found}")
     raise UsageError(f"'{path}': unknown kind of scene, expected a {suffixes_read()} file, or a folder with {names}")
 
 

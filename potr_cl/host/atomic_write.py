@@ -80,7 +80,7 @@ def check_place(path: str | os.PathLike[str]) -> None:
 def _no_folder(folder: Path) -> str:
     """Why no file can be in what is no folder."""
     if os.path.lexists(folder):
-        return f"'{folder}' is no folder"
+        return f"'{folder}' is not a folder"
     home = "; '~' is not expanded here: write the home folder out" if "~" in folder.parts else ""
     return f"the folder '{folder}' does not exist{home}"
 

@@ -93,7 +93,7 @@ class Lens:
     def __post_init__(self) -> None:
         coefficients = (*self.radial, *self.quotient, *self.tangential, *self.prism)
         if not all(abs(value) <= _LARGEST_COEFFICIENT for value in coefficients):
-            raise DataError(f"lens distortion with a coefficient beyond {_LARGEST_COEFFICIENT:g} is no lens's")
+            raise DataError(f"no lens has a distortion coefficient beyond {_LARGEST_COEFFICIENT:g}")
         intrinsics = (self.fx, self.fy, self.cx, self.cy)
         if not all(map(math.isfinite, intrinsics)) or min(self.fx / self.width, self.fy / self.height) < _SHORTEST:
             raise DataError(f"intrinsics (fx, fy, cx, cy) = {intrinsics} are not a camera's")

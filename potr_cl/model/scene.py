@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NoReturn
@@ -184,39 +183,6 @@ class Scene:
         box = " x ".join(f"[{a:.3g}, {b:.3g}]" for a, b in zip(low, high, strict=True))
         return f"Scene({len(self):,} splats, SH degree {self.sh_degree}, {box}, {self.nbytes / 1e6:.1f} MB)"
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the scene in the format that the suffixes of ``path`` tell, as :func:`potr_cl.save` does.
-
-        Raises:
-            As :func:`potr_cl.save`.
-        """
-        # Arrays know nothing of files: which formats there are the package knows, and is asked when it is needed.
-        import potr_cl
-
-        potr_cl.save(self, path)
-
-    def show(self, **choices: Any) -> Any:
-        """Show the scene in the browser, in a notebook below the cell, as :func:`potr_cl.view` does.
-
-        Args:
-            choices: keywords of :func:`potr_cl.view`.
-
-        Returns:
-            A :class:`potr_cl.viewer.server.Viewer`.
-
-        Raises:
-            As :func:`potr_cl.view`.
-        """
-        import potr_cl
-
-        return potr_cl.view(self, **choices)
-
-    def _repr_png_(self) -> bytes | None:
-        """For notebooks: the scene from four sides, or nothing where no device renders it."""
-        import potr_cl
-
-        return potr_cl.preview(self)
-
     def uncoloured(self) -> Scene:
         """The same splats, all black, for those who do not look at colours: black takes no memory."""
         return dataclasses.replace(self, sh=np.broadcast_to(np.float32(0), (len(self), 1, 3)))
@@ -340,7 +306,7 @@ class Scene:
         dropped = len(self) - int(np.count_nonzero(finite))
         scene = self.subset(finite) if dropped else self
         if len(scene) == 0:
-            raise DataError("the scene holds no splat with finite values: nothing to do")
+            raise DataError("the scene has no splat with finite values: nothing to do")
         zero = np.empty(len(scene), bool)
 
         def measure(start: int, stop: int) -> None:

@@ -46,4 +46,4 @@ def size_in_bytes(text: str) -> int:
                 raise UsageError(f"'{text.strip()}' would be {size:g} bytes: give a unit, as in {match[1]}MB")
             if size <= _MOST_BYTES:
                 return int(size)
-    raise UsageError(f"'{text[:40]}' is no size: give bytes, or a number with k, MB, GB, KiB, MiB or GiB")
+    raise UsageError(f"'{text[:40]}' is not a size: give bytes, or a number with k, MB, GB, KiB, MiB or GiB")

@@ -103,8 +103,10 @@ def cameras_or_virtual(
     watch: Stopwatch,
     in_frame: bool = False,
     device: Device | None = None,
+    count: int | None = None,
 ) -> Sequence[Camera] | None:
-    """The cameras; or virtual ones, if there are none and a stage needs views.
+    """The cameras; or virtual ones (``count``, or as many as the scene asks for), if there are none and a stage needs
+    views.
 
     Where a stage fits to photographs, views with a lens look at no more than theirs show.
 
@@ -115,7 +117,7 @@ def cameras_or_virtual(
     if cameras is None and options.look_at_views(scene):
         watch("place cameras", 0.0)
         cameras, _ = on_device(
-            device or Device(), options.memory, lambda opened, _: place_cameras(scene, device=opened)
+            device or Device(), options.memory, lambda opened, _: place_cameras(scene, count, device=opened)
         )
         watch("place cameras", 1.0)
     if cameras is not None and any(getattr(stage, "ground_truth", None) is not None for stage in options.stages):

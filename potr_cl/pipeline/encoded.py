@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +50,7 @@ class Encoded:
         parameters: the hyper-parameters that the stages took.
         shared: who did the work, where views were shared out.
         left_out: how many of the scene's SH degrees, the highest ones, the file's format has left out.
+        report: of :func:`potr_cl.encode`, ready for JSON; printed, it is what the command ``encode`` prints.
     """
 
     pieces: list[bytes]
@@ -67,6 +69,7 @@ class Encoded:
     parameters: HyperParameters
     shared: SharedOut | None = None
     left_out: int = 0
+    report: dict[str, Any] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         q = f"q {self.options.q:.4g} of preset {self.options.preset}"

@@ -1,13 +1,17 @@
 """What memory an encode will take, before it begins (:func:`memory_needed`): what its stages keep, added up.
 
+:func:`log_forecast` reports it, with the device that does the work.
+
 How long it takes is not foretold: the first part of each stage says that (:mod:`potr_cl.cli.progress`).
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 
-from potr_cl.model.camera import Camera
+from potr_cl.errors import DeviceError
+from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
@@ -23,11 +27,45 @@ from potr_cl.stages.views_between import Between
 from potr_cl.views.budget import default_memory
 from potr_cl.views.visibility import LEAST_SPLATS
 
+_log = logging.getLogger("potr_cl")
+
+#: Splats times views from which on the work may take long enough to be worth a forecast.
+_LONG = 2_000_000
 #: Bytes of the process with its libraries; a splat, on the host and on the device; and what is kept of views and
 #: besides, as a multiple of what a view's own buffers take.
 _PROCESS, _HOST_SPLAT, _DEVICE_SPLAT, _VIEWS = 180e6, 1550, 154, 1.02
 #: Bytes of a pixel of the picture that a view is to have; and of what is measured of an intersection, on CPUs.
 _PIXEL, _SUM = 12, 8
+
+
+def log_forecast(
+    device: Device, scene: Scene, cameras: Sequence[Camera], options: EncodeOptions, kept: KeptScene | None = None
+) -> None:
+    """Report the device and its kernels; and where the work may take long, roughly its memory.
+
+    Args:
+        cameras: of which the training views are looked at.
+        device, scene, options, kept: as of :func:`memory_needed`.
+
+    Raises:
+        UsageError: there is no training view.
+    """
+    views = train_views(cameras)
+    if not _log.isEnabledFor(logging.INFO):
+        return
+    _log.debug("driver: %s, %s", device.info.platform, device.info.version)
+    width, height = max((view.width, view.height) for view in views)
+    work = f"{len(scene):,} splats, {len(views)} views of {width} x {height}"
+    # At once: to measure takes seconds.
+    _log.info("on %s, kernels for %ss: %s", device.info, device.family.upper(), work)
+    if len(scene) * len(views) >= _LONG:
+        try:
+            memory = memory_needed(scene, views, options, device, kept)
+        except DeviceError as error:
+            _log.debug("no forecast: %s", error)  # the encode goes on with less memory, or elsewhere
+        else:
+            size = f"{memory / 1e9:.1f} GB" if memory >= 1e9 else f"{max(memory / 1e6, 1):.0f} MB"
+            _log.info("about %s of memory%s", size, "" if device.info.kind == "cpu" else " of the device")
 
 
 def memory_needed(

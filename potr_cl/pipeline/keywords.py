@@ -69,7 +69,7 @@ def stage_changes(
         else:
             near = difflib.get_close_matches(name, [*known, *by_name], 1)
             hint = f": did you mean '{near[0]}'?" if near else f": there are {', '.join(sorted(known))}"
-            raise UsageError(f"there is no option '{name}'{hint}")
+            raise UsageError(f"unknown option '{name}'{hint}")
     changes = {kind.name: kind.from_flags(values) for kind, values in given.items()}
     for name, values in more.items():
         changes[name] = {**changes.get(name, {}), **values}
@@ -95,7 +95,7 @@ def _value(kind: type[Stage], field: str, flag: Flag, name: str, value: Any) -> 
         try:
             return field, flag.kind(value)
         except ValueError:
-            raise UsageError(f"{name} is {value!r}: that is no value for it") from None
+            raise UsageError(f"{name} is {value!r}: invalid value") from None
     if isinstance(value, np.generic):
         value = value.item()  # NumPy has numbers of its own, which JSON does not know
     if flag.kind is int and isinstance(value, float):

@@ -103,7 +103,7 @@ class EncodeOptions:
             elif having_it := [preset for preset, table in PRESETS.items() if name in {each.name for each in table}]:
                 raise UsageError(f"preset '{self.preset}' has no stage '{name}': it is in {', '.join(having_it)}")
             else:
-                raise UsageError(f"there is no option '{name}': there are {', '.join(sorted(fields | stages.keys()))}")
+                raise UsageError(f"unknown option '{name}': there are {', '.join(sorted(fields | stages.keys()))}")
         return dataclasses.replace(self, **{"stages": tuple(stages.values()), **own})
 
     def stage(self, kind: type[S]) -> S:

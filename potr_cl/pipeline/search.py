@@ -216,8 +216,8 @@ class _Search(AbstractContextManager["_Search"]):
             if q in self._encoded:
                 break
         if best is None:
-            hint = "; --unseen drop gives up what no view shows well, too" if is_virtual(self._views) else ""
-            raise UnreachableError(f"{target} cannot be reached: {self._extremes()}{hint}")
+            hint = "; --unseen drop also removes what no view shows well" if is_virtual(self._views) else ""
+            raise UnreachableError(f"cannot reach {target}: {self._extremes()}{hint}")
         encoded = best.encoded or self._code(best.reduced, best.options)
         return Found(encoded, best.options, best.value, self._tries)
 

@@ -11,7 +11,7 @@ from potr_cl.pipeline.options import EncodeOptions
 
 #: The kinds of tries (:class:`Try`), and what is said of each; to be followed by a value.
 KINDS = {
-    "scout": "quality {}, roughly:",
+    "scout": "trying quality {}:",
     "encode": "quality {}:",
     "refit": "re-fitted for quality {}:",
     "steps": "steps of quality {}:",

@@ -38,7 +38,9 @@ def read_photograph(path: Path, camera: Camera, background: Colour = (0.0, 0.0, 
     if camera.lens is None:
         return photograph
     if photograph.shape[:2] != (camera.lens.height, camera.lens.width):
-        raise DataError(f"'{path}' has not the size of its camera, {camera.lens.width} x {camera.lens.height} pixels")
+        raise DataError(
+            f"'{path}' does not have the size of its camera, {camera.lens.width} x {camera.lens.height} pixels"
+        )
     view = Pinhole(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
     if not _fills(camera.lens, view):
         raise DataError(f"camera '{camera.name}' looks at more than its photograph shows: give within_photographs")

@@ -12,8 +12,6 @@ from typing import Any
 from potr_cl import __version__
 from potr_cl.model.scene import Scene
 from potr_cl.pipeline.encoded import Encoded
-from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.pipeline.proof import Proved
 from potr_cl.pipeline.target import Found, Target
 from potr_cl.plain_text import plain_document
 from potr_cl.quality.compare import Comparison, mean_view
@@ -29,35 +27,40 @@ _FEW = 8
 _PACKAGES = ("numpy", "pyopencl", "zstandard")
 
 
+class EncodeReport(dict[str, Any]):
+    """The facts of an encode; printed, they are lines for people."""
+
+    def __str__(self) -> str:
+        return format_encode_report(self)
+
+
 def encode_report(
     source: Path,
     scene: Scene,
     target: Path,
-    file: Proved,
     encoded: Encoded,
-    options: EncodeOptions,
+    source_bytes: int | None,
     search: dict[str, Any] | None,
     quality: dict[str, Any] | str,
     seconds: dict[str, float],
     photographs: dict[str, Any] | None = None,
     command: str | None = None,
-) -> dict[str, Any]:
+) -> EncodeReport:
     """The facts of an encode, ready for JSON.
 
     Args:
         source, target: paths of the uncompressed and the compressed file.
         scene: the uncompressed scene.
-        file: what was written to ``target``, and what its readers see.
-        encoded: how it came about.
-        options: that it was encoded with; they know the size of ``source``. Of a scene that comes from no file, the
-            bytes of its arrays stand for it.
-        search: of :func:`search_report`, where ``options`` were found by a search.
+        encoded: the file, and how it came about.
+        source_bytes: size of ``source``; None: it comes from no file, and the bytes of its arrays stand for it.
+        search: of :func:`search_report`, where the options were found by a search.
         quality: of :func:`quality_report`, or why it was not judged.
         seconds: wall time by stage, in order; "total" last.
         photographs: of :func:`photographs_report`, where photographs were fitted to.
         command: the command line, where there was one.
     """
-    source_bytes = scene.nbytes if options.source_bytes is None else options.source_bytes
+    source_bytes = scene.nbytes if source_bytes is None else source_bytes
+    nbytes, splats, options = encoded.nbytes, len(encoded.order), encoded.options
     report: dict[str, Any] = {
         "source": {
             "file": str(source),
@@ -67,11 +70,11 @@ def encode_report(
             "antialiased": scene.antialiased,
         },
         "file": str(target),
-        "bytes": len(file.data),
-        "ratio": source_bytes / len(file.data),
-        "splats": len(file.scene),
-        "bytes_a_splat": len(file.data) / len(file.scene),
-        "properties": options.output.properties(file.data),
+        "bytes": nbytes,
+        "ratio": source_bytes / nbytes,
+        "splats": splats,
+        "bytes_a_splat": nbytes / splats,
+        "properties": options.output.properties(encoded.data),
         "quality": quality,
         "photographs": photographs,
         "pruning": None,
@@ -104,8 +107,7 @@ def encode_report(
     if encoded.device is not None:
         info = encoded.device.info
         report["device"] = {"name": info.name, "platform": info.platform, "version": info.version}
-    shown: dict[str, Any] = plain_document(report)
-    return shown
+    return EncodeReport(plain_document(report))
 
 
 def search_report(target: Target, found: Found) -> dict[str, Any]:
@@ -155,7 +157,7 @@ def _training(judged: float | None, training: float, views: int) -> dict[str, An
     if judged is not None and training > judged + _APART:
         how = f"{training - judged:.1f} dB worse than training views" if math.isfinite(training) else "worse"
         said = (
-            f"the held-out views are matched {how}: they show much that the training views do not, or from elsewhere; "
+            f"the held-out views are matched {how}: they show parts or directions that the training views do not; "
             "give more cameras, or --views-between 3"
         )
     return {"psnr": training if math.isfinite(training) else None, "views": views, "said": said}
@@ -225,7 +227,7 @@ def format_encode_report(report: dict[str, Any]) -> str:
             if shown_by is not None and shown_by < _FEW:
                 lines.append(
                     f"           a quarter of the scene is shown by no more than {shown_by:.0f} of them: "
-                    "from elsewhere it may be matched far worse"
+                    "from other directions it may match far worse"
                 )
     if report.get("fit") is not None:
         lines.append(f"fit        {report['fit']['said']}")

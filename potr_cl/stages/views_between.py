@@ -47,8 +47,8 @@ class Added:
     shown_by: float | None = None
 
     def __str__(self) -> str:
-        count = f"{self.added} view{'' if self.added == 1 else 's'}" if self.added else "no view"
-        return f"{count} between the {self.given} training views {'were' if self.added > 1 else 'was'} looked at, too"
+        views = "view" if self.added == 1 else "views"
+        return f"{self.added or 'no'} extra {views} between the {self.given} training views"
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ CALLS = {
 def test_a_scene_in_memory_that_nobody_has_cleaned(call, plush_excerpt, plush_excerpt_cameras, tmp_path):
     with pytest.raises(DataError, match=r"holds a splat with non-finite values: give scene.cleaned\(\)\[0\]"):
         CALLS[call](with_a_nan(plush_excerpt), plush_excerpt_cameras, tmp_path)
-    with pytest.raises(DataError, match="the scene holds no splat"):
+    with pytest.raises(DataError, match="the scene has no splats"):
         CALLS[call](plush_excerpt.subset(np.zeros(0, int)), plush_excerpt_cameras, tmp_path)
 
 
@@ -94,7 +94,7 @@ def test_one_camera_stands_for_a_list_of_one(plush_excerpt, plush_excerpt_camera
 
 @pytest.mark.parametrize("cameras", [[np.eye(4)], 3, {"a": 1}])
 def test_cameras_that_are_none(cameras, plush_excerpt):
-    with pytest.raises(UsageError, match="cameras are wanted, or the path of their file, not"):
+    with pytest.raises(UsageError, match="expected cameras or the path of their file, not"):
         potr_cl.encode(plush_excerpt, cameras, **QUICK)
 
 

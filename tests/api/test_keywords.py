@@ -22,13 +22,13 @@ import pytest
 
 import potr_cl
 from potr_cl import Camera, Scene, cli
-from potr_cl.api.encoding import encode_options
+from potr_cl.api.choices import EncodeChoices, encode_options
+from potr_cl.api.editing import EditChoices, _CompactKeywords, _PruneKeywords
 from potr_cl.cli import command_parser
 from potr_cl.host import signals
 from potr_cl.model.virtual_cameras import PREFIX
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import list_devices
-from potr_cl.pipeline.keywords import stage_keywords
 from potr_cl.pipeline.run import Run
 from potr_cl.stages.stage import State
 from tests.reference.scenes import ring_of_cameras
@@ -47,7 +47,7 @@ COMMAND_LINE_ONLY = {
     "--skip-existing": "for folders of scenes",
     "--ladder": "encode_ladder makes several files, encode one",
     "--cluster": "a keyword too; tests/workers/test_cluster.py compares them, with a cluster",
-    "--no-quality": "nothing is judged unless a report is asked for: compare() judges",
+    "--no-quality": "judge=False, which is the default in Python unless there is a report",
 }
 #: Of each option what is typed, and the same in Python; {name} stands for a path of the test's files. What has the
 #: command's name in front is for that command alone.
@@ -103,6 +103,8 @@ VALUES: dict[str, tuple[list[str], Any]] = {
     "--sh-degree": (["1"], 1),
     "--box": (["-100", "-100", "2.7", "100", "100", "100"], [-100, -100, 2.7, 100, 100, 100]),
     "--spz-version": (["3"], 3),
+    "--title": (["A title"], "A title"),
+    "--author": (["Somebody"], "Somebody"),
     "--cameras-anyway": ([], True),
     "--unseen": (["drop"], "drop"),
     "--views-between": (["1"], 1),
@@ -142,11 +144,12 @@ CASES = [(command, flag) for command, flag in CASES if flag not in COMMAND_LINE_
 
 
 def keywords_of(command: str) -> set[str]:
-    """Those in the function's own signature, and those of stages where it takes any."""
+    """Those in the function's own signature, and those that stand for ``**choices``."""
     signature = inspect.signature(getattr(potr_cl, command)).parameters
     own = {name for name, each in signature.items() if each.kind is not inspect.Parameter.VAR_KEYWORD}
-    takes_more = any(each.kind is inspect.Parameter.VAR_KEYWORD for each in signature.values())
-    return own | (set(stage_keywords()) if takes_more else set())
+    more = {"Unpack[EncodeChoices]": EncodeChoices, "Unpack[EditChoices]": EditChoices,
+            "Unpack[_PruneKeywords]": _PruneKeywords, "Unpack[_CompactKeywords]": _CompactKeywords}  # fmt: skip
+    return own.union(*(more[each.annotation].__annotations__ for each in signature.values() if each.name not in own))
 
 
 def keyword(command: str, flag: str) -> str:
@@ -183,9 +186,9 @@ def files(tmp_path_factory, data) -> dict[str, Path]:
     cameras.write_text(json.dumps(few))
     scene = potr_cl.read_scene(data / "plush_excerpt.ply")
     scene = scene.subset(np.arange(0, len(scene), 5))
-    scene.save(folder / "scene.ply")
+    potr_cl.save(scene, folder / "scene.ply")
     reduced = scene.subset(np.arange(0, len(scene), 2))
-    reduced.save(folder / "reduced.ply")
+    potr_cl.save(reduced, folder / "reduced.ply")
     potr_cl.encode(scene, prune=False, refit=False, compact=False, q=0.3, output=folder / "scene.potr")
     potr_cl.render(folder / "reduced.ply", cameras, output=folder / "photos")
     chosen = Device().info
@@ -244,17 +247,17 @@ def nothing_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(Run, "stages", stages)
     monkeypatch.setattr(Device, "prepare_for", prepare_for)
-    for module in ("api.encoding", "cli.views"):
+    for module in ("pipeline.encode", "api.views"):
         monkeypatch.setattr(f"potr_cl.{module}.place_cameras", placed)
     for name in ("turntable", "look_around"):
         monkeypatch.setattr(f"potr_cl.api.views.{name}", lambda *given: asked(given[-1], *given[:-1]))
-    for module, name in (("editing", "refit_colours"), ("fitting", "fit_scene")):
-        monkeypatch.setattr(f"potr_cl.api.{module}.{name}", asked)
-        monkeypatch.setattr(
-            f"potr_cl.api.{module}.Rasterizer",
-            lambda device, scene, **how: contextlib.nullcontext((scene, list(how.items()))),
-        )
-        monkeypatch.setattr(f"potr_cl.api.{module}.RenderedTargets", lambda *given: given)
+    for name in ("refit_colours", "fit_scene"):
+        monkeypatch.setattr(f"potr_cl.api.editing.{name}", asked)
+    monkeypatch.setattr(
+        "potr_cl.api.editing.Rasterizer",
+        lambda device, scene, **how: contextlib.nullcontext((scene, list(how.items()))),
+    )
+    monkeypatch.setattr("potr_cl.api.editing.RenderedTargets", lambda *given: given)
     monkeypatch.setattr(
         "potr_cl.api.editing.PhotographTargets", lambda device, truth, views: [truth.picture(view) for view in views]
     )
@@ -294,6 +297,7 @@ def called(command: str, flags: list[str], files: dict[str, Path], folder: Path,
         here.mkdir(parents=True)
         suffix = {"encode": ".potr", "render": "", "compare": ".png"}.get(command, ".ply")
         suffix = ".spz" if "--spz-version" in flags else suffix
+        suffix = ".html" if {"--title", "--author"} & {*flags} else suffix
         names = {**files, "output": here / f"out{suffix}", "report": here / "page.html", "order": here / "order.npy"}
         paths = {name: str(path) for name, path in names.items()}
         sources = {"decode": ["potr"], "refit": ["reduced"], "fit": ["reduced"], "compare": ["scene", "reduced"]}.get(
@@ -393,7 +397,7 @@ def test_choices_of_stages_by_name() -> None:
     ("choices", "said"),
     [
         ({"iteration": 3}, "did you mean 'iterations'"),
-        ({"xyzzy": 3}, "there is no option 'xyzzy'"),
+        ({"xyzzy": 3}, "unknown option 'xyzzy'"),
         ({"entropy": "gzip"}, "choose one of"),
         ({"one_pass": 1}, "True or False"),
         ({"keep": "half"}, "no value"),

@@ -16,12 +16,15 @@ from tests.api.test_keywords import files  # noqa: F401  (a fixture: a small sce
 pytestmark = pytest.mark.one_runtime
 
 
-def test_a_ladder_has_the_files_of_plain_encodes(files, tmp_path, capsys):  # noqa: F811
-    told: list[str] = []
+def test_a_ladder_has_the_files_of_plain_encodes(files, tmp_path, capsys, caplog):  # noqa: F811
+    caplog.set_level("INFO", "potr_cl")
     ladder = potr_cl.encode_ladder(
-        files["scene"], tmp_path / "new" / "ladder", "0.8,0.2", files["cameras"], preset="fast", tell=told.append
+        files["scene"], tmp_path / "new" / "ladder", "0.8,0.2", files["cameras"], preset="fast"
     )
-    assert len(told) == 2
+    assert [message for message in caplog.messages if "_q0." in message] == [
+        f"{ladder.file(rung)}: q {rung.q:g}, {rung.bytes:,} bytes, {rung.splats:,} splats, {rung.psnr:.2f} dB"
+        for rung in ladder.rungs
+    ]
     assert ladder == read_ladder(ladder.path)
     assert ladder.scene == "scene.ply"
     assert ladder.scene_bytes == files["scene"].stat().st_size

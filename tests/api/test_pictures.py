@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +20,7 @@ from potr_cl.raster.rasterizer import Rasterizer
 from tests.reference.scenes import random_scene, ring_of_cameras
 
 CAMERAS = ring_of_cameras(12)
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
@@ -77,3 +81,15 @@ def test_a_picture_that_cannot_be_written_is_told(rasterizer, tmp_path):
 def test_names_of_views_as_names_of_files(view, elsewhere, windows):
     assert pictures.file_name(view, windows=False) == elsewhere
     assert pictures.file_name(view, windows=True) == windows
+
+
+def test_a_notebook_shows_a_scene_as_a_picture():
+    """Arrays know nothing of rendering: the package tells the notebook, when it is imported there."""
+    pytest.importorskip("IPython")
+    program = (
+        "from IPython.core.interactiveshell import InteractiveShell; shell = InteractiveShell.instance();"
+        "shell.run_cell('import potr_cl; from tests.reference.scenes import random_scene; scene = random_scene(50)');"
+        "shown, _ = shell.display_formatter.format(shell.user_ns['scene']); print(shown['image/png'][:4])"
+    )
+    said = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True, cwd=ROOT)
+    assert said.stdout.strip() == repr(b"\x89PNG")

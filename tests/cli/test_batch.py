@@ -74,7 +74,7 @@ def test_a_mistake_of_the_program_does_not_lose_the_others(
 ) -> None:
     read = load_scene
     monkeypatch.setattr(
-        "potr_cl.cli.scenes.load_scene", lambda path, **more: 1 / 0 if path.name == "a.ply" else read(path, **more)
+        "potr_cl.formats.load_scene", lambda path, **more: 1 / 0 if path.name == "a.ply" else read(path, **more)
     )
     assert cli.main(["convert", "a.ply", "b.ply", "-o", "small", "--to", "spz"]) == 1
     assert "'a.ply': unforeseen ZeroDivisionError" in capsys.readouterr().err
@@ -91,7 +91,7 @@ def test_one_device_is_opened_once(
         opened.append(open_workers(device, cluster))
         return opened[-1]
 
-    monkeypatch.setattr("potr_cl.cli.encode.open_workers", opening)
+    monkeypatch.setattr("potr_cl.api.encoder.open_workers", opening)
     call = ["encode", "a.ply", "b.ply", "c.ply", "-o", "small", "--preset", "fast", "--virtual-views", "8"]
     assert cli.main(call) == 0
     assert len(opened) == 1
@@ -176,7 +176,7 @@ def test_an_interrupted_batch_says_how_to_go_on(
             raise KeyboardInterrupt
         return read(path, **more)
 
-    monkeypatch.setattr("potr_cl.cli.scenes.load_scene", interrupted)
+    monkeypatch.setattr("potr_cl.formats.load_scene", interrupted)
     assert cli.main(trainings) == 130
     assert "2 of 3 scenes are done: --skip-existing goes on behind them" in capsys.readouterr().err
     assert sorted(path.name for path in Path("small").iterdir()) == ["bicycle.potr", "garden.potr"]
@@ -204,7 +204,7 @@ def test_refused_before_any_work(
 ) -> None:
     (folder / "sub").mkdir()
     ply.save("sub/a.ply", random_scene(5))
-    monkeypatch.setattr("potr_cl.cli.scenes.load_scene", lambda *_, **__: pytest.fail("a scene was read"))
+    monkeypatch.setattr("potr_cl.formats.load_scene", lambda *_, **__: pytest.fail("a scene was read"))
     assert cli.main(call.split()) == 2
     told = capsys.readouterr().err
     assert said in told

@@ -18,7 +18,7 @@ from tests.cli.calls import KEEP, fails
 
 def test_what_looks_at_no_views_opens_no_device(tmp_path, scene_path, monkeypatch):
     opened = []
-    monkeypatch.setattr("potr_cl.cli.encode.Device", opened.append)
+    monkeypatch.setattr("potr_cl.workers.opening.Device", opened.append)
     assert cli.main(["encode", str(scene_path), "-o", str(tmp_path / "scene.potr"), *KEEP]) == 0
     assert not opened
 
@@ -135,7 +135,7 @@ def test_interrupt(tmp_path, scene_path, capsys, monkeypatch):
     def interrupted(*_args, **_kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("potr_cl.cli.encode.encode", interrupted)
+    monkeypatch.setattr("potr_cl.api.encoder.run_stages", interrupted)
     fails(capsys, ["encode", scene_path, "-o", tmp_path / "a.potr", *KEEP], 130, "interrupted")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["scene.ply"]
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from potr_cl import cli
+from potr_cl import cli, formats
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import DataError, PotrError
@@ -250,7 +250,7 @@ def test_errors_that_nobody_foresaw_are_one_line(
     def fail(_path: object, **_keywords: object) -> None:
         raise RuntimeError(f"{ESCAPES}{'x' * 60_000}")
 
-    monkeypatch.setattr("potr_cl.cli.scenes.load_scene", fail)
+    monkeypatch.setattr("potr_cl.formats.load_scene", fail)
     assert cli.main(["convert", str(scene_path), "b.ply"]) == 1
     said = capsys.readouterr().err
     assert said.count("\n") == 1
@@ -292,7 +292,7 @@ def test_a_scene_that_does_not_fit_the_memory(
         def fail(_path: object, error: Exception = error, **_keywords: object) -> None:
             raise error
 
-        monkeypatch.setattr("potr_cl.cli.scenes.load_scene", fail)
+        monkeypatch.setattr("potr_cl.formats.load_scene", fail)
         assert cli.main(["convert", str(scene_path), "b.ply"]) == 1
         said = capsys.readouterr().err
         assert said.count("\n") == 1
@@ -364,14 +364,14 @@ def test_a_scene_that_is_removed_meanwhile(
 ) -> None:
     """What was read is enough."""
     size = scene_path.stat().st_size
-    load = cli.scenes.load_scene
+    load = formats.load_scene
 
     def load_and_remove(path: Path, **keywords: Any) -> object:
         scene = load(path, **keywords)
         path.unlink()
         return scene
 
-    monkeypatch.setattr("potr_cl.cli.scenes.load_scene", load_and_remove)
+    monkeypatch.setattr("potr_cl.formats.load_scene", load_and_remove)
     arguments: list[object] = ["encode", scene_path, "-o", tmp_path / "a.potr", "--json", *KEEP]
     code, out, _ = outcome(capsys, arguments)
     assert code == 0
@@ -396,7 +396,7 @@ def test_trust_reaches_the_readers(
         asked.append(trust)
         raise PotrError("enough")
 
-    for reader in ("cli.scenes.load_scene", "api.describing.load_scene", "formats.load_scene"):
+    for reader in ("formats.load_scene", "api.describing.load_scene", "formats.load_scene"):
         monkeypatch.setattr(f"potr_cl.{reader}", ask)
     for module in ("api.files", "api.describing", "codec.decoder"):
         monkeypatch.setattr(f"potr_cl.{module}.open_file", ask)

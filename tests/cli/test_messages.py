@@ -17,7 +17,8 @@ from types import SimpleNamespace
 import pytest
 
 from potr_cl import cli
-from potr_cl.cli import command_parser, scenes
+from potr_cl.api import inputs
+from potr_cl.cli import command_parser
 from potr_cl.cli.progress import Progress
 from potr_cl.cli.terminal import note, speak
 from potr_cl.errors import UsageError
@@ -66,19 +67,22 @@ def called(capsys, *arguments):
     ("call", "said"),
     [
         ([], "a command is missing: encode, prune, "),
-        (["encod", "a.ply"], "there is no command 'encod': is encode meant?"),
+        (["encod", "a.ply"], "unknown command 'encod': did you mean encode?"),
         (["a.ply"], "to compress a scene: potr-cl encode a.ply -o OUT.potr"),
         (["encode"], '.ply or .html, a folder, or "-" for standard output) is missing (see'),
-        (["encode", "a.ply", "--outptu", "b"], "there is no option '--outptu': is --output OUT.potr meant?"),
-        (["encode", "a.ply", "--camras=b", "-o", "c"], "is --cameras PATH meant?"),
-        (["encode", "a.ply", "--bananas", "-o", "c"], "there is no option '--bananas'"),
-        (["encode", "a.ply", "-o", "c", "-z"], "there is no option '-z'"),
+        (["encode", "a.ply", "--outptu", "b"], "unknown option '--outptu': did you mean --output OUT.potr?"),
+        (["encode", "a.ply", "--camras=b", "-o", "c"], "did you mean --cameras PATH?"),
+        (["encode", "a.ply", "--bananas", "-o", "c"], "unknown option '--bananas'"),
+        (["encode", "a.ply", "-o", "c", "-z"], "unknown option '-z'"),
         (["encode", "a.ply", "-o"], "-o/--output needs a value: OUT.potr (.potr, .spz, "),
         (["encode", "a.ply", "-o", "c", "-q", "x"], "-q/--quality is 'x', it must be a number"),
-        (["encode", "a.ply", "-o", "c", "--preset", "bset"], "must be best, smallest, fast or paper; is best meant?"),
+        (
+            ["encode", "a.ply", "-o", "c", "--preset", "bset"],
+            "must be best, smallest, fast or paper; did you mean best?",
+        ),
         (["info", "a.potr", "b.ply"], "'b.ply' is one argument too many"),
         (["info", "a\x1b[31m.ply", "b\x1b[31m.ply"], "'b\\x1b[31m.ply' is one argument too many"),
-        (["--print-completion", "bahs"], "is bash meant?"),
+        (["--print-completion", "bahs"], "did you mean bash?"),
     ],
 )
 def test_a_wrong_call_is_told_in_one_line(call, said, capsys):
@@ -134,7 +138,7 @@ def test_a_long_run_says_what_it_will_take(data, tmp_path, capsys, monkeypatch):
     def far_enough(*_, **__):
         raise UsageError("far enough")
 
-    monkeypatch.setattr("potr_cl.cli.encode.encode", far_enough)
+    monkeypatch.setattr("potr_cl.api.encoder.run_stages", far_enough)
     ply.save(tmp_path / "a.ply", random_scene(250_000, 0))
     cameras = data / "plush_excerpt_cameras.json"
     encode = ["encode", tmp_path / "a.ply", "--cameras", cameras, "-o", tmp_path / "a.potr"]
@@ -155,7 +159,7 @@ def test_a_long_stage_says_how_long_it_will_go_on(capsys, monkeypatch):
 @pytest.mark.slow
 def test_what_takes_long_to_read_is_named(encode, told, capsys, monkeypatch):
     assert "reading" not in told
-    monkeypatch.setattr(scenes, "_LONG_TO_READ", 100_000)
+    monkeypatch.setattr(inputs, "_LONG_TO_READ", 100_000)
     _, _, err = called(capsys, *encode)
     assert re.fullmatch(r"reading .*plush_excerpt\.ply, 0\.0 GB …", err.splitlines()[0])
 

@@ -123,7 +123,7 @@ def test_compare_without_cameras(scene_path, potr_path, capsys):
     assert cli.main(["compare", str(scene_path), str(potr_path)]) == 0
     captured = capsys.readouterr()
     assert "times smaller" in captured.out
-    assert "25 virtual views of 480 x 480 pixels" in captured.err or "30 virtual views of 600 x 600" in captured.err
+    assert "25 virtual views of 480 x 480 pixels" in captured.out or "30 virtual views of 600 x 600" in captured.out
     placed = [line for line in captured.err.splitlines() if "no --cameras" in line]
     assert len(placed) == 1
     assert placed[0].endswith("A scene encoded with cameras looks best from those.")
@@ -140,7 +140,7 @@ def test_compare_without_cameras(scene_path, potr_path, capsys):
 
 
 def test_compare_tells_sizes_where_there_is_no_device(scene_path, potr_path, capsys, monkeypatch):
-    monkeypatch.setattr("potr_cl.cli.pictures.list_devices", list)
+    monkeypatch.setattr("potr_cl.api.comparing.list_devices", list)
     assert cli.main(["compare", str(scene_path), str(potr_path)]) == 0
     captured = capsys.readouterr()
     assert "times smaller" in captured.out
@@ -173,9 +173,9 @@ def test_render_without_cameras_places_views(tmp_path, scene_path, capsys):
         (["--virtual-views", "100000"], ["100000 views"]),
         (["--size", "0"], ["0 x 0"]),
         (["--size", "99999"], ["99999 x 99999"]),
-        (["--up", "sideways"], ["'sideways' is no direction", "--up=x|y|z|-x|-y|-z"]),
-        (["--up", "0,0,0"], ["'0,0,0' is no direction"]),
-        (["--up", "nan,0,1"], ["is no direction"]),
+        (["--up", "sideways"], ["'sideways' is not a direction", "--up=x|y|z|-x|-y|-z"]),
+        (["--up", "0,0,0"], ["'0,0,0' is not a direction"]),
+        (["--up", "nan,0,1"], ["is not a direction"]),
     ],
 )
 def test_wrong_views_to_place(tmp_path, scene_path, cameras_path, capsys, options, words):

@@ -82,7 +82,7 @@ def test_a_report_that_cannot_be_written_takes_nothing_from_the_file(tmp_path, s
 def test_a_folder_where_a_file_of_a_ladder_belongs_is_told_before_the_work(tmp_path, scene_path):
     (tmp_path / "ladder.json").mkdir()
     with pytest.raises(potr_cl.UsageError, match=r"ladder\.json': it is a directory"):
-        potr_cl.encode_ladder(scene_path, tmp_path, "0.2", tell=pytest.fail)
+        potr_cl.encode_ladder(scene_path, tmp_path, "0.2", progress=pytest.fail)
 
 
 def test_a_comparison_tells_its_figures_although_the_picture_cannot_be_written(
@@ -91,13 +91,13 @@ def test_a_comparison_tells_its_figures_although_the_picture_cannot_be_written(
     folder = tmp_path / "gone"
     folder.mkdir()
     cli.command_parser(["compare"])
-    work = sys.modules["potr_cl.cli.pictures"].compare_scenes
+    work = sys.modules["potr_cl.api.comparing"].compare_scenes
 
     def instead(*args, **keywords):
         shutil.rmtree(folder)
         return work(*args, **keywords)
 
-    monkeypatch.setattr("potr_cl.cli.pictures.compare_scenes", instead)
+    monkeypatch.setattr("potr_cl.api.comparing.compare_scenes", instead)
     call = ["compare", scene_path, scene_path, "--cameras", cameras_path, "--views", "0", "-o", folder / "a.png"]
     assert cli.main([str(word) for word in [*call, "--json"]]) == 1
     captured = capsys.readouterr()

@@ -165,16 +165,16 @@ LIES = {
     "flags of a later day": (changed(flags=5), "flags 5 and quantiser 1 is unknown: update potr_cl"),
     "quantiser of a later day": (changed(quantiser=2), "quantiser 2 is unknown: update potr_cl"),
     "reserved": (changed(reserved=1), "unknown"),
-    "SH degree": (changed(degree=4), "makes no sense"),
-    "no blocks": (changed(count=0), "makes no sense"),
+    "SH degree": (changed(degree=4), "is invalid"),
+    "no blocks": (changed(count=0), "is invalid"),
     "a block more": (changed(count=2), "its table is longer than it says"),
     "thousands of blocks": (changed(count=3000), "3000 blocks are too many"),
     "bundles of the paper's quantiser": (changed(quantiser=0), "of coder 1, which is unknown"),
-    "no splats": (in_block(splats=0), "makes no sense"),
-    "more splats than a block may have": (in_block(splats=2**22 + 1), "makes no sense"),
+    "no splats": (in_block(splats=0), "is invalid"),
+    "more splats than a block may have": (in_block(splats=2**22 + 1), "is invalid"),
     "more splats than its bytes hold": (in_block(splats=2**21), "2097152 splats in .* --trust"),
     "coder": (in_block(coder=2), "coder 2, which is unknown"),
-    "octree depth": (in_block(depth=53), "makes no sense"),
+    "octree depth": (in_block(depth=53), "is invalid"),
     "a section more": (in_block(count=12), "its table is longer|no name"),
     "a section less": (in_block(count=8), "the sections do not fill"),
     "the finest level is not there": (in_block(level=1), "the finest level is not there"),
@@ -215,7 +215,7 @@ def test_lies_in_header_and_table(data, name):
 def test_levels_that_rise(data):
     file = File.of(data)
     file.blocks += [dataclasses.replace(file.blocks[0], level=1), file.blocks[0]]
-    with pytest.raises(DataError, match="block 1 makes no sense: level 1"):
+    with pytest.raises(DataError, match="block 1 is invalid: level 1"):
         open_file(file.bytes())
 
 

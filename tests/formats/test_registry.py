@@ -314,7 +314,7 @@ def test_the_folder_of_a_training_is_refused_with_the_name_of_its_scene(tmp_path
     for file in files:
         (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / file).touch()
-    with pytest.raises(UsageError, match="holds no scene that can be read as a folder") as caught:
+    with pytest.raises(UsageError, match="has no scene that can be read as a folder") as caught:
         load_scene(tmp_path)
     inside = [file for file in files if f"give the file in it: '{tmp_path / file}'" in str(caught.value)]
     assert inside == ([] if named is None else [files[named]])

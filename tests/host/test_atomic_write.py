@@ -97,7 +97,7 @@ def test_refuses_what_is_no_file(tmp_path: Path) -> None:
         (tmp_path / "fifo", "not a regular file"),
         (Path(os.devnull), "not a regular file"),
         (tmp_path / "missing" / "out.bin", "folder '.*missing' does not exist"),
-        (tmp_path / "file" / "out.bin", "'.*file' is no folder"),
+        (tmp_path / "file" / "out.bin", "'.*file' is not a folder"),
         (tmp_path / ("x" * 300), "File name too long"),
     ]:
         with pytest.raises(UsageError, match=message), replacing(path) as file:
@@ -113,7 +113,7 @@ def test_a_place_is_looked_at_before_the_work_without_a_trace(tmp_path: Path) ->
         (Path(os.devnull), "not a regular file"),
         (tmp_path / "missing" / "out.bin", "folder '.*missing' does not exist$"),
         (tmp_path / "~" / "out.bin", "does not exist; '~' is not expanded here"),
-        (tmp_path / "file" / "out.bin", "'.*file' is no folder"),
+        (tmp_path / "file" / "out.bin", "'.*file' is not a folder"),
         (tmp_path / ("x" * 300), "File name too long"),
     ]:
         with pytest.raises(UsageError, match=message):

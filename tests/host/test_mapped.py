@@ -71,7 +71,7 @@ def test_rows_are_those_that_numpy_takes(kind):
 @linux
 def test_a_scene_that_is_read_and_what_is_taken_of_it(tmp_path):
     scene = random_scene(500, 3)
-    scene.save(tmp_path / "scene.ply")
+    potr_cl.save(scene, tmp_path / "scene.ply")
     with mapped.bounded(1_000_000):
         read = load_scene(tmp_path / "scene.ply")
         part = read.subset(np.arange(0, 500)[::-1])
@@ -84,7 +84,7 @@ def test_a_scene_that_is_read_and_what_is_taken_of_it(tmp_path):
 
 @pytest.mark.slow
 def test_a_file_is_the_same_wherever_arrays_lie(plush_excerpt, plush_excerpt_cameras, tmp_path, monkeypatch):
-    plush_excerpt.save(tmp_path / "scene.ply")
+    potr_cl.save(plush_excerpt, tmp_path / "scene.ply")
     files = []
     for part in (1e9, 1e-9):
         monkeypatch.setattr(mapped, "_PART", part)
@@ -152,7 +152,7 @@ def test_what_finds_no_room_later_is_kept_in_memory_where_there_is_plenty(left, 
 def test_an_encode_whose_disk_is_full_after_the_scene_was_read_ends_well(
     plush_excerpt, plush_excerpt_cameras, tmp_path, monkeypatch, caplog
 ):
-    plush_excerpt.save(tmp_path / "scene.ply")
+    potr_cl.save(plush_excerpt, tmp_path / "scene.ply")
     monkeypatch.setattr(mapped, "_PART", 1e-9)
     choices = {"preset": "fast", "iterations": 2, "memory": 0.25}
     wanted = potr_cl.encode(tmp_path / "scene.ply", plush_excerpt_cameras[:4], **choices).data

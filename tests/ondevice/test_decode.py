@@ -199,7 +199,7 @@ def test_the_commands_say_the_same_of_a_file_and_of_its_scene(tmp_path, monkeypa
     files = {"potr": tmp_path / "b.potr", "ply": tmp_path / "b.ply"}
     pieces = code_scene(plush_excerpt, HyperParameters.from_quality(0.3, "best")).pieces
     files["potr"].write_bytes(b"".join(pieces))
-    potr_cl.decode(files["potr"]).save(files["ply"])
+    potr_cl.save(potr_cl.decode(files["potr"]), files["ply"])
     pictures, told = {}, {}
     for kind, path in files.items():
         folder = tmp_path / kind

@@ -119,7 +119,7 @@ def read_header(data: bytes) -> tuple[int, list[Entry], list[Block], int]:
     check(version == 1, f"version {version} is not supported")
     check(36 <= size <= len(data) == file_size, "sizes of header and file")
     check(zlib.crc32(data[: size - 4]) == struct.unpack_from("<I", data, size - 4)[0], "the header's checksum is wrong")
-    check(flags in (0, 1, 3) and degree <= 3 and quantiser <= 1 and zero == 0, "the header makes no sense")
+    check(flags in (0, 1, 3) and degree <= 3 and quantiser <= 1 and zero == 0, "the header is invalid")
     check(count >= 1 and own_count <= 32, "number of blocks or sections")
     at = 32
 
@@ -145,7 +145,7 @@ def read_header(data: bytes) -> tuple[int, list[Entry], list[Block], int]:
         numbers = take("<10fd5f")
         box, origin, error, edge, factors = numbers[:6], numbers[6:9], numbers[9], numbers[10], numbers[11:]
         check(coder == 0 or (coder == 1 and quantiser == 1), f"coder {coder}")
-        check(deepest <= 52 and sections <= 32 and 1 <= splats <= 2**22, "a block makes no sense")
+        check(deepest <= 52 and sections <= 32 and 1 <= splats <= 2**22, "a block is invalid")
         check(all(map(math.isfinite, (*box, *origin, error, edge))), "a number of a block is out of range")
         check(all(low <= high for low, high in zip(box, box[3:], strict=False)), "a box ends before it begins")
         check(0 <= edge <= 2 * LARGEST_SINGLE and error >= 0, "edge or error out of range")

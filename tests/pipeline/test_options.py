@@ -47,7 +47,7 @@ def test_changes_reach_the_stage_that_they_name():
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"itertions": 3}, "there is no option 'itertions'"),
+        ({"itertions": 3}, "unknown option 'itertions'"),
         ({"prune": {"itertions": 3}}, "stage 'prune' has no option 'itertions'"),
         ({"prune": {"keep": 2.0}}, "must be above 0 and at most 1"),
         ({"code": False}, "stage 'code' makes the file"),

@@ -141,7 +141,7 @@ def test_all_presets_but_the_papers_add_them(preset):
 
 def test_the_summary_tells_of_them(device, plush_excerpt, plush_excerpt_cameras):
     encoded = encode(plush_excerpt, plush_excerpt_cameras, options(1), device=device)
-    assert str(encoded.between) == "8 views between the 9 training views were looked at, too"
+    assert str(encoded.between) == "8 extra views between the 9 training views"
 
 
 def test_single_cameras_get_none(device, plush_excerpt, plush_excerpt_cameras):

@@ -37,7 +37,7 @@ def test_where_there_is_no_page_the_still_alone_and_where_no_device_the_words():
 
 def test_scenes_and_comparisons_show_themselves(plush_excerpt, plush_excerpt_cameras):
     pytest.importorskip("viser", reason="the extra view is not installed")
-    with plush_excerpt.show(cameras=plush_excerpt_cameras) as viewer:
+    with potr_cl.view(plush_excerpt, cameras=plush_excerpt_cameras) as viewer:
         bundle = viewer._repr_mimebundle_()
         assert viewer.url in bundle["text/html"]
         still = np.asarray(Image.open(io.BytesIO(base64.b64decode(bundle["image/jpeg"]))))

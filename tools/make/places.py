@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -21,14 +20,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.formats import load_scene
+from potr_cl.formats import load_scene, save_scene
 from potr_cl.model.camera import Camera
 from potr_cl.model.quaternions import quaternions_of
 from potr_cl.model.scene import Scene, joined
 from tests.reference.captures import looking
 from tests.reference.frames import moved
-from tools.make.city import of_size
-from tools.workloads import camera_entry
+from tools.make.city import of_size, write_cameras
 
 F64 = NDArray[np.float64]
 
@@ -288,8 +286,8 @@ def main() -> None:
         args.kind, [load_scene(path) for path in args.scenes], int(args.splats), args.views, args.degree
     )
     args.output.mkdir(parents=True, exist_ok=True)
-    scene.save(args.output / "point_cloud.ply")
-    (args.output / "cameras.json").write_text(json.dumps([camera_entry(n, camera) for n, camera in enumerate(cameras)]))
+    save_scene(args.output / "point_cloud.ply", scene)
+    write_cameras(args.output, cameras)
     print(f"{len(scene):,} splats and {len(cameras)} views in {args.output}")
 
 

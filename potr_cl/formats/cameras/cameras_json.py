@@ -58,7 +58,7 @@ def parse(content: Any, path: Path) -> list[Camera]:
     if not isinstance(content, list) or not all(isinstance(view, dict) for view in content):
         raise DataError(f"'{path}' is no cameras.json: it is not a list of views")
     if not content:
-        raise DataError(f"'{path}' holds no view")
+        raise DataError(f"'{path}' has no views")
     files = [image_name(view.get("img_name"), f"'{path}', view {i}: 'img_name'") for i, view in enumerate(content)]
     ground_truth = {stem(image.name): image for image in _images_beside(path)}
     points = points_beside(path.parent, "input.ply")

@@ -119,7 +119,7 @@ def load(folder: Path) -> list[Camera]:
     lenses, images = _lenses(folder / f"cameras{ending}"), _images(folder / f"images{ending}")
     path = folder / f"images{ending}"
     if not images:
-        raise DataError(f"'{path}' holds no view")
+        raise DataError(f"'{path}' has no views")
     for image in images:
         if image.lens not in lenses:
             raise DataError(f"'{folder}' is a damaged COLMAP model: image {image.number} has an unknown camera")
@@ -201,7 +201,7 @@ def _images(path: Path) -> list[_Image]:
 
 def _unread(path: Path, camera: str, model: str) -> DataError:
     return DataError(
-        f"'{path}': camera {camera} has the model {excerpt(model)}, which is not read: undistort the images with "
+        f"'{path}': camera {camera} has the model {excerpt(model)}, which is not supported: undistort the images with "
         "'colmap image_undistorter' and use the model that it writes"
     )
 

@@ -36,7 +36,7 @@ def read_points(path: Path) -> NDArray[np.float64]:
     try:
         points = np.array(list(read(path)), np.float64).reshape(-1, 3)
     except (struct.error, ValueError, KeyError, IndexError) as error:
-        raise DataError(f"'{path}' holds no points of a reconstruction: {error}") from error
+        raise DataError(f"'{path}' has no points of a reconstruction: {error}") from error
     return points[np.isfinite(points).all(axis=1)]
 
 

@@ -147,7 +147,7 @@ def _frames(content: Any, path: Path) -> list[_Frame]:
     if not isinstance(frames, list):
         raise DataError(f"'{path}' is no transforms.json: it is not an object with a list 'frames'")
     if not frames:
-        raise DataError(f"'{path}' holds no view")
+        raise DataError(f"'{path}' has no views")
     for i, frame in enumerate(frames):
         if not isinstance(frame, dict):
             raise DataError(f"'{path}', frame {i} is {excerpt(frame)}, not an object")

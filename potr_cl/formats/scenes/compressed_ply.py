@@ -192,7 +192,7 @@ def _counts(path: str | os.PathLike[str], lines: list[str]) -> tuple[int, int, i
     (_, chunks, bounds), (_, splats, vertex) = elements[:2]
     _, rows, rest = elements[2] if elements[2:] else ("sh", splats, [])
     if splats == 0:
-        raise DataError(f"'{path}' holds no splat")
+        raise DataError(f"'{path}' has no splats")
     if vertex != _VERTEX:
         raise DataError(f"'{path}' is no compressed PLY that can be read")
     if bounds != _BOUNDS:

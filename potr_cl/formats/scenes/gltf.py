@@ -120,14 +120,14 @@ def _scene(path: str | os.PathLike[str], asset: Asset, trust: bool) -> Scene:
                 left_out += 1
     if not found:
         raise DataError(
-            f"'{path}' holds no Gaussian splats: no part of its scene has the extension {_EXTENSION}; it is a mesh or "
+            f"'{path}' has no Gaussian splats: no part of its scene has the extension {_EXTENSION}; it is a mesh or "
             "a point cloud"
         )
     primitives = {id(primitive): primitive for primitive, _ in found}
     for primitive in primitives.values():
         _check_kind(path, asset, primitive)
     if others:
-        raise DataError(f"'{path}' needs the glTF extension {shown(others[0])}, which is not known here")
+        raise DataError(f"'{path}' needs the glTF extension {shown(others[0])}, which is not supported")
     counts = {number: _count(asset, primitive) for number, primitive in primitives.items()}
     try:
         check_claim(sum(counts[id(primitive)] for primitive, _ in found), asset.size, MOST_A_BYTE, trust)
@@ -214,7 +214,7 @@ def _check_kind(path: str | os.PathLike[str], asset: Asset, primitive: dict[str,
     """That splats are of the kind that the base extension describes, which is that of 3DGS."""
     kind = primitive["extensions"][_EXTENSION]
     if not isinstance(kind, dict):
-        raise asset.damaged(f"its {_EXTENSION} is no object")
+        raise asset.damaged(f"its {_EXTENSION} is not an object")
     unknown = [name for name in kind.get("extensions", {}) if name != SPZ_EXTENSION]
     if unknown:
         raise DataError(
@@ -245,7 +245,7 @@ def _splats(path: str | os.PathLike[str], asset: Asset, primitive: dict[str, Any
     packed = primitive["extensions"][_EXTENSION].get("extensions", {}).get(SPZ_EXTENSION)
     if packed is not None:
         if not isinstance(packed, dict):
-            raise asset.damaged(f"its {SPZ_EXTENSION} is no object")
+            raise asset.damaged(f"its {SPZ_EXTENSION} is not an object")
         content = asset.content(packed.get("bufferView"))
         scene = spz.read(path, io.BytesIO(content), len(content), trust)
         if len(scene) != _count(asset, primitive):
@@ -300,7 +300,7 @@ def _placed(path: str | os.PathLike[str], scene: Scene, matrix: Matrix) -> Scene
     linear = matrix[:3, :3]
     lengths = np.linalg.norm(linear, axis=0)
     if not np.isfinite(matrix).all() or not (lengths > 0).all():
-        raise DataError(f"'{path}' is damaged: a node's transform is no transform")
+        raise DataError(f"'{path}' is damaged: a node's transform is invalid")
     rotation = linear / lengths
     if np.abs(rotation.T @ rotation - np.eye(3)).max() > _ROUNDING or np.linalg.det(rotation) < 0:
         raise DataError(f"'{path}' has splats in a node that is sheared or mirrored, which splats cannot be")

@@ -93,7 +93,7 @@ class Asset:
         if not isinstance(entries, list) or type(index) is not int or not 0 <= index < len(entries):
             raise self.damaged(f"there is no {shown(index)} among its {kind}")
         if not isinstance(entries[index], dict):
-            raise self.damaged(f"{kind} {index} is no object")
+            raise self.damaged(f"{kind} {index} is not an object")
         found: dict[str, Any] = entries[index]
         return found
 

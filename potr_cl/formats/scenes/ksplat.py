@@ -91,7 +91,7 @@ def _read(path: str | os.PathLike[str], data: bytes) -> Scene:
     sections = _sections(path, data, room, level)
     count = sum(section.splats for section in sections)
     if count == 0:
-        raise DataError(f"'{path}' holds no splat")
+        raise DataError(f"'{path}' has no splats")
     coefficients = SH_COEFFICIENTS[max(section.degree for section in sections)]
     scene = unfilled(count, coefficients)
     scene.sh[:] = 0  # sections may be of lower degrees
@@ -126,7 +126,7 @@ def _sections(path: str | os.PathLike[str], data: bytes, room: int, level: int) 
         rows_at = at + bucket_bytes * buckets + 4 * others
         end = rows_at + row.itemsize * most
         if end > len(data) or splats > most:
-            raise DataError(f"'{path}' is truncated: a section has room for {most} splats, which the file has not")
+            raise DataError(f"'{path}' is truncated: a section announces {most} splats, more than the file has")
         if level and splats:
             if bucket_bytes != _BUCKET_BYTES or full + others > buckets or full * bucket_size > most:
                 raise DataError(f"'{path}' is damaged: the buckets of a section do not fit its splats")

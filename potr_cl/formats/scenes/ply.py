@@ -220,7 +220,7 @@ def _read(path: str | os.PathLike[str], stream: io.FileIO, size: int) -> Scene:
     rest, scales = _check_properties(path, header, vertex)
     offset = _check_size(path, header, size)
     if count == 0:
-        raise DataError(f"'{path}' holds no splat")
+        raise DataError(f"'{path}' has no splats")
     _report_dropped(path, header, vertex, rest)
     kept = min(rest, _MOST_REST)
     if rest > kept:

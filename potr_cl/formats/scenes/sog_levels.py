@@ -61,7 +61,7 @@ def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
     if meta.environment is not None:
         names.setdefault(meta.environment, [])
     if not names:
-        raise DataError(f"'{path}': level {level or 0} holds no splat")
+        raise DataError(f"'{path}': level {level or 0} has no splats")
     folders = [(Folder(file), file, parts) for file, parts in names.items()]
     total = sum(folder.size for folder, _, _ in folders)
     # All are described before one is unpacked: each by itself may hold some splats for nothing.
@@ -148,10 +148,10 @@ class _Meta:
         while nodes:
             node = nodes.pop()
             if not isinstance(node, dict):
-                raise self._damaged("a part of its tree is none")
+                raise self._damaged("its tree is invalid")
             levels, children = node.get("lods", {}), node.get("children", [])
             if not isinstance(levels, dict) or not isinstance(children, list):
-                raise self._damaged("a part of its tree is none")
+                raise self._damaged("its tree is invalid")
             part = levels.get(str(level))
             if part is not None:
                 number = self._whole(part["file"], 0, len(self.files) - 1, "files")

@@ -264,11 +264,11 @@ def _header(path: str | os.PathLike[str], start: bytes, versions: range, size: i
         raise DataError(f"'{path}' is not an SPZ file")
     _, version, splats, degree, bits, flags, streams = _HEADER.unpack_from(start)
     if version not in versions:
-        raise DataError(f"'{path}' is an SPZ file of version {version}, which is not known or not packed like this")
+        raise DataError(f"'{path}' is an SPZ file of version {version}, which is unknown or not packed like this")
     if degree > _LARGEST_DEGREE:
         raise DataError(f"'{path}' has SH degree {degree}: export at most 3 bands")
     if splats == 0:
-        raise DataError(f"'{path}' holds no splat")
+        raise DataError(f"'{path}' has no splats")
     if version != HALF_FLOATS and not 1 <= bits <= MOST_FRACTIONAL_BITS:
         raise DataError(f"'{path}' is damaged: positions with {bits} fractional bits")
     try:

@@ -173,7 +173,7 @@ def test_a_lens_for_each_frame_costs_no_more_calls(tmp_path: Path, monkeypatch: 
         ({"fl_x": "50"}, "'fl_x' is '50', not a finite number"),
         ({"w": 0}, "'w' is 0.*not a number of pixels"),
         ({"h": 1 << 40}, "not a number of pixels from 1 to"),
-        ({"frames": []}, "holds no view"),
+        ({"frames": []}, "has no views"),
         ({"frames": {}}, "not an object with a list 'frames'"),
         ({"frames": [7]}, "frame 0 is 7, not an object"),
         ({"frames": [{}]}, "frame 0: 'file_path' is missing"),

@@ -244,7 +244,7 @@ def test_splats_packed_as_spz(degree: int, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda d: kind_of(d)["extensions"].update({SPZ: 3}), "is no object"),
+        (lambda d: kind_of(d)["extensions"].update({SPZ: 3}), "is not an object"),
         (lambda d: kind_of(d)["extensions"].update({SPZ: {"bufferView": 1}}), "no 1 among its bufferViews"),
         (lambda d: kind_of(d)["extensions"].update({SPZ: {}}), "no None among its bufferViews"),
         (lambda d: d["bufferViews"][0].update(byteLength=200), "damaged or truncated"),

@@ -74,7 +74,7 @@ def test_what_a_folder_lacks(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no description of a SOG scene: it has 5242880 bytes"):
         load_scene(folder)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(UsageError, match=r"holds no scene that can be read as a folder: it has no meta.json or lod-"):
+    with pytest.raises(UsageError, match=r"has no scene that can be read as a folder: it has no meta.json or lod-"):
         load_scene(tmp_path / "empty")
 
 
@@ -112,7 +112,7 @@ def test_a_level_in_parts(levels: Path, caplog: pytest.LogCaptureFixture) -> Non
     rewritten(levels / "lod-meta.json", split)
     scene = load_scene(f"{levels}#0")
     np.testing.assert_array_equal(scene.means, whole.means[[*range(30), *range(100, 150)]])
-    with pytest.raises(DataError, match="level 1 holds no splat"):
+    with pytest.raises(DataError, match="level 1 has no splats"):
         load_scene(f"{levels}#1")
 
 
@@ -131,9 +131,9 @@ def node(**changes: Any) -> dict[str, Any]:
         (lambda m: m.update(filenames=["../a/meta.json"]), "it names a file '../a/meta.json'"),
         (lambda m: m.update(filenames=["0_0/meta.json"] * 2), "names a file twice"),
         (lambda m: m.update(environment="/etc/passwd"), "it names a file"),
-        (lambda m: m.update(tree={"children": 3}), "a part of its tree is none"),
-        (lambda m: m.update(tree={"children": [3]}), "a part of its tree is none"),
-        (lambda m: m.update(tree={"lods": []}), "a part of its tree is none"),
+        (lambda m: m.update(tree={"children": 3}), "its tree is invalid"),
+        (lambda m: m.update(tree={"children": [3]}), "its tree is invalid"),
+        (lambda m: m.update(tree={"lods": []}), "its tree is invalid"),
         (lambda m: m.update(tree=node(file=2)), "impossible number of files: 2"),
         (lambda m: m.update(tree=node(file=-1)), "impossible number of files: -1"),
         (lambda m: m.update(tree=node(offset=-1)), "impossible number of offset"),
@@ -142,7 +142,7 @@ def node(**changes: Any) -> dict[str, Any]:
         (lambda m: m.update(tree=node(offset=1)), "has 150 splats"),
         (lambda m: m.update(tree={"children": [node(), node(count=1)]}), "parts overlap"),
         (lambda m: m.update(tree={"lods": {"0": {}}}), "damaged"),
-        (lambda m: m.update(tree={}) or m.pop("environment"), "level 0 holds no splat"),
+        (lambda m: m.update(tree={}) or m.pop("environment"), "level 0 has no splats"),
     ],
 )
 def test_bad_trees(change: Any, message: str, levels: Path) -> None:
