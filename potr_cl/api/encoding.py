@@ -109,8 +109,10 @@ def encode_ladder(
 
 
 def _kind(path: str | os.PathLike[str] | None, choices: EncodeChoices) -> Output | None:
-    version, title, author = (choices.pop(name, None) for name in ("spz_version", "title", "author"))
-    return output_choice(path, choices.pop("to", None), version=version, title=title, author=author)
+    version, title = choices.pop("spz_version", None), choices.pop("title", None)
+    return output_choice(
+        path, choices.pop("to", None), version=version, title=title, author=choices.pop("author", None)
+    )
 
 
 def _encoder(
