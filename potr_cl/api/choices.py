@@ -263,7 +263,9 @@ def _listed() -> str:
     lines = []
     for kind in STAGES:
         lines.append(f'\n    Options of the stage "{kind.name}":')
-        lines += [f"        {keyword_of(flag.flag)}: {flag.help}" for flag in flags(kind).values()]
+        for flag in flags(kind).values():
+            switched_off = "False: " if flag.flag.startswith("--no-") else ""
+            lines.append(f"        {keyword_of(flag.flag)}: {switched_off}{flag.help}")
     return "\n".join(lines)
 
 

@@ -109,8 +109,8 @@ class Device:
             self.queue = cl.CommandQueue(self.context, self.info.handle, properties=flags)
         if self.info.max_work_group < 256 and self.family == "gpu":
             raise DeviceError(
-                f"device {self.info} supports work-groups of only {self.info.max_work_group} work-items; 256 are required: "
-                "choose another with --device"
+                f"device {self.info} supports work-groups of only {self.info.max_work_group} work-items; 256 are "
+                "required: choose another with --device"
             )
         self.vector_width = self._proven_vector_width()
         self.native_exp2 = self.family == "gpu" and self._native_exp2_is_exact()
