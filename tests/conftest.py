@@ -15,9 +15,11 @@ import pytest
 from potr_cl import Camera, Scene
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model import agreement
+from potr_cl.opencl.device import Device
 from potr_cl.opencl.loader import register_runtimes
 from potr_cl.opencl.verdict import TRUST_VARIABLE
 from potr_cl.placement.space import Space
+from tests.reference.gpu_programs import undeclared
 
 # Tests take devices as they are; tests/opencl/test_verdict.py tries them.
 os.environ.setdefault(TRUST_VARIABLE, "1")
@@ -53,6 +55,21 @@ def runtimes_are_registered() -> None:
     left there would find that, if none has opened a device before them.
     """
     register_runtimes()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def programs_are_declared() -> Iterator[None]:
+    """What GPUs are given is what the kernel files say that they are: tools.stress.offline compiles just that."""
+    built = Device._built
+
+    def checked(self: Device, wanted: tuple[str, tuple[tuple[str, str], ...]]) -> Any:
+        if self.family == "gpu" and not self._variants and (fault := undeclared(wanted[0], dict(wanted[1]))):
+            raise AssertionError(fault)
+        return built(self, wanted)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Device, "_built", checked)
+        yield
 
 
 def once(function: Callable[..., Any], most: int) -> Callable[..., Any]:

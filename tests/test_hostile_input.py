@@ -1,7 +1,7 @@
 """Short runs of the tools that attack the package; docs/benchmarks/hostile_input.md has long ones.
 
-Changed files and bombs to every reader, signals to commands that write, every command twice. The tools run in processes
-of their own, which what is wrong may end.
+Changed files and bombs to every reader, every command twice. The tools run in processes of their own, which what is
+wrong may end.
 """
 
 from __future__ import annotations
@@ -53,11 +53,11 @@ def attack(formats: list[str], tmp_path: Path, count: int, seed: int) -> None:
 
 
 def test_some_changed_files(tmp_path):
-    attack(["potr", "ply", "spz", "transforms.json", "png"], tmp_path, 300, 1)
+    attack(["potr", "ply", "spz", "transforms.json", "png"], tmp_path, 100, 1)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("formats", "count"), [(FORMATS[:1], 4000), (FORMATS[1:], 300)], ids=["potr", "others"])
+@pytest.mark.parametrize(("formats", "count"), [(FORMATS[:1], 1500), (FORMATS[1:], 150)], ids=["potr", "others"])
 def test_many_changed_files(formats, count, tmp_path):
     """Most of the format that is our own; campaigns go further (docs/benchmarks/hostile_input.md)."""
     attack(formats, tmp_path, count, 11)
@@ -70,33 +70,6 @@ def test_bombs(formats, tmp_path):
     rows = run("bombs", tmp_path, *each("--format", formats))
     assert {row["format"] for row in rows} == set(formats)
     assert {row["outcome"] for row in rows} <= {"read", "refused"}
-
-
-def test_some_messages_to_the_viewer(tmp_path):
-    pytest.importorskip("viser", reason="the extra view is not installed")
-    (row,) = run("page", tmp_path, "--count", "1000", "--tabs", "2")
-    assert row["bytes printed"] == 0
-    assert row["answers to the honest tab"] > 0
-
-
-@pytest.mark.parametrize(
-    ("commands", "moments"),
-    [
-        (["decode"], 6),
-        pytest.param(
-            ["encode --report", "encode --ladder", "encode, preset smallest", "prune --order", "render"],
-            20,
-            marks=pytest.mark.slow,
-        ),
-    ],
-    ids=["quick", "others"],
-)
-def test_signals(commands, moments, tmp_path):
-    """To commands that write one file, two, several, pictures, and to one that an interrupt may end early."""
-    rows = run("signals", tmp_path, "--moments", str(moments), *each("--command", commands))
-    assert sum(row["moments"] for row in rows) == moments
-    assert sum(row["wrong"] for row in rows) == 0
-    assert sum(row["ended by the signal"] for row in rows) > 0
 
 
 @pytest.mark.slow

@@ -7,8 +7,8 @@ How fast, how large, how much memory (``bench``):
 
 =====================  =================================================================================================
 bench.encode           run time against error of every stage and variant on every device: what is on the Pareto front?
-bench.rasterizer       frames a second, and time against splats, pixels and overlap
-bench.pruning          what does pruning keep, against other pruners, and what may its sweeps skip?
+bench.rasterizer       frames a second, and time by kernel
+bench.pruning          what does pruning keep, against other pruners?
 bench.refit            what does the re-fit of the colours bring, and what does it take?
 bench.fit              how fast are the fit's steps?
 bench.decode           how fast does a file decode, by compiled code, NumPy or OpenCL, and in how much memory?
@@ -33,12 +33,11 @@ What happens at the limits (``stress``):
 ==================  ====================================================================================================
 stress.run          every kernel against float64 on the worst inputs: what error is the kernel's own?
 stress.platforms    the rasterizer, the metrics and the re-fit on every OpenCL runtime of this machine
+stress.offline      do all GPU programs build for AMD's, Intel's and Apple's GPUs, and do any spill registers?
 stress.simulated    does Oclgrind see a race, an access out of bounds or an uninitialised read in any kernel?
 stress.fuzz         does any changed file do more than be refused or decode to finite numbers?
 stress.bombs        what do files take that unpack to far more than they are, or claim to?
-stress.signals      what is left of a command that is told to end, at any moment?
 stress.determinism  does every command write the same bytes the second time?
-stress.page         is the viewer's server upset by any message, or by many?
 stress.long_life    does a process that encodes, renders and compares all day grow?
 stress.native       does the compiled decoder touch memory not its own, or differ from NumPy's, on changed files?
 ==================  ====================================================================================================

@@ -16,6 +16,7 @@ import json
 import math
 import os
 import platform
+import re
 import shlex
 import subprocess
 import sys
@@ -126,11 +127,6 @@ class Table:
         print(f"| {' | '.join(texts)} |", flush=True)
         self._keep()
 
-    def put(self, *cells: Cell) -> None:
-        """As :meth:`add`, but in place of the row that has the same first cell, where there is one."""
-        self._rows = [row for row in self._rows if row[0] != cells[0]]
-        self.add(*cells)
-
     def content(self, about: dict[str, Any]) -> dict[str, Any]:
         """What the JSON file holds of it; ``about`` is what :func:`circumstances` gives."""
         columns = [
@@ -175,13 +171,20 @@ def threads() -> int:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write a file in one step, so that a run that is cut off leaves the last whole one.
+    """Write a file in one step, so that a run that is cut off leaves the last whole one; in tables each column and each
+    row is a line.
 
     Raises:
         ValueError: a figure is not finite.
     """
+    text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
+
+    def one_line(match: re.Match[str]) -> str:
+        return match[1] + json.dumps(json.loads(match[0]), ensure_ascii=False)
+
+    text = re.sub(r"(?<=\n)(   )([\[{])\n.*?\n   [\]}](?=,?\n)", one_line, text, flags=re.DOTALL)
     with replacing(path) as file:
-        file.write(json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False).encode() + b"\n")
+        file.write(text.encode() + b"\n")
 
 
 def _command() -> str:

@@ -46,9 +46,8 @@ from potr_cl.quality.compare import (
     size_report,
 )
 from potr_cl.quality.figures import ViewFigures
-from potr_cl.quality.judging import Looks
+from potr_cl.quality.judging import Judging, Looks
 from potr_cl.quality.metrics import Lpips
-from potr_cl.quality.shared_judging import SharedJudging
 from potr_cl.raster.rules import RULES, RasterRules
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.report.labels import U8, comparison_picture, shrunk
@@ -319,11 +318,11 @@ def compare_scenes(
     opened, tell, stage = workers.device, progress or (lambda _stage, _done: None), comparing(len(views))
     looks = Looks(background, rules, ground_truth, metric)
     tell(stage, 0.0)
-    with SharedJudging(opened, a[1], views, looks, workers.pool, anyway=True, coded=coded[0]) as judging:
-        found = judging.figures(b[1], views, coded[1], lambda done: tell(stage, done / len(views)))
+    with Judging(opened, a[1], views, looks, workers.pool, anyway=True, coded=coded[0]) as judging:
+        found = judging.figures(b[1], None, coded[1], lambda done: tell(stage, done))
         figures = comparison_of(found)
         worst = figures.views[figures.worst]
-        ((picture_a, picture_b),) = judging.pictures(b[1], [views[figures.worst]])
+        ((picture_a, picture_b),) = judging.pictures(b[1], [figures.worst])
     psnr = None if worst.identical else worst.figures["b_against_a"].psnr
     picture, factor = comparison_picture(picture_a, picture_b, worst.name, psnr, (a[0].path.name, b[0].path.name))
     called = next((name for name, known in RULES.items() if known == rules), "own")

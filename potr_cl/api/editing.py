@@ -62,8 +62,8 @@ from potr_cl.stages.pruning.unseen import Unseen
 from potr_cl.stages.refitting.refit import active_coefficients, refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions as RefitOptions
 from potr_cl.stages.refitting.refit_options import Refitted
-from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets
 from potr_cl.stages.stage import Progress, Stage, State
+from potr_cl.views.targets import PhotographTargets, RenderedTargets
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -458,12 +458,12 @@ def refit(
 
     def solved(device: Device, memory: int | None) -> Refitted:
         with ExitStack() as stack:
-            targets: RenderedTargets | GroundTruthTargets
+            targets: RenderedTargets | PhotographTargets
             if work.truth is None:
                 rasterizer = stack.enter_context(Rasterizer(device, work.original, background=work.colour))
                 targets = RenderedTargets(rasterizer, work.views)
             else:
-                targets = GroundTruthTargets(device, work.truth, work.views)
+                targets = PhotographTargets(device, work.truth, work.views)
             return refit_colours(
                 device, work.scene, work.views, targets, dataclasses.replace(options, memory=memory),
                 active_coefficients(work.scene.sh, _ZERO_SF), work.colour,

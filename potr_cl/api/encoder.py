@@ -309,13 +309,14 @@ class Encoder:
                 )
                 quality = quality_report(views, *found)
                 shown = [] if page is None else views_to_show(quality, chosen)
-                pairs = evaluator.pictures(written.scene, [view["name"] for _, view in shown]) if shown else []
+                numbers = [views.named(view["name"]) for _, view in shown]
+                pairs = evaluator.pictures(written.scene, numbers) if shown else []
             watch("evaluate", 1.0)
         except DeviceError as error:
             return f"not judged: {error}", []
         return quality, [
-            PicturePair(title, view["name"], view["psnr"], *pair, self._photograph(views.named(view["name"])))
-            for (title, view), pair in zip(shown, pairs, strict=True)
+            PicturePair(title, view["name"], view["psnr"], *pair, self._photograph(views.views[number]))
+            for (title, view), pair, number in zip(shown, pairs, numbers, strict=True)
         ]
 
     def _photograph(self, view: Camera) -> FloatArray | None:

@@ -20,8 +20,8 @@ from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.stages.fit import LeftOut
 from potr_cl.stages.fitting.files import File, TwoFiles
 from potr_cl.stages.fitting.fit import Fitted, held_out_error
-from potr_cl.stages.refitting.targets import RenderedTargets
 from potr_cl.stages.stage import State
+from potr_cl.views.targets import RenderedTargets
 
 _NO_SMALLER = "on the views that were held out, a file with it was no better than one without"
 

@@ -9,8 +9,7 @@ from potr_cl.model.camera import Camera, test_views, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.quality.ground_truth import GroundTruth, PhotographFigures
-from potr_cl.quality.judging import Looks
-from potr_cl.quality.shared_judging import SharedJudging
+from potr_cl.quality.judging import Judging, Looks
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.workers.pool import Pool
@@ -43,8 +42,8 @@ def judge_by_photographs(
         views, kind = ground_truth.of(train_views(cameras)), "train"
     reference, candidate = scenes
     near = pool if pool is not None and pool.in_process else None
-    with SharedJudging(device, reference, views, Looks(background), near) as judging:
-        psnrs = judging.by_photographs(candidate, views, ground_truth)
+    with Judging(device, reference, views, Looks(background), near) as judging:
+        psnrs = judging.by_photographs(candidate, ground_truth)
     names = [camera.name for camera in views]
     return PhotographFigures(
         names, kind, [of_reference for of_reference, _ in psnrs], [of_file for _, of_file in psnrs]

@@ -1,7 +1,7 @@
 """What is told of a comparison of two scenes (:class:`Comparison`), for programs and for people; and its photographs.
 
 A is the reference scene (uncompressed), B the candidate. With photographs, both are also judged against those.
-:mod:`potr_cl.quality.shared_judging` finds the figures.
+:mod:`potr_cl.quality.judging` finds the figures.
 """
 
 from __future__ import annotations

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 
 from potr_cl.errors import UsageError
 from potr_cl.formats.images import Colour
 from potr_cl.model.camera import Camera, test_views, train_views
-from potr_cl.model.scene import FloatArray
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
-from potr_cl.opencl.memory import Owner
 from potr_cl.quality.compare import Comparison, comparing, comparison_of, mean_view
 from potr_cl.quality.figures import ViewFigures
-from potr_cl.quality.judging import Looks
-from potr_cl.quality.shared_judging import SharedJudging
+from potr_cl.quality.judging import Judging, Looks
 from potr_cl.raster.carried import Carried
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.scene_buffers import Drawable
@@ -29,6 +25,8 @@ from potr_cl.workers.pool import Pool
 _MOST_TRAINING_VIEWS = 32
 #: Beside held-out views so many training views are judged, as a part of them, and at least, and at most.
 _BESIDE, _LEAST_BESIDE, _MOST_BESIDE = 1 / 8, 4, 16
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -63,15 +61,15 @@ class EvaluationViews:
         training = train_views(cameras)
         return EvaluationViews(_evenly(training, _MOST_TRAINING_VIEWS), "train", len(training))
 
-    def named(self, name: str) -> Camera:
-        """The view of a name.
+    def named(self, name: str) -> int:
+        """The number of the view of a name.
 
         Raises:
             UsageError: there is none.
         """
-        for camera in self.views:
+        for number, camera in enumerate(self.views):
             if camera.name == name:
-                return camera
+                return number
         raise UsageError(f"there is no view '{name}' among the {self}: '{self.views[0].name}' is the first of them")
 
     def __str__(self) -> str:
@@ -82,12 +80,12 @@ class EvaluationViews:
         return f"{which} {self.available} training views, for the cameras name no test views"
 
 
-def _evenly(views: Sequence[Camera], most: int) -> list[Camera]:
+def _evenly(views: Sequence[T], most: int) -> list[T]:
     """So many of some views at most, from the first to the last."""
     return [views[k] for k in np.linspace(0, len(views) - 1, min(len(views), most)).round().astype(int)]
 
 
-class Evaluator(Owner):
+class Evaluator(Judging):
     """Compares candidates with one uncompressed scene.
 
     Args:
@@ -115,9 +113,7 @@ class Evaluator(Owner):
         remember: bool = True,
     ) -> None:
         self.views = views
-        self.device = device
-        looks = Looks(background, remember=remember)
-        self._judging = SharedJudging(device, scene, [*views.views, *views.beside], looks, pool)
+        super().__init__(device, scene, [*views.views, *views.beside], Looks(background, remember=remember), pool)
 
     def psnr(
         self,
@@ -126,28 +122,18 @@ class Evaluator(Owner):
         coded: Carried | None = None,
         progress: Callable[[float], None] = lambda done: None,
     ) -> float:
-        """:meth:`psnr_of` the views, or of so many of them, spread evenly."""
-        views = self.views.views
-        return self.psnr_of(views if most is None else _evenly(views, most), candidate, coded, progress)
-
-    def psnr_of(
-        self,
-        views: Sequence[Camera],
-        candidate: Drawable,
-        coded: Carried | None = None,
-        progress: Callable[[float], None] = lambda done: None,
-    ) -> float:
-        """Mean over some views of the PSNR against the uncompressed scene's pictures, in decibels.
+        """Mean over the views of the PSNR against the uncompressed scene's pictures, in decibels.
 
         Identical pictures are left out of the mean; it is infinite if all are identical.
 
         Args:
-            views: any.
             candidate: to judge; where it is on a device, that is the evaluator's.
+            most: judge by so many of the views, spread evenly; None: by all.
             coded: what the pool's workers on other computers are sent in its place.
             progress: called with the part of the views that is done.
         """
-        return _mean_psnr(self._judging.figures(candidate, views, coded, lambda done: progress(done / len(views))))
+        views = range(len(self.views.views))
+        return _mean_psnr(self.figures(candidate, views if most is None else _evenly(views, most), coded, progress))
 
     def judge(
         self, candidate: Drawable, progress: Callable[[str, float], None], coded: Carried | None = None
@@ -155,31 +141,13 @@ class Evaluator(Owner):
         """PSNR and SSIM from every view, and the mean PSNR from the training views beside them, if there are any.
 
         Args:
-            candidate, coded: as of :meth:`psnr_of`.
+            candidate, coded: as of :meth:`psnr`.
             progress: called with the stage and the part of it that is done.
         """
-        views, beside = self.views.views, self.views.beside
-        stage, together = comparing(len(views)), [*views, *beside]
-        progress(stage, 0.0)
-        found = self._judging.figures(candidate, together, coded, lambda done: progress(stage, done / len(together)))
-        return comparison_of(found[: len(views)]), _mean_psnr(found[len(views) :]) if beside else None
-
-    def pictures(self, candidate: Drawable, names: Sequence[str]) -> list[tuple[FloatArray, FloatArray]]:
-        """(H, W, 3) float32 pictures of both scenes from the named views.
-
-        Raises:
-            UsageError: there is no such view.
-        """
-        return self._judging.pictures(candidate, [self.views.named(name) for name in names])
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._judging.__exit__(kind, error, trace)
-
-    def close(self) -> None:
-        """Give all device memory back."""
-        self._judging.close()
+        count = len(self.views.views)
+        progress(comparing(count), 0.0)
+        found = self.figures(candidate, None, coded, lambda done: progress(comparing(count), done))
+        return comparison_of(found[:count]), _mean_psnr(found[count:]) if self.views.beside else None
 
 
 def _mean_psnr(views: Sequence[ViewFigures]) -> float:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,12 +20,10 @@ from potr_cl.quality.metrics import Lpips
 from potr_cl.quality.metrics_device import Similarity, in_batches
 from potr_cl.quality.photographs import read_photograph
 from potr_cl.quality.pictures import Picture, place_pictures
+from potr_cl.views.targets import TargetPictures
 
 #: Photographs read before they are needed.
 _READ_AHEAD = 32
-
-#: Makes pictures of a scene from some views, on a device as long as the context lasts.
-Pictures = Callable[[Sequence[Camera]], AbstractContextManager[list[Picture]]]
 
 
 class Against:
@@ -51,25 +48,31 @@ class Against:
         self._ground_truth, self._lpips = ground_truth, lpips
         self._similarity = Similarity(device)
 
-    def figures(self, a: Pictures, b: Pictures, cameras: Sequence[Camera]) -> Iterator[ViewFigures]:
+    def figures(
+        self, a: TargetPictures, b: TargetPictures, views: Sequence[Camera], numbers: Sequence[int]
+    ) -> Iterator[ViewFigures]:
         """The figures of some views, in their order.
 
         Args:
-            a, b: make the pictures of the reference and of the candidate.
-            cameras: the views.
+            a, b: the pictures of the reference and of the candidate.
+            views: all that these know.
+            numbers: of those that are meant.
 
         Raises:
             UsageError: a photograph cannot be opened.
             DataError: a photograph is damaged.
             DeviceError: a view does not fit the device.
         """
-        truth = self._ground_truth
+        truth, cameras = self._ground_truth, [views[number] for number in numbers]
         photographs = [] if truth is None else [(truth[camera.name], camera) for camera in cameras]
+        first = 0
         with thread_pool() as pool:
             read = _ground_truth(pool, photographs, self._background)
             for some in in_batches(self._device, cameras):
-                with a(some) as of_a, b(some) as of_b:
-                    yield from self._compared(some, of_a, of_b, None if truth is None else read)
+                now = numbers[first : first + len(some)]
+                of_a, of_b = (place_pictures(of.of(now), some) for of in (a, b))
+                yield from self._compared(some, of_a, of_b, None if truth is None else read)
+                first += len(some)
 
     def _compared(
         self,

@@ -1,4 +1,4 @@
-"""Photographs of a scene's views: to judge pictures by. As targets of a re-fit: stages/refitting/targets.py."""
+"""Photographs of a scene's views: to judge pictures by. As targets of a re-fit: views/targets.py."""
 
 from __future__ import annotations
 

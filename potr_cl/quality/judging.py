@@ -1,18 +1,23 @@
-"""What one device does of the judging: :class:`Judging`, and the same as a part of a pool's work, :class:`JudgingPart`.
+"""Judging scenes by one uncompressed scene, on one device or several: :class:`Judging`.
 
-A view's figures are found on one device, from sums over parts of its pictures that are the same on every device of a
-kind. So it makes no difference who judges which view.
+A view's figures are found on one device (:class:`JudgingPart`), from sums over parts of its pictures that are the same
+on every device of a kind. So it makes no difference who judges which view.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TypeAlias
+from types import TracebackType
+from typing import Any, TypeVar
 
+import pyopencl as cl
+
+from potr_cl.errors import DeviceError
 from potr_cl.formats.images import Colour
 from potr_cl.host.threads import Ahead
 from potr_cl.model.camera import Camera
@@ -23,17 +28,28 @@ from potr_cl.opencl.memory import Owner
 from potr_cl.quality.figures import Against, ViewFigures
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.quality.metrics import Lpips, psnr
-from potr_cl.quality.pictures import Picture, rendered
-from potr_cl.raster.carried import Carried
+from potr_cl.quality.metrics_device import in_batches
+from potr_cl.raster.carried import Carried, HostScene, LentScene
 from potr_cl.raster.kept_scene import KeptScene, lying_on
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA, RasterRules
-from potr_cl.raster.scene_buffers import Drawable
-from potr_cl.views.pictures import SeenRasterizer, rasterizer_of
-from potr_cl.workers.pool import Part
+from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
+from potr_cl.views.pictures import SeenRasterizer, groups_worth_it, rasterizer_of
+from potr_cl.views.targets import RenderedTargets, Room, TargetPictures
+from potr_cl.workers.dealing import shares
+from potr_cl.workers.parts import Each, Parts
+from potr_cl.workers.pool import Part, Pool
 
 #: Bytes of the uncompressed scene's pictures that are kept from one candidate to the next; others are rendered again.
 CACHED_PICTURES = 1 << 30
+#: A larger uncompressed scene is not sent to another computer to be judged there: its pictures take less time here.
+_SENT_ANYWAY = 1 << 28
+#: About how often several devices meet while they judge, so that one can tell how far they are.
+_MEETINGS = 16
+
+_log = logging.getLogger("potr_cl")
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -54,29 +70,42 @@ class Looks:
     remember: bool = False
 
 
-class Judging(Owner):
+class JudgingPart(Part):
     """Compares candidates with one uncompressed scene, on one device.
 
     Args:
         device: to render on.
-        reference: the uncompressed scene; it goes to the device when its pictures are first wanted.
+        memory: of no account: pictures come and go.
+        reference: the uncompressed scene; its pictures are made when they are first wanted.
         looks: how pictures are made.
+        views: all views that may be judged.
         groups: of the reference's splats, where views see little of it.
 
     Raises:
         DeviceError: the kernels cannot be built.
     """
 
-    def __init__(self, device: Device, reference: Drawable, looks: Looks, groups: SplatGroups | None = None) -> None:
-        self._device, self._scene, self._looks, self._groups = device, reference, looks, groups
+    def __init__(
+        self,
+        device: Device,
+        memory: int | None,
+        reference: Drawable | KeptScene | Carried,
+        looks: Looks,
+        views: Sequence[Camera],
+        groups: SplatGroups | None = None,
+    ) -> None:
+        self._device, self._looks, self._views, self._groups = device, looks, views, groups
         self._against = Against(device, looks.background, looks.ground_truth, looks.lpips)
-        self._reference: Rasterizer | SeenRasterizer | None = None
+        self._taken, self._opened = ExitStack(), ExitStack()
         self._candidate: Rasterizer | SeenRasterizer | None = None
-        self._pictures: dict[_Seen, Picture] = {}
-        self._kept = ExitStack()
-        self._room = min(CACHED_PICTURES, device.info.memory // 16) if looks.remember else 0
+        self._reference: Rasterizer | SeenRasterizer | None = None
+        with ExitStack() as owned:
+            self._scene = owned.enter_context(lying_on(device, reference))
+            room = min(CACHED_PICTURES, device.info.memory // 16) if looks.remember else 0
+            self._pictures = owned.enter_context(TargetPictures(device, views, Room(room), self))
+            self._owned = owned.pop_all()
 
-    def take(self, candidate: Drawable, groups: SplatGroups | None = None) -> None:
+    def take(self, candidate: Drawable | Carried, groups: SplatGroups | None = None) -> None:
         """Judge a candidate from now on, until :meth:`forget`.
 
         Args:
@@ -87,134 +116,308 @@ class Judging(Owner):
             DeviceError: it does not fit the device.
         """
         self.forget()
-        self._candidate = rasterizer_of(self._device, candidate, self._looks.rules, self._looks.background, groups)
+        with ExitStack() as stack:
+            scene = stack.enter_context(lying_on(self._device, candidate))
+            self._candidate = self._rasterizer(stack, scene, groups)
+            self._taken = stack.pop_all()
 
     def forget(self) -> None:
         """Give the candidate's memory back, and the reference's where its pictures may be all that is needed of it."""
-        if self._candidate is not None:
-            self._candidate.close()
-            self._candidate = None
+        self._candidate = None
+        self._taken.close()
         if self._looks.remember:
-            self._close_reference()
+            self._reference = None
+            self._opened.close()
 
-    def figures(self, cameras: Sequence[Camera]) -> Iterator[ViewFigures]:
+    def figures(self, numbers: Sequence[int], told: Callable[[], None] = lambda: None) -> list[ViewFigures]:
         """The figures of some views, in their order.
+
+        Args:
+            numbers: of the views.
+            told: called after each.
 
         Raises:
             As :meth:`potr_cl.quality.figures.Against.figures`.
         """
-        yield from self._against.figures(self._references, partial(rendered, self._taken), cameras)
+        found = []
+        with TargetPictures(self._device, self._views, Room(0), RenderedTargets(self._taken_one, self._views)) as shown:
+            for each in self._against.figures(self._pictures, shown, self._views, numbers):
+                found.append(each)
+                told()
+        return found
 
-    def by_photographs(self, cameras: Sequence[Camera], photographs: GroundTruth) -> Iterator[tuple[float, float]]:
+    def by_photographs(
+        self, numbers: Sequence[int], photographs: GroundTruth, told: Callable[[], None] = lambda: None
+    ) -> list[tuple[float, float]]:
         """PSNR in decibels of both scenes' pictures against the photograph of each view, the reference's first.
 
         Raises:
             UsageError, DataError: a photograph cannot be read.
             DeviceError: a view does not fit the device.
         """
-        with Ahead(photographs.picture, cameras) as read:
-            for camera, photograph in read:
-                reference, candidate = self.pictures(camera)
-                yield psnr(reference, photograph), psnr(candidate, photograph)
+        found = []
+        with Ahead(photographs.picture, [self._views[number] for number in numbers]) as read:
+            for number, (_, photograph) in zip(numbers, read, strict=True):
+                reference, candidate = self.pictures(number)
+                found.append((psnr(reference, photograph), psnr(candidate, photograph)))
+                told()
+        return found
 
-    def pictures(self, camera: Camera) -> tuple[FloatArray, FloatArray]:
+    def pictures(self, number: int) -> tuple[FloatArray, FloatArray]:
         """(H, W, 3) float32 pictures of both scenes from a view."""
-        return self._original.render(camera)[0], self._taken.render(camera)[0]
+        camera = self._views[number]
+        return self._original.render(camera)[0], self._taken_one.render(camera)[0]
+
+    def into(self, numbers: Sequence[int], buffer: cl.Buffer, start: int = 0) -> None:
+        """The reference's pictures, as a :class:`potr_cl.views.targets.Targets`."""
+        RenderedTargets(self._original, self._views).into(numbers, buffer, start)
+
+    def _rasterizer(self, stack: ExitStack, scene: Drawable, groups: SplatGroups | None) -> Rasterizer | SeenRasterizer:
+        found = rasterizer_of(self._device, scene, self._looks.rules, self._looks.background, groups)
+        stack.callback(found.close)
+        return found
 
     @property
-    def _taken(self) -> Rasterizer | SeenRasterizer:
+    def _taken_one(self) -> Rasterizer | SeenRasterizer:
         assert self._candidate is not None, "there is no candidate"
         return self._candidate
 
     @property
     def _original(self) -> Rasterizer | SeenRasterizer:
         if self._reference is None:
-            looks = self._looks
-            self._reference = rasterizer_of(self._device, self._scene, looks.rules, looks.background, self._groups)
+            self._reference = self._rasterizer(self._opened, self._scene, self._groups)
         return self._reference
-
-    @contextmanager
-    def _references(self, cameras: Sequence[Camera]) -> Iterator[list[Picture]]:
-        """The uncompressed scene's pictures; kept from one candidate to the next while there is room."""
-        missing = [camera for camera in cameras if _seen(camera) not in self._pictures]
-        with ExitStack() as stack:
-            new: list[Picture] = []
-            if missing:
-                nbytes = sum(12 * camera.width * camera.height for camera in missing)
-                keep = nbytes <= self._room
-                new = (self._kept if keep else stack).enter_context(rendered(self._original, missing))
-                if keep:
-                    self._room -= nbytes
-                    self._pictures |= {_seen(camera): picture for camera, picture in zip(missing, new, strict=True)}
-            rest = iter(new)
-            yield [self._pictures.get(_seen(camera)) or next(rest) for camera in cameras]
-
-    def _close_reference(self) -> None:
-        if self._reference is not None:
-            self._reference.close()
-            self._reference = None
 
     def close(self) -> None:
         self.forget()
-        self._close_reference()
-        self._kept.close()
-        self._pictures = {}
+        self._opened.close()
+        self._owned.close()
 
 
-#: What a view's picture depends on. From Python, several views may have the same name.
-_Seen: TypeAlias = "tuple[float | bytes, ...]"
-
-
-def _seen(camera: Camera) -> _Seen:
-    intrinsics = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-    return *intrinsics, camera.rotation.tobytes(), camera.translation.tobytes()
-
-
-class JudgingPart(Part):
-    """Some views; see :class:`Judging`.
+class Judging(Owner):
+    """Compares candidates with one uncompressed scene.
 
     Args:
-        device: to render on.
-        memory: of no account: pictures come and go.
+        device: of this process, the pool's first.
         reference: the uncompressed scene.
-        looks, groups: as of :class:`Judging`.
+        views: all views that may be judged.
+        looks: how pictures are made.
+        pool: workers that views are shared out to; None: the device does all.
+        anyway: whether other computers are sent the uncompressed scene, however large.
+        coded: the uncompressed scene for other computers, where there is something smaller.
+
+    Raises:
+        DeviceError: the kernels cannot be built.
     """
 
     def __init__(
         self,
         device: Device,
-        memory: int | None,
-        reference: Scene | KeptScene | Carried,
+        reference: Drawable | KeptScene,
+        views: Sequence[Camera],
         looks: Looks,
-        groups: SplatGroups | None = None,
+        pool: Pool | None = None,
+        anyway: bool = False,
+        coded: Carried | None = None,
     ) -> None:
-        self._device = device
-        self._candidate = ExitStack()
-        with ExitStack() as owned:
-            drawable = owned.enter_context(lying_on(device, reference))
-            self._judging = owned.enter_context(Judging(device, drawable, looks, groups))
-            self._owned = owned.pop_all()
+        self.device, self._reference, self._views, self._looks = device, reference, list(views), looks
+        self._pool = pool if pool is not None and pool.first is device else None
+        self._anyway, self._coded = anyway, coded
+        kept = reference if isinstance(reference, KeptScene) else None
+        here = reference if not isinstance(reference, KeptScene) else reference.drawable(device, reference.scene)
+        self._groups: SplatGroups | None = None
+        if kept is not None:
+            there, large = isinstance(here, SceneBuffers), kept.is_large_for(device)
+            self._groups = groups_worth_it(device, kept.scene, views, looks.rules.near, there, large, kept.groups)
+        elif isinstance(here, Scene):
+            self._groups = groups_worth_it(device, here, views, looks.rules.near)
+        self._own = JudgingPart(device, None, here, looks, self._views, self._groups)
+        self._parts: Parts | None = None
+        self._part_of: dict[int, int] = {}  # who has a view; the others are this device's
+        self._left = ExitStack()
 
-    def take(self, candidate: Carried) -> None:
-        """See :meth:`Judging.take`."""
-        self.forget()
+    def figures(
+        self,
+        candidate: Drawable,
+        numbers: Sequence[int] | None = None,
+        coded: Carried | None = None,
+        progress: Callable[[float], None] = lambda done: None,
+    ) -> list[ViewFigures]:
+        """The figures of a candidate from some views, in their order.
+
+        Args:
+            candidate: to judge; where it is on a device, that is this one.
+            numbers: of the views; None: all.
+            coded: the same for other computers: what it was coded as is smaller. None: there is nothing smaller.
+            progress: called with the part of the views that is done.
+
+        Raises:
+            UsageError, DataError: a photograph cannot be read.
+            DeviceError: a view does not fit the device.
+        """
+        return self._of_views("figures", candidate, numbers, coded, progress)
+
+    def by_photographs(self, candidate: Drawable, photographs: GroundTruth) -> list[tuple[float, float]]:
+        """See :meth:`JudgingPart.by_photographs`, of all views; other computers have no photographs."""
+        return self._of_views("by_photographs", candidate, None, None, lambda done: None, photographs)
+
+    def pictures(self, candidate: Drawable, numbers: Sequence[int]) -> list[tuple[FloatArray, FloatArray]]:
+        """(H, W, 3) float32 pictures of both scenes from some views."""
         with ExitStack() as stack:
-            self._judging.take(stack.enter_context(candidate.on(self._device)))
-            stack.callback(self._judging.forget)
-            self._candidate = stack.pop_all()
+            self._take(stack, candidate)
+            return [self._own.pictures(number) for number in numbers]
 
-    def forget(self) -> None:
-        """Give the candidate's memory back."""
-        self._candidate.close()
+    def _take(self, stack: ExitStack, candidate: Drawable) -> None:
+        self._own.take(candidate, self._groups_of(candidate))
+        stack.callback(self._own.forget)
 
-    def figures(self, cameras: Sequence[Camera]) -> list[ViewFigures]:
-        """See :meth:`Judging.figures`."""
-        return list(self._judging.figures(cameras))
+    def _groups_of(self, candidate: Drawable) -> SplatGroups | None:
+        """Those of a candidate that is too large for what a user allows, where views see little of it."""
+        reference = self._reference
+        if not isinstance(candidate, Scene) or not isinstance(reference, KeptScene) or self._groups is None:
+            return None
+        if not self.device.info.shares_host_memory or not reference.is_large_for(self.device, candidate):
+            return None
+        return groups_worth_it(self.device, candidate, self._views, self._looks.rules.near, large=True)
 
-    def by_photographs(self, cameras: Sequence[Camera], photographs: GroundTruth) -> list[tuple[float, float]]:
-        """See :meth:`Judging.by_photographs`."""
-        return list(self._judging.by_photographs(cameras, photographs))
+    def _of_views(
+        self,
+        command: str,
+        candidate: Drawable,
+        numbers: Sequence[int] | None,
+        coded: Carried | None,
+        progress: Callable[[float], None],
+        *args: Any,
+    ) -> list[Any]:
+        numbers = range(len(self._views)) if numbers is None else numbers
+        found: dict[int, Any] = {}
+        done = 0
+
+        def told(some: int = 1) -> None:
+            nonlocal done
+            done += some
+            progress(done / len(numbers))
+
+        def own(some: Sequence[int]) -> None:
+            found.update(zip(some, getattr(self._own, command)(some, *args, told), strict=True))
+
+        with ExitStack() as stack:
+            self._take(stack, candidate)
+            sent = self._for_others(candidate, coded)
+            parts = None if sent is None else self._open_parts()
+            if parts is not None:
+                try:
+                    _asked(partial(parts.begin, "take", sent, anew=True))
+                    for mine, theirs in self._meetings(numbers, len(parts)):
+                        pending = _asked(partial(parts.begin, command, Each(theirs), *args, logged=False))
+                        own(mine)
+                        for some, results in zip(theirs, _asked(pending.results), strict=True):
+                            found.update(zip(some, results, strict=True))
+                            told(len(some))
+                    _asked(partial(parts.begin, "forget", anew=True)).results()
+                except _NobodyElse as lost:
+                    self._lose_parts(lost.error)
+            # All of them, if nobody helps; or what those who are lost have left.
+            if left := [number for number in numbers if number not in found]:
+                own(left)
+        return [found[number] for number in numbers]
+
+    def _meetings(self, numbers: Sequence[int], others: int) -> list[tuple[list[int], list[list[int]]]]:
+        """Who does which views until they meet, from meeting to meeting: this device's first."""
+        dealt: list[list[int]] = [[] for _ in range(others + 1)]
+        for number in numbers:
+            dealt[self._part_of.get(number, -1)].append(number)
+        most = max(map(len, dealt))
+        # Views that are rendered together are not torn apart: that would take longer.
+        together = max(len(next(in_batches(self.device, [self._views[number] for number in numbers]), ())), 1)
+        some = together * max(round(most / (together * _MEETINGS)), 1)
+        now = [[each[first : first + some] for each in dealt] for first in range(0, most, some)]
+        return [(mine, theirs) for *theirs, mine in now]
+
+    def _for_others(self, candidate: Drawable, coded: Carried | None) -> Carried | None:
+        """What other devices are given of a candidate; None: nothing that they could use."""
+        if self._pool is None:
+            return None
+        if self._pool.in_process:
+            return LentScene(candidate) if isinstance(candidate, SceneBuffers) else HostScene(candidate)
+        if coded is not None or isinstance(candidate, SceneBuffers):
+            return coded
+        return HostScene(candidate, travels=True)
+
+    def _open_parts(self) -> Parts | None:
+        """The others' parts; None: they are not worth it, or lost."""
+        pool = self._pool
+        if pool is None or self._parts is not None:
+            return self._parts
+        shared = self._shared(pool)
+        if shared is None:
+            self._pool = None
+            return None
+        try:
+            dealt = shares(pool, len(self._views))
+            thing = self._left.enter_context(pool.shared(shared))
+            given = [(thing, self._looks, self._views, self._groups)] * len(dealt.others)
+            if given:
+                self._parts = self._left.enter_context(Parts(pool, JudgingPart, given, names=dealt.names))
+        except DeviceError as error:
+            self._lose_parts(error)
+            return None
+        self._part_of = {number: place for place, numbers in enumerate(dealt.others) for number in numbers}
+        return self._parts
+
+    def _shared(self, pool: Pool) -> Scene | KeptScene | Carried | None:
+        """What other devices are given of the uncompressed scene; None: they had better do without."""
+        reference = self._reference
+        if pool.in_process:
+            return LentScene(reference) if isinstance(reference, SceneBuffers) else reference
+        if self._looks.lpips is not None or self._looks.ground_truth is not None:
+            return None  # they are read, or computed, here
+        if self._coded is not None:
+            return self._coded
+        scene = reference.scene if isinstance(reference, KeptScene) else reference
+        if isinstance(scene, SceneBuffers):
+            return None
+        there = pool.has(scene) or scene.nbytes <= _SENT_ANYWAY
+        return scene if there or self._anyway else None
+
+    def _lose_parts(self, error: DeviceError) -> None:
+        # What else the line says is how to mend it, which nobody has to.
+        _log.warning("no worker can judge (%s); using %s instead", str(error).split(": ")[0], self.device.info)
+        self._parts, self._pool, self._part_of = None, None, {}
+        abandoned = _Abandoned()
+        self._left.__exit__(type(abandoned), abandoned, None)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._parts = None
+        self._own.close()
+        self._left.__exit__(kind, error, trace)  # after Ctrl-C nobody is waited for
 
     def close(self) -> None:
-        self._candidate.close()
-        self._owned.close()
+        """Give all device memory back, here and elsewhere."""
+        self.__exit__(None, None, None)
+
+
+class _Abandoned(BaseException):
+    """Has parts left without waiting for workers that may stand still."""
+
+
+class _NobodyElse(Exception):
+    """All others are lost."""
+
+    def __init__(self, error: DeviceError) -> None:
+        super().__init__(str(error))
+        self.error = error
+
+
+def _asked(call: Callable[[], T]) -> T:
+    """What the others answer.
+
+    Raises:
+        _NobodyElse: none of them can.
+    """
+    try:
+        return call()
+    except DeviceError as error:
+        raise _NobodyElse(error) from None

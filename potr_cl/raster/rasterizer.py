@@ -236,6 +236,27 @@ class Rasterizer(Owner):
         """
         return self._preparation.prepare_again(views, cameras)
 
+    def projected(self, cameras: Sequence[Camera], former: ViewSet | None = None) -> ViewSet:
+        """Views with nothing but their projection, which is enqueued.
+
+        Args:
+            cameras: of the views.
+            former: views that this gave before, whose memory is taken, or given back; of no use any more.
+
+        Returns:
+            The views; the caller closes them.
+
+        Raises:
+            DeviceMemoryError: they do not fit the device.
+        """
+        views = former
+        if views is None or not views.aim_all(cameras):
+            if views is not None:
+                views.close()
+            views = self._preparation.new_views(cameras)
+        self.project(views)
+        return views
+
     def composite(self, view: View) -> tuple[FloatArray, FloatArray]:
         """The picture of a prepared view; returns what :meth:`render` returns."""
         self._enqueue_composite(view.owner)

@@ -32,11 +32,11 @@ from potr_cl.stages.fitting.fit import (
     kept_pictures,
 )
 from potr_cl.stages.fitting.photographs import fit_to_photographs, longer
-from potr_cl.stages.fitting.pictures import TargetPictures
 from potr_cl.stages.fitting.settling import Looking, Settling, settle
+from potr_cl.stages.fitting.together import Helpers
 from potr_cl.stages.prune import Prune
-from potr_cl.stages.refitting.targets import RenderedTargets, Targets
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
+from potr_cl.views.targets import RenderedTargets, TargetPictures, Targets
 
 #: Times the threshold of pruning up to which a fit makes up for splats, about (docs/benchmarks/findings.md): for this
 #: threshold, and for others as much more as its root is larger, because a fit brings the more, the fewer splats are
@@ -65,6 +65,8 @@ _LESS = 0.97
 #: A fit that has made up for no splats has to leave less than this part of the held-out views' error: the re-fit takes
 #: most of what a little one mends off by itself, and splats that have moved have fewer coefficients that are 0.
 _LESS_ALONE = 0.7
+#: A larger scene that other computers have not got is not sent to them for a fit.
+_SENT_ANYWAY = 1 << 28
 #: Why a fit was left out.
 _TOO_FEW_VIEWS = "it needs two training views or more, because one of them is held out and tells whether it helps"
 _NO_GAIN = "on the views that were held out it did not make up for the splats that were removed before it"
@@ -228,7 +230,7 @@ class Fit(Stage):
             targets: Targets | TargetPictures = rendered
             if bench.memory is None:  # else pruning needs all that is allowed, between two fits
                 targets = stack.enter_context(kept_pictures(bench.opened, seen.views, rendered))
-            found = self._cycles(seen, bench, targets, asked)
+            found = self._cycles(seen, bench, targets, asked, _helpers(bench, state))
             found = dataclasses.replace(found, views=state.views, added=state.added)
             if bench.photographs is not None and self.photograph_steps != 0 and not asked:
                 found = self._to_photographs(found, bench, asked)
@@ -239,7 +241,8 @@ class Fit(Stage):
             if found.truth is not None:
                 rasterizer = stack.enter_context(Rasterizer(bench.opened, found.truth, background=bench.background))
                 targets = RenderedTargets(rasterizer, seen.views)
-            return self._settled(found, bench, Looking(seen.views, seen.added, targets, rasterizer), asked)
+            looking = Looking(seen.views, seen.added, targets, rasterizer, _helpers(bench, found))
+            return self._settled(found, bench, looking, asked)
 
     def _looking_between(self, state: State, bench: Workbench) -> State:
         """The state with the views that the fit looks at."""
@@ -250,7 +253,10 @@ class Fit(Stage):
         added = views_between(state.source, given, each)  # with threads it takes twice as long
         return dataclasses.replace(state, views=(*given, *added), added=len(added))
 
-    def _cycles(self, state: State, bench: Workbench, targets: Targets | TargetPictures, asked: SupportsBool) -> State:
+    def _cycles(
+        self, state: State, bench: Workbench, targets: Targets | TargetPictures, asked: SupportsBool,
+        helpers: Helpers | None,
+    ) -> State:  # fmt: skip
         """Remove splats and fit by turns, each time up to a higher threshold, and keep what costs least."""
         price = state.learnt.price
         worth = 0.0 if price is None else _WORTH * price
@@ -272,7 +278,7 @@ class Fit(Stage):
             def progress(now: int, _steps: int, before: int = done) -> None:
                 bench.progress("fit", 0.99 * (before + now) / total)
 
-            fitted = self._fitted(last, bench, targets, steps, progress, asked)
+            fitted = self._fitted(last, bench, targets, steps, progress, asked, helpers)
             last, done = dataclasses.replace(last, scene=fitted.scene, geometry=None), done + steps
             cost = fitted.error + worth * len(fitted.scene)
             spared = len(state.scene) - len(fitted.scene)
@@ -352,10 +358,22 @@ class Fit(Stage):
         steps: int,
         progress: FitProgress,
         asked: SupportsBool,
+        helpers: Helpers | None,
     ) -> Fitted:
         options = dataclasses.replace(self._options(bench.opened.family, bench.memory), steps=steps)
         options = dataclasses.replace(options, rates=self._sparse(options.rates, state))
         return fit_scene(
             bench.opened, state.scene, state.views, targets, options, state.added, bench.background, progress,
-            bench.tell, asked,
+            bench.tell, asked, helpers=helpers,
         )  # fmt: skip
+
+
+def _helpers(bench: Workbench, state: State) -> Helpers | None:
+    """Who helps to fit to the pictures of a state's goal."""
+    pool, kept = bench.pool, bench.kept
+    if pool is None:
+        return None
+    if not pool.in_process and not pool.has(state.goal) and state.goal.nbytes > _SENT_ANYWAY:
+        return None
+    there = kept is not None and pool.in_process and kept.is_of(state.goal)
+    return Helpers(pool, kept if kept is not None and there else state.goal)

@@ -22,13 +22,12 @@ from potr_cl.stages.guarded import as_important
 from potr_cl.stages.refitting.colour_refit import ColourRefit, HelpFrom
 from potr_cl.stages.refitting.coming_scene import ComingScene
 from potr_cl.stages.refitting.photographs import PhotographChoice, hold_out
-from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.stages.refitting.placement import placed
 from potr_cl.stages.refitting.refit import active_coefficients, chosen_coefficients, refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
 from potr_cl.stages.refitting.shared_map import colour_shares
-from potr_cl.stages.refitting.targets import GroundTruthTargets, RememberedTargets, Targets, targets_of
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
+from potr_cl.views.targets import HostTargets, PhotographTargets, PicturesAhead, Targets, targets_of
 
 #: A scene that takes more than this part of the memory that is given makes room for the re-fit.
 _LARGE = 1 / 16
@@ -195,7 +194,7 @@ class Refit(Stage):
                 fit_to, judging = hold_out(photographs.of(given))
                 # Nobody photographed added views. Renders of them beside photographs would ask for colours that leap
                 # from one view to the next, and SH can do that: held-out photographs were matched 7 to 13 dB worse.
-                targets = GroundTruthTargets(bench.opened, photographs, fit_to)
+                targets = PhotographTargets(bench.opened, photographs, fit_to)
                 to_photographs, its_geometry = fitted(fit_to, targets, 1)
                 psnrs = []
                 for each in (to_photographs, refitted):
@@ -244,7 +243,7 @@ def _pictures_of_goal(state: State, bench: Workbench, ahead: PicturesAhead | Non
         if not little or bench.pool is not None:
             yield targets
             return
-        remembered = RememberedTargets(device, targets, views)
+        remembered = HostTargets(device, targets, views)
     with remembered:
         yield remembered
 

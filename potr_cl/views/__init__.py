@@ -14,8 +14,9 @@ Follow it in this order:
 A stage is a *use*: it says what it makes of a set of prepared views, and adds up exact integers by the splats' numbers
 in the scene, so that plans, devices and computers give the same bits. Pruning is one (stages/pruning/removal.py), the
 re-fit another (stages/refitting/own_views.py): it goes through :meth:`~potr_cl.views.engine.ViewEngine.walk`, to which
-it makes no difference which views stay. A fit and judging come onto it in the same way; judging with a plan of which
-nothing stays. Several devices make a plan each, of the numbers of their own views.
+it makes no difference which views stay. Several devices make a plan each, of the numbers of their own views. A fit and
+judging look at a view as often as it comes, in colours that nobody has seen before: they keep nothing but pictures.
 
-shares.py deals views and splats out to computers. pictures.py renders large scenes.
+targets.py has the pictures that views should show: rendered, read, kept, or made ahead. shares.py deals views and
+splats out to computers. pictures.py renders large scenes.
 """

@@ -257,7 +257,7 @@ def nothing_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:
     )
     monkeypatch.setattr("potr_cl.api.editing.RenderedTargets", lambda *given: given)
     monkeypatch.setattr(
-        "potr_cl.api.editing.GroundTruthTargets", lambda device, truth, views: [truth.picture(view) for view in views]
+        "potr_cl.api.editing.PhotographTargets", lambda device, truth, views: [truth.picture(view) for view in views]
     )
 
 

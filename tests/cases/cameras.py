@@ -46,16 +46,6 @@ def refused(path: Path, message: str, kind: type[PotrError] = DataError) -> None
     assert len(str(caught.value)) < 600
 
 
-def load_or_refuse(path: Path) -> None:
-    message = ""
-    try:
-        assert load_cameras(path)
-    except PotrError as error:
-        message = str(error)
-    assert "\n" not in message
-    assert len(message) < 1000
-
-
 def pixel(camera: Camera, point: list[float]) -> tuple[float, float]:
     """Where a world point appears, by Camera's definition."""
     t = camera.rotation @ np.array(point) + camera.translation

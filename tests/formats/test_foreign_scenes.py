@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
-from potr_cl.errors import PotrError, UsageError
+from potr_cl.errors import UsageError
 from potr_cl.formats import load_scene, scene_writer
 from potr_cl.opencl.device import Device
 from tests.cases.judging import psnr
@@ -57,33 +54,6 @@ def test_what_is_written_looks_as_the_scene_does(device, tmp_path, plush_excerpt
     assert len(scene) == len(plush_excerpt)
     assert psnr(device, plush_excerpt, scene, plush_excerpt_cameras) >= WRITTEN[name, version]
     assert [p.name for p in tmp_path.iterdir()] == [name], "something is left behind"
-
-
-@pytest.mark.parametrize("name", FOREIGN)
-@settings(
-    max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
-)
-@given(draw=st.data())
-def test_damage_is_an_error_of_ours_or_does_not_matter(tmp_path, data, name, draw):
-    content = bytearray((data / "foreign" / name).read_bytes())
-    what = draw.draw(st.sampled_from(["truncate", "bytes", "header", "append"]))
-    if what == "truncate":
-        del content[draw.draw(st.integers(0, len(content) - 1)) :]
-    elif what == "append":
-        content += draw.draw(st.binary(max_size=100))
-    else:
-        last = min(len(content), 600 if what == "header" else len(content)) - 1
-        for place in draw.draw(st.lists(st.integers(0, last), min_size=1, max_size=8)):
-            content[place] = draw.draw(st.integers(0, 255))
-    path = tmp_path / f"damaged{''.join(Path(name).suffixes)}"
-    path.write_bytes(content)
-    message = ""
-    try:
-        assert 0 < len(load_scene(path)) < 10000
-    except PotrError as error:
-        message = str(error)
-    assert "\n" not in message
-    assert not message or str(path) in message
 
 
 @pytest.mark.parametrize("name", ["a.spz", "a.sog"])

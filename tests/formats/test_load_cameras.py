@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from PIL import Image
 
 from potr_cl import UsageError
@@ -16,8 +13,7 @@ from potr_cl.formats import load_cameras
 from potr_cl.formats.cameras import view_files
 from potr_cl.model.camera import test_views as views_for_judging
 from potr_cl.model.camera import train_views
-from tests.cases.cameras import assert_same_views, load_or_refuse, nerfstudio, refused, view, write_image, write_json
-from tests.cases.own_warnings import warnings_are_errors
+from tests.cases.cameras import assert_same_views, nerfstudio, refused, view, write_image, write_json
 
 # The same views in different formats ---------------------------------------------------------------------------------
 
@@ -132,37 +128,3 @@ def test_paths_of_no_known_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     refused(tmp_path / "a.json", "has no cameras", UsageError)
     monkeypatch.setattr(view_files, "MAX_JSON_BYTES", 10)
     refused(write_json(tmp_path / "b.json", [view()]), "too large for a camera file")
-
-
-# Fuzzing -------------------------------------------------------------------------------------------------------------
-
-JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5) | st.just(10**400),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
-    max_leaves=8,
-)
-
-
-def replace_somewhere(draw: st.DataObject, value: Any) -> Any:
-    """The JSON value with one of its parts replaced by another value, or dropped."""
-    keys = list(value) if isinstance(value, dict) else list(range(len(value))) if isinstance(value, list) else []
-    if not keys or draw.draw(st.integers(0, 9)) == 0:
-        return draw.draw(JSON)
-    key = draw.draw(st.sampled_from(keys))
-    copy = value.copy()
-    if draw.draw(st.integers(0, 9)) == 0:
-        del copy[key]
-    else:
-        copy[key] = replace_somewhere(draw, value[key])
-    return copy
-
-
-@pytest.mark.slow
-@warnings_are_errors
-@pytest.mark.parametrize("content", [[view(), view(img_name="b", split="test")], nerfstudio(["a.png", "b.png"])])
-@given(draw=st.data())
-@settings(max_examples=150, deadline=None)
-def test_json_with_replaced_parts(content: Any, draw: st.DataObject, tmp_path_factory: pytest.TempPathFactory) -> None:
-    for _ in range(draw.draw(st.integers(1, 3))):
-        content = replace_somewhere(draw, content)
-    load_or_refuse(write_json(tmp_path_factory.getbasetemp() / "fuzz.json", content))

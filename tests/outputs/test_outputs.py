@@ -274,7 +274,7 @@ def test_training_views_are_what_worth_is_about(plush_excerpt, plush_excerpt_cam
     """An error in a coefficient that is worth much is worth that in pictures: the sum over one channel's error."""
     from potr_cl.stages.refitting.colour_refit import ColourRefit
     from potr_cl.stages.refitting.refit_options import RefitOptions
-    from potr_cl.stages.refitting.targets import RenderedTargets
+    from potr_cl.views.targets import RenderedTargets
 
     views = train_views(plush_excerpt_cameras)
     with (
@@ -297,7 +297,7 @@ def test_coefficients_make_up_for_each_other(plush_excerpt, plush_excerpt_camera
     """Rounded in turn, the coefficients of a splat lose less than each for itself, and the file is no larger."""
     from potr_cl.stages.refitting.colour_refit import ColourRefit
     from potr_cl.stages.refitting.refit_options import RefitOptions
-    from potr_cl.stages.refitting.targets import RenderedTargets
+    from potr_cl.views.targets import RenderedTargets
 
     views, output = train_views(plush_excerpt_cameras), output_of(Path("a.compressed.ply"))
     request = Request(HyperParameters.from_quality(0.5, "best"))

@@ -61,9 +61,8 @@ def views(plush_excerpt_cameras):
 
 
 def compare(device, a, b, views, ground_truth=None, lpips=None):
-    with Judging(device, a, Looks(BACKGROUND, ground_truth=ground_truth, lpips=lpips)) as judging:
-        judging.take(b)
-        return comparison_of(list(judging.figures(views)))
+    with Judging(device, a, views, Looks(BACKGROUND, ground_truth=ground_truth, lpips=lpips)) as judging:
+        return comparison_of(judging.figures(b))
 
 
 def comparison(*psnrs):

@@ -15,7 +15,7 @@ from potr_cl.quality.metrics import psnr
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
-from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets
+from potr_cl.views.targets import PhotographTargets, RenderedTargets
 from tests.reference.scenes import random_scene, ring_of_cameras
 
 
@@ -59,7 +59,7 @@ def test_a_refit_to_ground_truth_is_one_to_what_they_show(device, scene, cameras
     """8 bits are all that tells the photographs from the pictures."""
     dimmed = dataclasses.replace(scene, sh=scene.sh * np.float32(0.5))
     options = RefitOptions(steps=20, gain=0, prior=1)
-    targets = GroundTruthTargets(device, GroundTruth(folder, cameras), cameras)
+    targets = PhotographTargets(device, GroundTruth(folder, cameras), cameras)
     refitted = refit_colours(device, dimmed, cameras, targets, options)
     with Rasterizer(device, scene) as rasterizer:
         wanted = refit_colours(device, dimmed, cameras, RenderedTargets(rasterizer, cameras), options)
@@ -93,6 +93,6 @@ def test_views_without_a_photograph_are_left_out(cameras, folder):
 def test_a_damaged_photograph(device, scene, cameras, folder):
     whole = (folder / "view_2.png").read_bytes()
     (folder / "view_2.png").write_bytes(whole[: len(whole) // 2])
-    targets = GroundTruthTargets(device, GroundTruth(folder, cameras), cameras)
+    targets = PhotographTargets(device, GroundTruth(folder, cameras), cameras)
     with pytest.raises(DataError, match=r"view_2\.png"):
         refit_colours(device, scene, cameras, targets)

@@ -18,7 +18,7 @@ from potr_cl.stages.refitting.coefficients import Coefficients, Vector
 from potr_cl.stages.refitting.colour_refit import ColourRefit
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
-from potr_cl.stages.refitting.targets import RenderedTargets, Targets
+from potr_cl.views.targets import RenderedTargets, Targets
 from tests.reference.refit import Array, Reference
 
 

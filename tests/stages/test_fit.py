@@ -17,8 +17,8 @@ from potr_cl.stages.fitting.fit import FitOptions, Fitted, fit_scene, held_out_e
 from potr_cl.stages.fitting.views import batches, share_out
 from potr_cl.stages.learnt import Learnt
 from potr_cl.stages.prune import Prune
-from potr_cl.stages.refitting.targets import RenderedTargets
 from potr_cl.stages.stage import State, Workbench
+from potr_cl.views.targets import RenderedTargets
 from tests.devices import FAMILIES, KERNELS, open_device
 from tests.reference.refit_cases import Pictures
 from tests.reference.scenes import ring_of_cameras, visible_scene

@@ -14,7 +14,7 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.fit import FitOptions, fit_scene
 from potr_cl.stages.fitting.memory import fit_bytes
-from potr_cl.stages.refitting.targets import RenderedTargets
+from potr_cl.views.targets import RenderedTargets
 from tests.devices import FAMILIES
 
 

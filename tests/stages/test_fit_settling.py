@@ -18,8 +18,8 @@ from potr_cl.stages.fitting.parameters import Factors, in_form_of_files
 from potr_cl.stages.fitting.settling import Looking, Settling, settle
 from potr_cl.stages.fitting.views import share_out
 from potr_cl.stages.refit import Refit
-from potr_cl.stages.refitting.targets import RenderedTargets
 from potr_cl.stages.stage import State, Workbench
+from potr_cl.views.targets import RenderedTargets
 from tests.devices import FAMILIES, open_device
 
 PARAMETERS = HyperParameters.from_quality(0.2, "best")

@@ -82,10 +82,13 @@ def sweep(devices, grouping, options, scene, cameras, elsewhere=False, spared=No
 @pytest.mark.parametrize(
     ("residency", "workers"),
     [
-        # Several devices have the extremes in the quick subset.
-        pytest.param(some, who, marks=pytest.mark.slow if who != "one device" and some in ("some", "pictures") else ())
-        for some in RESIDENCY
-        for who in WORKERS
+        ("all", "one device"),
+        ("nothing", "one device"),
+        ("nothing", "two devices"),
+        ("all", "two workers elsewhere"),
+        pytest.param("some", "one device", marks=pytest.mark.slow),
+        pytest.param("some", "two devices", marks=pytest.mark.slow),
+        pytest.param("pictures", "two workers elsewhere", marks=pytest.mark.slow),
     ],
 )
 @pytest.mark.parametrize("grouping", GROUPINGS)

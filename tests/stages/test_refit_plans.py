@@ -159,11 +159,14 @@ def plain(device):
 @pytest.mark.parametrize(
     ("plan", "way"),
     [
-        pytest.param(plan, way, id=f"{name}, {way}", marks=() if way == WAYS[place % 3] else pytest.mark.slow)
+        pytest.param(
+            plan, way, id=f"{name}, {way}",
+            marks=() if way == WAYS[place % 3] else [pytest.mark.slow, pytest.mark.one_family, pytest.mark.one_runtime],
+        )
         for place, (name, plan) in enumerate(PLANS.items())
         for way in WAYS
     ],
-)
+)  # fmt: skip
 def test_the_same_solution(device, plain, picked, plan, way, monkeypatch):
     monkeypatch.setattr(own_views, "ENOUGH", 4)
     monkeypatch.setattr(placement, "_FEWEST", plan.resident)
@@ -410,6 +413,7 @@ def test_more_views_stay(device, picked):
 
 
 @pytest.mark.slow
+@pytest.mark.one_family
 @pytest.mark.one_runtime
 @pytest.mark.parametrize("part", [0.3, 0.6])
 def test_little_memory_is_enough_for_views_with_splats_of_their_own(device, picked, part, monkeypatch):
@@ -449,6 +453,7 @@ def test_the_same_file(device, plush_excerpt, plush_excerpt_cameras, monkeypatch
     assert sliced.refitted.errors == whole.refitted.errors
 
 
+@pytest.mark.one_family
 def test_the_same_file_of_views_with_splats_of_their_own(device, picked):
     """Of a whole encode, on one device and on two."""
     scene, cameras = crowded(400)

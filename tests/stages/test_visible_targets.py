@@ -15,9 +15,9 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
 from potr_cl.raster.scene_buffers import uploaded
-from potr_cl.stages.refitting import targets
-from potr_cl.stages.refitting.targets import RenderedTargets, VisibleTargets
-from potr_cl.views import visibility
+from potr_cl.views import targets, visibility
+from potr_cl.views.pictures import SeenRasterizer
+from potr_cl.views.targets import RenderedTargets, targets_of
 from potr_cl.views.visibility import Visibility
 from tests.cases.streets import street
 from tests.devices import KERNELS, open_device
@@ -49,7 +49,7 @@ def test_the_same_pictures(device):
     with (
         uploaded(device, scene) as whole,
         Rasterizer(device, whole, background=background) as rasterizer,
-        VisibleTargets(whole, cameras, sights, background) as visible,
+        targets_of(device, whole, cameras, background, sights) as visible,
         Memory(device) as memory,
     ):
         buffers = [memory.allocate(4 * sum(pixels), "pictures") for _ in range(2)]
@@ -83,7 +83,7 @@ def test_fewer_together_where_the_device_has_no_room(device, monkeypatch):
         for full in (False, True):
             if full:
                 monkeypatch.setattr(Rasterizer, "prepare_set", failing)
-            with VisibleTargets(whole, cameras, sights, (0.0, 0.0, 0.0)) as visible:
+            with targets_of(device, whole, cameras, (0.0, 0.0, 0.0), sights) as visible:
                 visible.into(range(len(cameras)), buffer)
             found.append(device.download(buffer, (pixels,), np.float32))
     assert max(together) > 2 == together[-1]
@@ -99,13 +99,13 @@ def test_a_refit_takes_them_and_the_bytes_stay(device, monkeypatch, memory):
     wanted = encode(scene, cameras, options, device=device) if memory is None else None
     made = []
 
-    class Noting(VisibleTargets):
-        def __init__(self, *args: object) -> None:
+    class Noting(SeenRasterizer):
+        def __init__(self, *args: object, **named: object) -> None:
             made.append(self)
-            super().__init__(*args)  # type: ignore[arg-type]
+            super().__init__(*args, **named)  # type: ignore[arg-type]
 
     monkeypatch.setattr(visibility, "LEAST_SPLATS", 1)
-    monkeypatch.setattr(targets, "VisibleTargets", Noting)
+    monkeypatch.setattr(targets, "SeenRasterizer", Noting)
     got = encode(scene, cameras, options, device=device)
     assert len(made) == (2 if memory is None else 1)  # where there is room, pictures are rendered ahead besides
     assert wanted is None or got.data == wanted.data

@@ -20,10 +20,9 @@ from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.stages.pruning import removal
 from potr_cl.stages.pruning.part import RemovalPart
-from potr_cl.stages.refitting import pictures_ahead
 from potr_cl.stages.refitting.part import ColourPart
-from potr_cl.stages.refitting.targets import RenderedTargets
-from potr_cl.views import visibility
+from potr_cl.views import targets, visibility
+from potr_cl.views.targets import RenderedTargets
 from potr_cl.workers.host import HostPool
 from potr_cl.workers.opening import open_workers
 from potr_cl.workers.parts import Parts
@@ -116,15 +115,15 @@ def test_pictures_are_rendered_ahead_by_the_device_that_needs_them(plush_excerpt
     rendered, renderers = [], set()
     into = RenderedTargets.into
 
-    def noted(self, numbers, buffer):
+    def noted(self, numbers, *where):
         rendered.extend(numbers)
         renderers.add(threading.current_thread().name)
-        into(self, numbers, buffer)
+        into(self, numbers, *where)
 
     monkeypatch.setattr(RenderedTargets, "into", noted)
     found = []
-    for room in (pictures_ahead._PART, 0):
-        monkeypatch.setattr(pictures_ahead, "_PART", room)
+    for room in (targets.AHEAD, 0):
+        monkeypatch.setattr(targets, "AHEAD", room)
         with HostPool(devices) as pool:
             for some in (None, pool):
                 rendered.clear()

@@ -205,8 +205,8 @@ def test_workers_with_gpus_look_at_each_view_with_what_it_may_draw(keep, monkeyp
     expected = encode(scene, cameras, options, device=open_device(family)).data
     monkeypatch.setattr("potr_cl.raster.kept_scene.fits_whole", lambda device, scene: True)
     made = []
-    for where, name in (("pruning.planned", "NamedSplats"), ("refitting.targets", "VisibleTargets")):
-        where = f"potr_cl.stages.{where}"
+    for where, name in (("stages.pruning.planned", "NamedSplats"), ("views.targets", "SeenRasterizer")):
+        where = f"potr_cl.{where}"
         kind = importlib.import_module(where).__dict__[name]
 
         def noted(*args, kind=kind, **named):
@@ -218,7 +218,7 @@ def test_workers_with_gpus_look_at_each_view_with_what_it_may_draw(keep, monkeyp
     with ElsewherePool(devices) as pool:
         assert encode(scene, cameras, options, device=devices[0], pool=pool).data == expected
     assert made.count("NamedSplats") == 2
-    assert made.count("VisibleTargets") == 2 * 3  # two re-fits, of two workers and of the master
+    assert made.count("SeenRasterizer") == 2 * 3  # two re-fits, of two workers and of the master
     assert [device.allocated for device in devices] == [0] * 3
 
 

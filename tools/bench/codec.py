@@ -2,8 +2,8 @@
 
     python -m tools.bench.codec [--part PART …] [--splats N] [--json FILE]
 
-Parts (default: all): encode (stages and peak memory, each in a process of its own), octree (against the number of
-splats), sizes (bytes a splat of every section, lego and plush). tools.bench.decode measures how fast files decode.
+Parts (default: both): encode (stages and peak memory, each in a process of its own), sizes (bytes a splat of every
+section, lego and plush). tools.bench.decode measures how fast files decode.
 """
 
 from __future__ import annotations
@@ -11,9 +11,6 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-import numpy as np
-
-from potr_cl.codec import octree
 from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import open_file
 from potr_cl.codec.quantize import Preset
@@ -23,12 +20,12 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.report.file import file_report
 from tools.make.large_scene import cameras_beside, default_scene, large_scene
 from tools.results import Cell, Column, Results
-from tools.workloads import SCENES, best_of, growth, in_process, plain_parser, read
+from tools.workloads import SCENES, growth, in_process, plain_parser, read
 
 
 def as_it_is(preset: Preset, coder: EntropyCoder | None = None) -> EncodeOptions:
     """Options that keep every splat and every colour; coder: another than the preset's."""
-    options = EncodeOptions.for_preset(preset, prune=False, compact=False, refit=False)
+    options = EncodeOptions.for_preset(preset, prune=False, compact=False, refit=False, cameras_anyway=True)
     return options if coder is None else options.changed(code={"entropy": coder.name, "zstd_level": coder.level})
 
 
@@ -58,26 +55,6 @@ def encodes(results: Results, splats: int) -> None:
         table.add(level, "yes" if views else "no", *in_process(_encode, splats, views, level))
 
 
-def octrees(results: Results, splats: int) -> None:
-    like = load_scene(default_scene())
-    table = results.table(
-        "octree", "Octree alone: growth with the number of splats",
-        "splats||,; build|ns/splat|.0f; parse|ns/splat|.0f; levels; before coding|bytes a splat|.2f",
-    )  # fmt: skip
-    rng, tolerance = np.random.default_rng(0), EncodeOptions().parameters.gamma
-    for count in (splats // 100, splats // 10, splats, 10 * splats):
-        source = rng.integers(0, len(like), count)
-        spread = np.exp(like.log_scales[source])
-        means = (like.means[source] + spread * rng.normal(size=(count, 3)).astype(np.float32)).astype(np.float32)
-        streams, _ = octree.build(means, tolerance)
-        build, parse = (
-            1e9 * best_of(5 if count <= splats else 1, work) / count
-            for work in (lambda m=means: octree.build(m, tolerance), lambda s=streams, n=count: octree.parse(s, n))
-        )
-        fields = (streams.occupancy, streams.several, streams.multiplicities, streams.leaf_levels, streams.tails)
-        table.add(count, build, parse, streams.depth, sum(field.nbytes for field in fields) / count)
-
-
 def sizes(results: Results, _: int) -> None:
     coders = {f"zstd {level}": EntropyCoder("zstd", level) for level in (9, 19, 22)}
     for folder in filter(Path.exists, (SCENES / "lego", SCENES / "plush")):
@@ -97,7 +74,7 @@ def sizes(results: Results, _: int) -> None:
         table.add("all", sum(serialised.values()) / len(scene), *(r["bytes_a_splat"] for r in reports.values()))
 
 
-PARTS = {"encode": encodes, "octree": octrees, "sizes": sizes}
+PARTS = {"encode": encodes, "sizes": sizes}
 
 
 def main() -> None:

@@ -7,7 +7,6 @@ pruning by the presets best and fast. Parts (default: all but device):
 
 speed    decodes in this process, in turn by NumPy and by the native path; wall time and processor time
 memory   host memory that a decode takes at most, beside what it makes; a process each
-command  `decode FILE -o scene.ply` as a fresh process, its modules compiled as `pip install` leaves them
 device   from the file's bytes to buffers of a device, in turn by way of a scene on the host and straight, on the
          devices given (default: the best one)
 """
@@ -17,8 +16,6 @@ from __future__ import annotations
 import argparse
 import os
 import statistics
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
@@ -34,7 +31,7 @@ from potr_cl.pipeline.encode import encode
 from potr_cl.raster.scene_buffers import uploaded
 from tools.bench.codec import as_it_is
 from tools.make.large_scene import cameras_beside, default_scene, large_scene
-from tools.results import ROOT, Results
+from tools.results import Results
 from tools.results import threads as processors
 from tools.workloads import growth, in_process, in_turn, plain_parser
 
@@ -71,9 +68,9 @@ def made_files(splats: int, folder: Path) -> list[Path]:
     return files
 
 
-def _medians(times: Times, clock: int, unit: float) -> list[float]:
-    """Of the wall (0) or of the processors (1), for NumPy and the native path."""
-    return [unit * statistics.median(times[way][clock]) for way in PATHS]
+def _medians(times: Times, clock: int) -> list[float]:
+    """Milliseconds of the wall (0) or of the processors (1), for NumPy and the native path."""
+    return [1e3 * statistics.median(times[way][clock]) for way in PATHS]
 
 
 def _decode(path: Path, way: str, threads: int) -> None:
@@ -92,7 +89,7 @@ def speed(results: Results, files: Iterable[Path], args: argparse.Namespace) -> 
         splats = open_file(path).header.splats
         for threads in args.threads:
             times = in_turn({way: partial(_decode, path, way, threads) for way in PATHS}, args.runs)
-            wall, used = _medians(times, 0, 1e3), _medians(times, 1, 1e3)
+            wall, used = _medians(times, 0), _medians(times, 1)
             ratio = statistics.median(a / b for a, b in zip(times["NumPy"][0], times["native"][0], strict=True))
             rates = [1e-3 * splats / each for each in (wall[1], 1e3 * min(times["native"][0]), used[1])]
             table.add(path.stem, splats, threads, *wall, *used, ratio, *rates)
@@ -114,27 +111,6 @@ def _growth(path: Path, way: str, threads: int) -> int:
     return growth(partial(_decode, path, way, threads))
 
 
-def command(results: Results, files: Iterable[Path], args: argparse.Namespace) -> None:
-    table = results.table(
-        "command", "`decode FILE -o scene.ply` as a fresh process, medians",
-        "file; splats||,; NumPy, wall|s|.2f; native, wall|s|.2f; NumPy, processor time|s|.2f; "
-        "native, processor time|s|.2f",
-    )  # fmt: skip
-    for path in files:
-        with tempfile.TemporaryDirectory() as folder:
-            times = in_turn({way: partial(_whole_command, path, way, Path(folder)) for way in PATHS}, args.runs)
-        table.add(path.stem, open_file(path).header.splats, *_medians(times, 0, 1), *_medians(times, 1, 1))
-
-
-def _whole_command(path: Path, way: str, folder: Path) -> None:
-    compiled = {"PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": str(folder / "compiled")}
-    environment = {**os.environ, **compiled, VARIABLE: PATHS[way], "PYTHONPATH": str(ROOT)}
-    output = folder / "scene.ply"
-    whole = [sys.executable, "-m", "potr_cl", "decode", str(path), "-o", str(output)]
-    subprocess.run(whole, check=True, capture_output=True, env=environment)
-    output.unlink()
-
-
 def device(results: Results, files: Iterable[Path], args: argparse.Namespace) -> None:
     table = results.table(
         "device", "From a file's bytes to a device's buffers, when it was done before, medians of wall times",
@@ -145,8 +121,8 @@ def device(results: Results, files: Iterable[Path], args: argparse.Namespace) ->
         opened, timed = Device(name), Device(name, profiling=True)
         for path in files:
             data = path.read_bytes()
-            works: dict[str, Callable[[], None]] = {
-                "host": partial(_on_host, data),
+            works: dict[str, Callable[[], object]] = {
+                "host": partial(_on_the_host, data),
                 "both": partial(_by_way_of_the_host, data, opened),
                 "straight": partial(_straight, data, opened),
             }
@@ -161,8 +137,8 @@ def device(results: Results, files: Iterable[Path], args: argparse.Namespace) ->
             )  # fmt: skip
 
 
-def _on_host(data: bytes) -> None:
-    open_file(data, trust=True).scene()
+def _on_the_host(data: bytes) -> object:
+    return open_file(data, trust=True).scene()
 
 
 def _by_way_of_the_host(data: bytes, opened: Device) -> None:
@@ -177,7 +153,6 @@ def _straight(data: bytes, opened: Device) -> None:
 PARTS: dict[str, Callable[[Results, Iterable[Path], argparse.Namespace], None]] = {
     "speed": speed,
     "memory": memory,
-    "command": command,
     "device": device,
 }
 

@@ -2,11 +2,11 @@
 
     python -m tools.bench.encode [SCENE …] [--device NAME] [--quick] [--stage NAME …] [--json FILE]
 
-For each stage the variants that exist: kernel family, compiler flags, sort, steps, entropy coder; each with its time
-and its error against float64 or against the full computation. (tools.bench.pruning has what the schedule may skip,
-tools.study.rate_distortion compares whole encodes of any options.) A variant is on the Pareto
-front if no other of its stage is at least as good in time, error and bytes and better in one by more than 5 %, the
-noise. Scenes: lego and plush by default; --quick takes the bundled excerpt at half size and the best device.
+For each stage the variants that exist: kernel family, compiler flags, precision, steps, entropy coder; each with its
+time and its error against float64 or against the full computation. (tools.study.rate_distortion compares whole encodes
+of any options.) A variant is on the Pareto front if no other of its stage is at least as good in time, error and bytes
+and better in one by more than 5 %, the noise. Scenes: lego and plush by default; --quick takes the bundled excerpt at
+half size and the best device.
 
 Every device runs in a process of its own. Times of the rasterizer's kernels and of the ridge are the device's own, the
 others the clock's. Each is the best of some.
@@ -17,7 +17,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any, get_args
@@ -41,11 +41,13 @@ from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
-from potr_cl.stages.refitting.targets import RenderedTargets
+from potr_cl.views.targets import RenderedTargets
 from tests.reference import raster as reference
 from tests.reference.removal import BruteForce
 from tools.bench.rasterizer import stage_times
 from tools.results import Results
+from tools.stress.solvers import ridge_errors
+from tools.stress.views import rasterized
 from tools.workloads import SCENES, best_of, excerpt, in_process, log, read, scaled, scene_parser
 
 F64 = NDArray[np.float64]
@@ -61,8 +63,6 @@ FLAGS: Mapping[str, tuple[str, ...]] = {
     "unsafe": ("-cl-unsafe-math-optimizations",),
     "fast relaxed": ("-cl-fast-relaxed-math",),
 }
-#: Keys that a GPU's work-group sorts in local memory at a time; 2048 is the default.
-CAPACITIES = (1024, 4096)
 #: Pixels of a view, and splats, that are computed in float64.
 PIXELS, SPLATS = 300, 150
 #: As in the tests: pixels that come no nearer, relatively, to a threshold cannot flip, nor splats in another order.
@@ -130,9 +130,9 @@ class Workload:
         """The device's own kernel family first."""
         return ("cpu", "gpu") if self.info.family == "cpu" else ("gpu",)
 
-    def profiled(self, family: Family, flags: Sequence[str] = (), **macros: int) -> Device:
-        """A device whose kernels are timed, with compiler flags and other values of the kernels' macros."""
-        return Device(self.info, profiling=True, family=family, build_options=flags, macros=macros)
+    def profiled(self, family: Family, flags: Sequence[str] = ()) -> Device:
+        """A device whose kernels are timed, with compiler flags."""
+        return Device(self.info, profiling=True, family=family, build_options=flags)
 
     def flagged(self, family: Family) -> Iterator[tuple[str, bool, Device]]:
         """Compiler flags: name, whether they are the default, device."""
@@ -154,29 +154,17 @@ KERNELS = {
 
 
 def rasterizer_rows(load: Workload) -> Iterator[Row]:
-    """All kernels of the rasterizer: family and flags; on GPU kernels also the sort's capacity and the exponential."""
+    """All kernels of the rasterizer: family and flags."""
     truth, first = RasterizerTruth(load), None
 
-    def variants() -> Iterator[tuple[str, bool, Device, Iterable[str]]]:
-        for family in load.families:
-            for flagged in load.flagged(family):
-                yield *flagged, KERNELS
-        for capacity in CAPACITIES:
-            if 8 * capacity <= load.info.local_memory:
-                device = load.profiled("gpu", SORT_CAPACITY=capacity)
-                yield f"gpu, sorts {capacity} at a time", False, device, ("sort",)
-        native = load.profiled("gpu").native_exp2
-        name = "polynomial" if native else "native exponential"
-        yield f"gpu, {name}", False, load.profiled("gpu", NATIVE_EXP2=int(not native)), ("composite",)
-
-    for name, default, device, stages in variants():
+    for name, default, device in (each for family in load.families for each in load.flagged(family)):
         runs = [stage_times(device, load.scene, load.some) for _ in range(load.repeats)]
         times = {kernel: min(run[kernel] for run in runs) for kernel in runs[0]}
         centre, wrong, pixel, pairs = truth.errors(device, load.scene)
         first = pairs if first is None else first
         errors = {"project": centre, "tile lists": len(first ^ pairs), "sort": wrong, "composite": pixel}
-        for stage in stages:
-            yield Row(stage, name, sum(times.get(kernel, 0) for kernel in KERNELS[stage]), errors[stage], default)
+        for stage, kernels in KERNELS.items():
+            yield Row(stage, name, sum(times.get(kernel, 0) for kernel in kernels), errors[stage], default)
 
 
 class RasterizerTruth:
@@ -195,21 +183,19 @@ class RasterizerTruth:
 
     def errors(self, device: Device, scene: Scene) -> tuple[float, float, float, set[bytes]]:
         """Of centres, of order, of pixels; and the tile lists as a set."""
-        with Rasterizer(device, scene, GSPLAT) as rasterizer, rasterizer.prepare(self.camera) as view:
-            shapes = device.download(view.shapes, (rasterizer.stride, 8), np.float32)
-            offsets = device.download(view.offsets, (view.tiles + 1,), np.uint32).astype(np.int64)
-            intersections = device.download(view.intersections, (view.intersection_count,), np.uint32)
-            image, transmittance = rasterizer.composite(view)
-        listed = np.isin(self.projected.index, intersections)
-        centres = np.abs(shapes[self.projected.index[listed], :2] - self.projected.centre[listed])
+        with Rasterizer(device, scene, GSPLAT) as rasterizer:
+            lists = rasterized(rasterizer, self.camera)
+        listed = np.isin(self.projected.index, lists.intersections)
+        centres = np.abs(lists.shapes[self.projected.index[listed], :2] - self.projected.centre[listed])
         inside = (self.projected.centre[listed] >= 0).all(axis=1)
         inside &= (self.projected.centre[listed] < (self.camera.width, self.camera.height)).all(axis=1)
-        tiles = np.repeat(np.arange(view.tiles), np.diff(offsets))
-        order = np.lexsort((intersections, shapes[intersections, 6], tiles))
-        wrong = int(np.count_nonzero(intersections[order] != intersections))
-        ours = np.concatenate([image, transmittance[..., None]], axis=2).astype(np.float64)
-        pixel = max((float(np.abs(ours[row, column] - true).max()) for column, row, true in self.pixels), default=0.0)
-        pairs = {pair.tobytes() for pair in np.stack([tiles, intersections], axis=1)}
+        tiles = np.repeat(np.arange(len(lists.offsets) - 1), np.diff(lists.offsets).astype(np.int64))
+        order = np.lexsort((lists.intersections, lists.shapes[lists.intersections, 6], tiles))
+        wrong = int(np.count_nonzero(lists.intersections[order] != lists.intersections))
+        ours = np.concatenate([lists.image, lists.transmittance[:, None]], axis=1)
+        at = (np.abs(ours[row * self.camera.width + column] - true).max() for column, row, true in self.pixels)
+        pixel = float(max(at, default=0.0))
+        pairs = {pair.tobytes() for pair in np.stack([tiles, lists.intersections], axis=1)}
         return float(centres[inside].max(initial=0)), wrong, pixel, pairs
 
 
@@ -249,30 +235,6 @@ def choose_splats(importance: F64, count: int) -> NDArray[np.int64]:
     low, high = np.log(importance[by_importance[[len(seen) // 100, -1]]])
     at = np.searchsorted(np.log(importance[by_importance]), np.linspace(low, high, count))
     return np.unique(by_importance[at.clip(0, len(seen) - 1)])
-
-
-def ridge_errors(scene: Scene, compacted: Scene, centres: F64, weights: Any, options: CompactionOptions) -> F64:
-    """(K, 3) weighted colour errors above the optimum over the coefficients left free, of the splats that are seen.
-
-    Relative to the largest coefficient or 1.
-    """
-    from tests.reference.ridge import YCOCG, Ridges, triangles  # needs scipy
-
-    before, after = scene.sh @ YCOCG.T, compacted.sh @ YCOCG.T
-    largest = np.maximum(np.abs(before).max(axis=1), 1)
-    squares = np.add.reduceat(np.append(weights.weights.astype(np.float64) ** 2, 0), weights.offsets[:-1])
-    errors = []
-    for splats, triangle in triangles(scene.means.astype(np.float64), centres, weights, scene.sh_degree):
-        found = np.zeros((len(splats), 3))
-        for c in range(3):
-            used = np.abs(after[splats, :, c]) > 1e-6 * np.abs(compacted.sh[splats]).max(axis=(1, 2))[:, None]
-            used[:, 0] = True
-            lam = options.lam * (options.chroma_factor if c else 1)
-            excess = Ridges(triangle, before[splats, :, c], used, lam).excess(after[splats, :, c])[0]
-            kept = np.isclose(after[splats, 1:, c], before[splats, 1:, c], rtol=1e-5, atol=1e-7).all(axis=1)
-            found[:, c] = np.where(kept, 0, np.sqrt(excess / squares[splats]) / largest[splats, c])
-        errors.append(found)
-    return np.concatenate(errors)
 
 
 def ridge_rows(load: Workload) -> Iterator[Row]:

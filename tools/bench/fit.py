@@ -23,9 +23,8 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Adam, Limits, Rates
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
-from potr_cl.stages.fitting.pictures import TargetPictures
 from potr_cl.stages.fitting.views import batches
-from potr_cl.stages.refitting.targets import RenderedTargets
+from potr_cl.views.targets import RenderedTargets, Room, TargetPictures
 from tools.results import Column, Results
 from tools.workloads import in_turn, read, reduced, scene_parser
 
@@ -97,7 +96,7 @@ def _steps(plain: Device, profiled: Device, load: Load, batch: int, count: int) 
         with (
             Rasterizer(device, scene) as whole,
             PictureDerivatives(device, left) as derivatives,
-            TargetPictures(device, train, RenderedTargets(whole, train), 8e9) as pictures,
+            TargetPictures(device, train, Room(8e9), RenderedTargets(whole, train)) as pictures,
             Adam(device, left, derivatives.rasterizer.parameters, derivatives.columns, _RATES, _LIMITS) as adam,
         ):
             for number in range(len(train)):

@@ -10,7 +10,6 @@ the ratios of the pairs.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import statistics
@@ -18,6 +17,9 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import Any
+
+from tools.results import ROOT, Results
+from tools.workloads import plain_parser
 
 #: What each process runs. It uses only names that every version of the package has had.
 _WORKER = """
@@ -37,67 +39,61 @@ for _ in sys.stdin:
 """
 
 
-class _Checkout:
-    """A process that encodes with the package of one checkout."""
+class Asked:
+    """A process that answers each line with one of JSON; its package is that of a folder, where one is given."""
 
-    def __init__(self, folder: Path, arguments: list[str]) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", _WORKER, *arguments],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            cwd=folder,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")])},
-        )
+    def __init__(self, command: list[str], folder: Path | None = None) -> None:
+        path = os.pathsep.join(str(each) for each in (folder, os.environ.get("PYTHONPATH")) if each)
+        pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+        self._process = subprocess.Popen(command, cwd=folder, env={**os.environ, "PYTHONPATH": path}, **pipes)
 
-    def encode(self) -> dict[str, Any]:
+    def ask(self, line: str = "") -> dict[str, Any]:
+        """Tell it a line and wait for the answer.
+
+        Raises:
+            SystemExit: the process has ended.
+        """
         assert self._process.stdin is not None
         assert self._process.stdout is not None
-        self._process.stdin.write("\n")
-        self._process.stdin.flush()
+        print(line, file=self._process.stdin, flush=True)
         said = self._process.stdout.readline()
         if not said:
-            sys.exit(f"the process of a checkout ended with {self._process.wait()}")
-        measured: dict[str, Any] = json.loads(said)
-        return measured
+            sys.exit(f"a process ended with {self._process.wait()}: {' '.join(self._process.args)[:300]}")  # type: ignore[arg-type]
+        answer: dict[str, Any] = json.loads(said)
+        return answer
 
-    def close(self) -> None:
-        assert self._process.stdin is not None
-        self._process.stdin.close()
-        self._process.wait()
+    def end(self) -> None:
+        self._process.communicate()
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = plain_parser(__doc__)
     parser.add_argument("before", type=Path, help="the other checkout")
     parser.add_argument("--scene", type=Path, required=True)
     parser.add_argument("--cameras", type=Path)
     parser.add_argument("--preset", default="best")
     parser.add_argument("--rounds", type=int, default=20)
     args = parser.parse_args()
-
     cameras = str(args.cameras.resolve()) if args.cameras else ""
-    arguments = [str(args.scene.resolve()), cameras, args.preset]
-    folders = {"before": args.before.resolve(), "now": Path(__file__).resolve().parents[2]}
-    checkouts = {name: _Checkout(folder, arguments) for name, folder in folders.items()}
+    command = [sys.executable, "-c", _WORKER, str(args.scene.resolve()), cameras, args.preset]
+    checkouts = {"before": Asked(command, args.before.resolve()), "now": Asked(command, ROOT)}
     measured: dict[str, list[dict[str, Any]]] = {name: [] for name in checkouts}
-    warm = {name: checkout.encode() for name, checkout in checkouts.items()}  # builds its kernels
+    warm = {name: checkout.ask() for name, checkout in checkouts.items()}  # builds its kernels
     for number in range(args.rounds):
         for name in ("before", "now") if number % 2 else ("now", "before"):
-            measured[name].append(checkouts[name].encode())
+            measured[name].append(checkouts[name].ask())
     for checkout in checkouts.values():
-        checkout.close()
-
+        checkout.end()
+    table = Results(None, args.json).table(
+        "paired", f"Whole encodes in turns, {args.rounds} pairs, preset {args.preset}; medians",
+        "clock; before|s|.3f; now|s|.3f; ratio of pairs||.4f; middle half of ratios||{:.4f} to {:.4f}",
+    )  # fmt: skip
     for clock in ("wall", "processor"):
-        pairs = [(b[clock], n[clock]) for b, n in zip(measured["before"], measured["now"], strict=True)]
-        ratios = sorted(now / before for before, now in pairs)
-        low, _, high = statistics.quantiles(ratios, n=4)
-        before, now = (statistics.median(times) for times in zip(*pairs, strict=True))
-        print(
-            f"{clock}: before {before:.3f} s, now {now:.3f} s (medians of {len(pairs)}); "
-            f"ratio of pairs: median {statistics.median(ratios):.4f}, middle half {low:.4f} to {high:.4f}"
-        )
-    print(f"bytes: {warm['before']['bytes']} before, {warm['now']['bytes']} now")
+        before, now = ([each[clock] for each in measured[name]] for name in checkouts)
+        ratios = [b / a for a, b in zip(before, now, strict=True)]
+        low, middle, high = statistics.quantiles(ratios, n=4)
+        table.add(clock, statistics.median(before), statistics.median(now), middle, [low, high])
+    print(f"\nbytes: {warm['before']['bytes']} before, {warm['now']['bytes']} now")
     print(f"same file: {warm['before']['sha256'] == warm['now']['sha256']}")
 
 

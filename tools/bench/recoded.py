@@ -11,7 +11,7 @@ machine disturbs least.
 
 from __future__ import annotations
 
-import argparse
+import itertools
 import json
 import os
 import subprocess
@@ -19,7 +19,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from tools.results import Column, Results
+from tools.results import ROOT, Results
+from tools.workloads import plain_parser
 
 #: What a process of a checkout runs. It uses only names that every version of the package has had.
 _WORKER = """
@@ -67,58 +68,40 @@ print(json.dumps(said))
 
 
 def _measured(folder: Path, arguments: list[str]) -> dict[str, Any]:
-    environment = {**os.environ, "PYTHONPATH": str(folder)}
-    done = subprocess.run(
-        [sys.executable, "-c", _WORKER, *arguments], cwd=folder, env=environment, stdout=subprocess.PIPE, check=True
-    )
+    command, environment = [sys.executable, "-c", _WORKER, *arguments], {**os.environ, "PYTHONPATH": str(folder)}
+    done = subprocess.run(command, cwd=folder, env=environment, stdout=subprocess.PIPE, check=True)
     measured: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return measured
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = plain_parser(__doc__)
     parser.add_argument("before", type=Path, help="the other checkout")
     parser.add_argument("scenes", type=Path, nargs="+", metavar="SCENE")
     parser.add_argument("--preset", action="append", dest="presets")
     parser.add_argument("--q", action="append", dest="qualities", type=float)
     parser.add_argument("--runs", type=int, default=5, metavar="R")
     parser.add_argument("--device", action="store_true", help="decode to the memory of the default device, too")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="keep the figures")
     args = parser.parse_args()
-
-    results = Results(None, args.json)
-    table = results.table(
+    table = Results(None, args.json).table(
         "recoded", "The same splats, coded and decoded by an earlier state and by this one",
-        Column("scene"), Column("splats", format=","), Column("preset"), Column("q", format="g"),
-        Column("bytes before", format=","), Column("bytes", format=","), Column("change", "%", "+.2f"),
-        Column("same values"),
-        Column("decode before", "ms", ".0f"), Column("decode", "ms", ".0f"),
-        Column("to a device before", "ms", ".0f"), Column("to a device", "ms", ".0f"),
-        Column("memory before, times the arrays", format=".2f"), Column("memory, times the arrays", format=".2f"),
+        "scene; splats||,; preset; q||g; bytes before||,; bytes||,; change|%|+.2f; same values; decode before|ms|.0f; "
+        "decode|ms|.0f; to a device before|ms|.0f; to a device|ms|.0f; memory before, times the arrays||.2f; "
+        "memory, times the arrays||.2f",
     )  # fmt: skip
-    folders = [args.before.resolve(), Path(__file__).resolve().parents[2]]
-    turn = 0
-    for scene in args.scenes:
-        for preset in args.presets or ["best"]:
-            for q in args.qualities or [0.5]:
-                cameras = scene.with_suffix(".json").resolve()
-                arguments = [scene.resolve(), cameras, preset, q, args.runs, int(args.device)]
-                turn += 1
-                found = {
-                    folder: _measured(folder, list(map(str, arguments))) for folder in folders[:: 1 if turn % 2 else -1]
-                }
-                before, now = (found[folder] for folder in folders)
-                table.add(
-                    scene.stem, now["splats"], preset, q, before["bytes"], now["bytes"],
-                    100 * (now["bytes"] / before["bytes"] - 1),
-                    "yes" if before["sha256"] == now["sha256"] else "no",
-                    *(_ms(each, "decode") for each in (before, now)), *(_ms(each, "device") for each in (before, now)),
-                    before["memory"], now["memory"],
-                )  # fmt: skip
-
-
-def _ms(measured: dict[str, Any], name: str) -> float | None:
-    return 1e3 * measured[name] if name in measured else None
+    folders = [args.before.resolve(), ROOT.resolve()]
+    kinds = itertools.product(args.scenes, args.presets or ["best"], args.qualities or [0.5])
+    for turn, (scene, preset, q) in enumerate(kinds):
+        cameras = scene.with_suffix(".json").resolve()
+        arguments = list(map(str, (scene.resolve(), cameras, preset, q, args.runs, int(args.device))))
+        found = {folder: _measured(folder, arguments) for folder in folders[:: -1 if turn % 2 else 1]}
+        both = [found[folder] for folder in folders]
+        sizes = [each["bytes"] for each in both]
+        times = (1e3 * each[name] if name in each else None for name in ("decode", "device") for each in both)
+        table.add(
+            scene.stem, both[1]["splats"], preset, q, *sizes, 100 * (sizes[1] / sizes[0] - 1),
+            "yes" if both[0]["sha256"] == both[1]["sha256"] else "no", *times, *(each["memory"] for each in both),
+        )  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -9,10 +9,7 @@ tools.make.web`` builds the decoder.
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
-import subprocess
 import time
 from pathlib import Path
 from typing import Any
@@ -20,28 +17,12 @@ from unittest import mock
 
 from potr_cl.codec.decoder import open_file
 from potr_cl.codec.native.library import VECTORS_VARIABLE
+from tools.bench.paired import Asked
+from tools.results import ROOT, Results
+from tools.workloads import plain_parser
 
 #: What the native decoder's variable is set to.
 _NATIVE = {"native": "1", "narrow": "0"}
-_PROGRAM = Path(__file__).parents[2] / "web" / "test" / "pace.mjs"
-
-
-class _Node:
-    """A decode at a time, when asked."""
-
-    def __init__(self, build: str, file: Path) -> None:
-        command = ["node", "--expose-gc", str(_PROGRAM), build, str(file)]
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-
-    def ask(self, line: str) -> dict[str, Any]:
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        print(line, file=self._process.stdin, flush=True)
-        answer: dict[str, Any] = json.loads(self._process.stdout.readline())
-        return answer
-
-    def end(self) -> None:
-        self._process.communicate()
 
 
 def _native(file: Path, vectors: str) -> float:
@@ -51,9 +32,11 @@ def _native(file: Path, vectors: str) -> float:
         return time.process_time() - begin
 
 
-def measured(file: Path, rounds: int, rate: float = 0) -> dict[str, Any]:
-    """Seconds by path, and until all is decoded from a server of so many Mbit/s; peak memory of Node, bytes."""
-    nodes = {build: _Node(build, file) for build in ("simd", "general")}
+def measured(file: Path, rounds: int, rate: float = 0) -> tuple[dict[str, float], dict[str, Any]]:
+    """Million splats a second by path; splats, megabytes of the arrays and of Node's peak, and seconds until all is
+    decoded from a server of so many Mbit/s."""
+    program = ["node", "--expose-gc", str(ROOT / "web" / "test" / "pace.mjs")]
+    nodes = {build: Asked([*program, build, str(file)]) for build in ("simd", "general")}
     times: dict[str, list[float]] = {name: [] for name in (*_NATIVE, *nodes)}
     last: dict[str, Any] = {}
     for _ in range(1 + rounds):
@@ -63,51 +46,34 @@ def measured(file: Path, rounds: int, rate: float = 0) -> dict[str, Any]:
             last = node.ask("go")
             times[build].append(last["cpu"])
     slow = min(nodes["simd"].ask(str(rate))["seconds"] for _ in range(rounds)) if rate else None
-    peaks = {build: node.ask("memory")["peak"] for build, node in nodes.items()}
+    peak = nodes["simd"].ask("memory")["peak"] / 1e6
     for node in nodes.values():
         node.end()
-    arrays = last["splats"] * 4 * (11 + 3 * (last["degree"] + 1) ** 2)
-    best = {name: min(each[1:]) for name, each in times.items()}
-    size = {"bytes": file.stat().st_size, "over": slow}
-    return {"file": file.name, **size, "splats": last["splats"], "arrays": arrays, "seconds": best, "peak": peaks}
+    splats, arrays = last["splats"], last["splats"] * 4e-6 * (11 + 3 * (last["degree"] + 1) ** 2)
+    paces = {name: splats / min(each[1:]) / 1e6 for name, each in times.items()}
+    return paces, {"splats": splats, "arrays": arrays, "peak": peak, "over": slow}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = plain_parser(__doc__)
     parser.add_argument("files", type=Path, nargs="+", metavar="FILE.potr")
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--rate", type=float, default=0, metavar="MBIT", help="of a slow server, Mbit/s")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="keep the figures")
     args = parser.parse_args()
-    results = [measured(file, args.rounds, args.rate) for file in args.files]
-    heads = (
-        "native, million splats/s",
-        "AVX2",
-        "SIMD (of native, of AVX2)",
-        "without SIMD",
-        "arrays, MB",
-        "Node's peak, MB",
-    )
-    print(f"| file | splats | {' | '.join(heads)} |")
-    print("|---" * (2 + len(heads)) + "|")
-    for each in results:
-        pace = {name: each["splats"] / seconds / 1e6 for name, seconds in each["seconds"].items()}
-        of = {
-            name: " ({:.2f}, {:.2f})".format(*(pace[name] / pace[other] for other in _NATIVE))
-            for name in ("simd", "general")
-        }
-        print(
-            f"| {each['file']} | {each['splats']:,} | {pace['native']:.2f} | {pace['narrow']:.2f} | "
-            f"{pace['simd']:.2f}{of['simd']} | {pace['general']:.2f}{of['general']} | {each['arrays'] / 1e6:.0f} | "
-            f"{each['peak']['simd'] / 1e6:.0f} |"
-        )
-    for each in results if args.rate else ():
-        alone = each["bytes"] * 8e-6 / args.rate
-        print(
-            f"{each['file']} at {args.rate:g} Mbit/s: decoded after {each['over']:.2f} s, {alone:.2f} s of it transfer"
-        )
-    if args.json is not None:
-        args.json.write_text(json.dumps(results, indent=1) + "\n")
+    both = "{:.2f} ({:.2f}, {:.2f})"
+    table = Results(None, args.json).table(
+        "web", "The browser's decoder, million splats/s; in brackets of native, and of AVX2",
+        f"file; splats||,; native||.2f; AVX2||.2f; SIMD||{both}; without SIMD||{both}; arrays|MB|.0f; "
+        "Node's peak|MB|.0f; transfer alone|s|.2f; decoded from the server|s|.2f",
+    )  # fmt: skip
+    for file in args.files:
+        pace, found = measured(file, args.rounds, args.rate)
+        builds = ([pace[build], *(pace[build] / pace[other] for other in _NATIVE)] for build in ("simd", "general"))
+        alone = file.stat().st_size * 8e-6 / args.rate if args.rate else None
+        table.add(
+            file.name, found["splats"], pace["native"], pace["narrow"], *builds, found["arrays"], found["peak"], alone,
+            found["over"],
+        )  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -18,15 +18,14 @@ import hashlib
 import json
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from PIL import Image
 
-from potr_cl.host.atomic_write import replacing
-from tools.results import ROOT, Cell, Column
+from tools.results import ROOT, Cell, Column, write_json
 
 PAGES, IMAGES = ROOT / "docs" / "benchmarks", ROOT / "docs" / "images"
 RESULTS = PAGES / "results"
@@ -185,36 +184,87 @@ _STYLES: list[dict[str, Any]] = [
     {"color": "#d55e00", "marker": "^", "ls": "-."},
     {"color": "#009e73", "marker": "D", "ls": ":"},
 ]
-_PRESETS = ("best", "fast", "paper", "smallest")
-_FITTED_SERIES = ("paper", "best", "smallest", "smallest with photographs")
 #: Of single points: shapes alone.
 _SHAPES = ["s", "D", "^", "v", "P", "X", "<", "*", ">"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Plot:
-    """One picture of two panels; keeps a digest of the figures that it was drawn of, so that changed ones are noticed.
+    """PSNR by size, a panel a scene; keeps a digest of the figures that it was drawn of, so that others are noticed.
 
     Attributes:
         name: of the file, without its suffix.
-        results: names of the results that it is drawn of.
-        draw: draws them into the panels, one a scene.
         title: the question that it answers.
+        of: file of results that the curves are in.
+        series: that get a line each.
+        against: "uncompressed" or "photographs".
+        formats: whether other formats get a point each.
     """
 
     name: str
-    results: tuple[str, ...]
-    draw: Callable[[Results, Sequence[Any]], None]
     title: str
+    of: str
+    series: tuple[str, ...]
+    against: str
+    formats: bool = True
 
     @property
     def path(self) -> Path:
         return IMAGES / f"{self.name}.png"
 
+    @property
+    def results(self) -> list[str]:
+        """Names of the results that it is drawn of."""
+        return [f"{self.of}/{name}" for name in (*SCENES, "uncompressed")] + ["other_formats/sizes"] * self.formats
+
     def digest(self, results: Results) -> str:
         """Of the figures that it is drawn of."""
         figures = [[r.title, [c.name for c in r.columns], r.rows] for r in (results[name] for name in self.results)]
         return hashlib.sha256(json.dumps([self.title, *figures]).encode()).hexdigest()
+
+    def draw(self, results: Results) -> None:
+        """Write the picture."""
+        import matplotlib
+
+        matplotlib.use("Agg")
+        from matplotlib import pyplot
+
+        with pyplot.rc_context({"font.size": 10, "axes.grid": True, "grid.alpha": 0.3, "lines.markersize": 5}):
+            figure, axes = pyplot.subplots(1, 2, figsize=(10, 5))
+            for scene, axis in zip(SCENES, axes, strict=True):
+                self._curves(results, scene, axis)
+            axes[0].set_ylabel(f"PSNR against the {self.against}{' renders' * (self.against == 'uncompressed')}, dB")
+            figure.suptitle(self.title, fontsize=12)
+            handles, labels = axes[0].get_legend_handles_labels()
+            rows = -(-len(labels) // 4)
+            figure.tight_layout(rect=(0, 0.015 + 0.045 * rows, 1, 1))
+            figure.legend(handles, labels, loc="lower center", ncols=4, fontsize=9)
+            figure.savefig(self.path, dpi=120, metadata={"Results": self.digest(results), "Software": None})
+            pyplot.close(figure)
+
+    def _curves(self, results: Results, scene: str, axis: Any) -> None:
+        """A line for each series, and a point for each other format."""
+        full = results[f"{self.of}/uncompressed"].row(scene=scene)
+        rows, truth = results[f"{self.of}/{scene}"].records(), full["PSNR against photographs"]
+        for name, style in zip(self.series, _STYLES, strict=True):
+            of_it = [row for row in rows if row["preset"] == name]
+            values = [r[f"PSNR against {self.against}"] for r in of_it]
+            axis.plot([r["size"] for r in of_it], values, label=name, **style)
+        others = results["other_formats/sizes"].records()[1:] if self.formats else ()
+        for row, shape in zip(others, _SHAPES, strict=False):
+            lost = self.against == "photographs"
+            value = truth - row[f"{scene}: lost"] if lost else row[f"{scene}: PSNR"]
+            label = row["format"].replace("`", "").replace(", 1000 iterations on the photographs", ", fine-tuned")
+            axis.plot(row[f"{scene}: size"], value, marker=shape, ms=8, ls="", mfc="w", mec="0.25", label=label)
+        if self.against == "photographs":
+            axis.axhline(truth, color="0.5", ls=":", label="uncompressed")
+        ticks = (0.5, 1, 2, 4, 8, 16)
+        axis.set_xscale("log")
+        axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+        axis.minorticks_off()
+        axis.set(title=f"{scene}, {full['PLY bytes'] / 1e6:.1f} MB as PLY", xlabel="MB")
+        if not self.formats:
+            axis.set_ylim(bottom=truth - 1.6)  # below this a file is smaller than anybody asks for
 
 
 def kept_digest(plot: Plot) -> str:
@@ -225,73 +275,19 @@ def kept_digest(plot: Plot) -> str:
         return str(image.info.get("Results", ""))
 
 
-def _curves(
-    results: Results, axes: Sequence[Any], of: str, series: Sequence[str], against: str, points: bool = True
-) -> None:
-    """PSNR by size: a line for each series, and a point for each other format."""
-    full = {row["scene"]: row for row in results[f"{of}/uncompressed"].records()}
-    for scene, axis in zip(SCENES, axes, strict=True):
-        rows, truth = results[f"{of}/{scene}"].records(), full[scene]["PSNR against photographs"]
-        for name, style in zip(series, _STYLES, strict=True):
-            of_it = [row for row in rows if row["preset"] == name]
-            axis.plot([r["size"] for r in of_it], [r[f"PSNR against {against}"] for r in of_it], label=name, **style)
-        for row, shape in zip(results["other_formats/sizes"].records()[1:] if points else (), _SHAPES, strict=False):
-            lost = against == "photographs"
-            value = truth - row[f"{scene}: lost"] if lost else row[f"{scene}: PSNR"]
-            label = row["format"].replace("`", "").replace(", 1000 iterations on the photographs", ", fine-tuned")
-            axis.plot(row[f"{scene}: size"], value, marker=shape, ms=8, ls="", mfc="w", mec="0.25", label=label)
-        if against == "photographs":
-            axis.axhline(truth, color="0.5", ls=":", label="uncompressed")
-        ticks = (0.5, 1, 2, 4, 8, 16)
-        axis.set_xscale("log")
-        axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
-        axis.minorticks_off()
-        axis.set(title=f"{scene}, {full[scene]['PLY bytes'] / 1e6:.1f} MB as PLY", xlabel="MB")
-        if not points:
-            axis.set_ylim(bottom=truth - 1.6)  # below this a file is smaller than anybody asks for
-    axes[0].set_ylabel(f"PSNR against the {against}{' renders' if against == 'uncompressed' else ''}, dB")
-
-
-def _draw(plot: Plot, results: Results) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    with pyplot.rc_context({"font.size": 10, "axes.grid": True, "grid.alpha": 0.3, "lines.markersize": 5}):
-        figure, axes = pyplot.subplots(1, 2, figsize=(10, 5), squeeze=False)
-        plot.draw(results, axes[0])
-        figure.suptitle(plot.title, fontsize=12)
-        handles, labels = axes[0][0].get_legend_handles_labels()
-        rows = -(-len(labels) // 4)
-        figure.tight_layout(rect=(0, 0.015 + 0.045 * rows, 1, 1))
-        figure.legend(handles, labels, loc="lower center", ncols=4, fontsize=9)
-        figure.savefig(plot.path, dpi=120, metadata={"Results": plot.digest(results), "Software": None})
-        pyplot.close(figure)
-
-
-_RATES = (*(f"rate_distortion/{scene}" for scene in SCENES), "rate_distortion/uncompressed", "other_formats/sizes")
-_PHOTOGRAPHS = (*(f"photographs/{scene}" for scene in SCENES), "photographs/uncompressed")
+_PRESETS = ("best", "fast", "paper", "smallest")
+_FITTED = ("paper", "best", "smallest", "smallest with photographs")
+_NEAR = "How near does a file of a size come to the {}?"
 PLOTS = (
-    Plot(
-        "rate_distortion_uncompressed",
-        _RATES,
-        partial(_curves, of="rate_distortion", series=_PRESETS, against="uncompressed"),
-        "How near does a file of a size come to the uncompressed scene?",
+    *(
+        Plot(f"rate_distortion_{to}", _NEAR.format(called), "rate_distortion", _PRESETS, to)
+        for to, called in (("uncompressed", "uncompressed scene"), ("photographs", "photographs"))
     ),
     Plot(
-        "rate_distortion_photographs",
-        _RATES,
-        partial(_curves, of="rate_distortion", series=_PRESETS, against="photographs"),
-        "How near does a file of a size come to the photographs?",
+        "photographs", "What does a fit to photographs bring, on photographs that nobody has looked at?",
+        "photographs", _FITTED, "photographs", formats=False,
     ),
-    Plot(
-        "photographs",
-        _PHOTOGRAPHS,
-        partial(_curves, of="photographs", series=_FITTED_SERIES, against="photographs", points=False),
-        "What does a fit to photographs bring, on photographs that nobody has looked at?",
-    ),
-)
+)  # fmt: skip
 
 
 # ----------------------------------------------------------------------------------------------- results
@@ -305,19 +301,7 @@ def take(tables: Path, subject: str, names: Sequence[str], remark: str = "") -> 
         target = other or name
         title = content.get(target, taken[name])["title"]
         content[target] = {**taken[name], "title": title, **({"remark": remark} if remark else {})}
-    write(path, content)
-
-
-def write(path: Path, content: dict[str, Any]) -> None:
-    """A file of results, each column and each row a line."""
-    text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
-
-    def one_line(match: re.Match[str]) -> str:
-        return match[1] + json.dumps(json.loads(match[0]), ensure_ascii=False)
-
-    text = re.sub(r"(?<=\n)(   )([\[{])\n.*?\n   [\]}](?=,?\n)", one_line, text, flags=re.DOTALL)
-    with replacing(path) as file:
-        file.write(text.encode() + b"\n")
+    write_json(path, content)
 
 
 def main() -> None:
@@ -338,7 +322,7 @@ def main() -> None:
         path.write_text(text, "utf-8")
     for plot in PLOTS:
         if kept_digest(plot) != plot.digest(results):
-            _draw(plot, results)
+            plot.draw(results)
 
 
 if __name__ == "__main__":

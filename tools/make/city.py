@@ -17,6 +17,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
@@ -86,15 +87,9 @@ class City:
     @property
     def copies(self) -> int:
         """How many there are; the last may lack some splats."""
-        a_round = sum(len(building.scene) for building in self.buildings)
-        rounds, left = divmod(self.splats, a_round)
-        copies = rounds * len(self.buildings)
-        for building in self.buildings:
-            if left <= 0:
-                break
-            left -= len(building.scene)
-            copies += 1
-        return copies
+        sizes = [len(building.scene) for building in self.buildings]
+        rounds, left = divmod(self.splats, sum(sizes))
+        return rounds * len(sizes) + sum(before < left for before in accumulate(sizes[:-1], initial=0))
 
     def parts(self) -> Iterator[Scene]:
         """The copies one after another, as they stand."""

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -27,8 +26,7 @@ from potr_cl.model.quaternions import quaternions_of
 from potr_cl.model.scene import Scene, joined
 from tests.reference.captures import looking
 from tests.reference.frames import moved
-from tools.make.city import of_size
-from tools.workloads import camera_entry
+from tools.make.city import of_size, write_cameras
 
 F64 = NDArray[np.float64]
 
@@ -289,7 +287,7 @@ def main() -> None:
     )
     args.output.mkdir(parents=True, exist_ok=True)
     save_scene(args.output / "point_cloud.ply", scene)
-    (args.output / "cameras.json").write_text(json.dumps([camera_entry(n, camera) for n, camera in enumerate(cameras)]))
+    write_cameras(args.output, cameras)
     print(f"{len(scene):,} splats and {len(cameras)} views in {args.output}")
 
 

@@ -27,10 +27,7 @@ _ALWAYS = (
     "-Wl,--no-entry", "-Wl,--gc-sections", "-Wl,--strip-all", "-Wl,--export=__heap_base",
 )  # fmt: skip
 #: The build that takes every file, as small as it can be; and the one for speed.
-BUILDS = {
-    "potr.wasm": ("-Oz", "-DPOTR_SMALL", "-DPOTR_WIDE_LEVELS"),
-    "potr-simd.wasm": ("-O3", "-msimd128"),
-}
+BUILDS = {"potr.wasm": ("-Oz", "-DPOTR_SMALL", "-DPOTR_WIDE_LEVELS"), "potr-simd.wasm": ("-O3", "-msimd128")}
 
 
 def compiler() -> list[str]:

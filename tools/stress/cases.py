@@ -87,11 +87,7 @@ def known_cases() -> Iterator[Case]:
     for sigma in (1e-30, 1e-6, 10, 1e3, 1e6, 1e20, 1e38):
         yield Case(f"sigma {sigma:g}", plain_splats([[0, 0, 2], [0.3, 0.2, 3]], sigma=sigma, logit=1), ahead)
     needles, logits = random_splats(40, 0, seed=9), np.random.default_rng(0).normal(2, 1, 40).astype(np.float32)
-    for label, scales in (
-        ("1 : 1e5", (-9, -9, 3)),
-        ("1 : 1e9, flat", (-20, 2, 2)),
-        ("1 : 1e13", (-20, -20, 10)),
-    ):
+    for label, scales in (("1 : 1e5", (-9, -9, 3)), ("1 : 1e9, flat", (-20, 2, 2)), ("1 : 1e13", (-20, -20, 10))):
         log_scales = np.tile(np.array(scales, np.float32), (40, 1))
         scene = dataclasses.replace(needles, log_scales=log_scales, opacity_logits=logits)
         yield Case(f"needles {label}", scene, tilted_camera(9, 80, 60))

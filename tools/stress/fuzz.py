@@ -1,6 +1,6 @@
 """Have every reader read changed files, by the thousand, in processes that they may end.
 
-    python -m tools.stress.fuzz [--format NAME …] [--count N] [--seconds S] [--seed SEED] [--json FILE]
+    python -m tools.stress.fuzz [--format NAME …] [--count N] [--seconds S] [--seed SEED] [--processes P] [--json FILE]
     python -m tools.stress.fuzz --replay FOLDER …
 
 Each file is a small good one with changes: of bytes, and of the parts that the format has (header fields, tables,
@@ -16,59 +16,71 @@ File number n of a seed is always the same. Findings are kept in a folder each (
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 import tempfile
 import time
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from tools.results import Results
 from tools.stress.hostile.formats import FORMATS
 from tools.stress.hostile.supervisor import attack, read_again
+from tools.stress.hostile.worker import Job
 from tools.workloads import plain_parser
 
 _MIB = 1 << 20
 
 
-def main() -> None:
-    parser = plain_parser(__doc__)
-    parser.add_argument("--format", action="append", choices=list(FORMATS), dest="formats", help="default: all in turn")
+def fuzz_parser(description: str | None) -> argparse.ArgumentParser:
+    """A command line for :func:`campaign`."""
+    parser = plain_parser(description)
     parser.add_argument("--count", type=int, default=1000, metavar="N", help="files of each format; default 1000")
     parser.add_argument("--first", type=int, default=0, metavar="N", help="number of the first one; default 0")
     parser.add_argument("--seconds", type=float, default=1e9, metavar="S", help="for each format at the most")
     parser.add_argument("--seed", type=int, default=1, help="default 1")
+    parser.add_argument("--processes", type=int, default=1, metavar="P", help="that read at a time; default 1")
     parser.add_argument("--findings", type=Path, metavar="FOLDER", help="default: a new temporary folder")
     parser.add_argument("--replay", type=Path, nargs="+", metavar="FOLDER", help="findings to read again")
-    args = parser.parse_args()
+    return parser
+
+
+def campaign(
+    name: str, formats: Iterable[str], args: argparse.Namespace, environment: Mapping[str, str] | None = None
+) -> int:
+    """Attack formats, or replay findings, in processes with some environment; 1 where something is wrong, else 0."""
     findings = args.findings or Path(tempfile.mkdtemp(prefix="findings-"))
+    around = dict(environment or {})
     if args.replay:
-        sys.exit(_replay(args.replay, findings))
+        again = read_again(args.replay, findings, environment=around)
+        for folder, told in zip(args.replay, again, strict=True):
+            print(f"{folder}: {told['kind']}, {told['seconds']:.3f} s, {told['memory'] / _MIB:.1f} MiB\n{told['text']}")
+        return int(any(told["kind"] not in ("read", "refused") for told in again))
     table = Results(None, args.json).table(
-        "files", "Changed files, what became of them, and the worst of them",
+        name, "Changed files, what became of them, and the worst of them",
         "format; files||,; read||,; refused||,; findings||,; slowest|s of processor time|.2f; most memory|MiB|.1f; "
         "time|s|.0f",
     )  # fmt: skip
     wrong = 0
-    for name in args.formats or FORMATS:
+    for form in formats:
         began = time.monotonic()
-        found = attack(name, args.seed, args.first, args.count, args.seconds, findings)
+        job = Job(form, "", str(findings), args.seed, args.first, args.count, args.seconds, environment=around)
+        found = attack(job, args.processes)
         wrong += found.findings
-        figures = found.number - args.first, found.read, found.refused, found.findings
-        seconds = round(time.monotonic() - began, 1)
-        table.add(name, *figures, round(found.slowest, 3), round(found.memory / _MIB, 3), seconds)
+        worst = round(found.slowest, 3), round(found.memory / _MIB, 3), round(time.monotonic() - began, 1)
+        table.add(form, found.files, found.read, found.refused, found.findings, *worst)
     for about in sorted(findings.glob("*/finding.json")):
         told = json.loads(about.read_text())
         print(f"\n{about.parent}: {told['kind']}\n{told['text']}", file=sys.stderr)
-    sys.exit(1 if wrong else 0)
+    return int(wrong > 0)
 
 
-def _replay(folders: list[Path], findings: Path) -> int:
-    wrong = 0
-    for result, folder in zip(read_again(folders, findings), folders, strict=True):
-        memory = f"{result['memory'] / _MIB:.1f} MiB"
-        print(f"{folder}: {result['kind']}, {result['seconds']:.3f} s, {memory}\n{result['text']}")
-        wrong += result["kind"] not in ("read", "refused")
-    return 1 if wrong else 0
+def main() -> None:
+    parser = fuzz_parser(__doc__)
+    parser.add_argument("--format", action="append", choices=list(FORMATS), dest="formats", help="default: all in turn")
+    args = parser.parse_args()
+    sys.exit(campaign("files", args.formats or FORMATS, args))
 
 
 if __name__ == "__main__":

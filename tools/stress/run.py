@@ -39,17 +39,7 @@ from tools.stress.cases import (
     ridge_systems,
     small_scenes,
 )
-from tools.stress.measures import (
-    LIMIT,
-    PROMISES,
-    WHAT,
-    Measures,
-    Worst,
-    limit,
-    note,
-    search,
-    smallest_failure,
-)
+from tools.stress.measures import LIMIT, PROMISES, WHAT, Measures, Worst, limit, note, search, smallest_failure
 from tools.stress.platforms import families
 from tools.stress.solvers import check_refit, check_ridge
 from tools.stress.views import check

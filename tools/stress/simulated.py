@@ -38,7 +38,7 @@ from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.native.library import VARIABLE
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.model import splat_groups
-from potr_cl.model.camera import Camera, camera_centres
+from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.ondevice.decode import decode_to_device
 from potr_cl.opencl import device as opencl_device
@@ -47,6 +47,8 @@ from potr_cl.opencl.discovery import list_devices
 from potr_cl.opencl.kernel import Kernel
 from potr_cl.opencl.memory import Memory
 from potr_cl.outputs.colour_grid import ColourGrid
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster import launch_gpu
 from potr_cl.raster import long_lists as long_lists_module
 from potr_cl.raster.picked_splats import Picker
@@ -54,11 +56,7 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import GSPLAT, INRIA
 from potr_cl.raster.scene_buffers import gathered, uploaded
 from potr_cl.raster.surely_seen import surely_seen
-from potr_cl.stages.compaction.ridge import Compactor
-from potr_cl.stages.compaction.view_weights import ViewWeights
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
-from potr_cl.stages.fitting.fit import FitOptions, fit_scene
-from potr_cl.stages.fitting.parameters import UNROUNDED, Factors, in_form_of_files
 from potr_cl.stages.pruning.alive_packing import AlivePacking
 from potr_cl.stages.pruning.changed_totals import AddedChanges, ChangedTotals
 from potr_cl.stages.pruning.on_device import prune_scene
@@ -73,8 +71,8 @@ from potr_cl.stages.refitting.exchange import Exchange
 from potr_cl.stages.refitting.layout import Layout
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
-from potr_cl.stages.refitting.targets import RenderedTargets
 from potr_cl.views import reached
+from potr_cl.views.targets import RenderedTargets
 from potr_cl.views.visibility import Visibility
 from tests.reference import raster as reference
 from tests.reference.scenes import plain_splats, random_splats, straight_camera, tilted_camera
@@ -118,16 +116,12 @@ def long_lists(device: Device) -> None:
         rasterizer.render(straight_camera(16, 16))
 
 
-def pruning(device: Device) -> None:
-    """Removal effects, and a pruning that the device steers where it can."""
-    scene, views = random_splats(60, 3, seed=2), _views()
-    with Rasterizer(device, scene) as rasterizer:
-        with RemovalSweep(rasterizer, views, SweepOptions(0, 1)) as removal:
-            removal.measure()
-            removal.remove(np.arange(0, 60, 5))
-            removal.measure()
-        with RemovalSweep(rasterizer, views, SweepOptions(0)) as removal:
-            prune_scene(removal, PruningOptions(1e-4, 3))
+def all_stages(device: Device) -> None:
+    """A whole encode: pruning that a GPU steers, the fit with its roundings, compaction, re-fit and judging."""
+    changes = {"prune": {"iterations": 3}, "fit": {"steps": 6}, "compact": True, "refit": {"steps": 1}}
+    options = EncodeOptions.for_preset("smallest", between=False, cameras_anyway=True, **changes)
+    for degree in (1, 3):
+        encode(random_splats(60, degree, seed=2), _views(5), options, device=device)
 
 
 def several_batches(device: Device) -> None:
@@ -271,42 +265,11 @@ def marks(device: Device) -> None:
             added.add(totals, changes, 61, memory.upload(np.arange(61, dtype=np.uint32), "numbers"))
 
 
-def derivatives(device: Device) -> None:
-    """Jᵀ v."""
-    scene, views = random_splats(60, 3, seed=2), _views()
-    _derivatives(device, scene, views)
-
-
 def _derivatives(device: Device, scene: Scene, views: list[Camera]) -> None:
     pixels = sum(view.width * view.height for view in views)
     with PictureDerivatives(device, scene) as found, Memory(device) as memory:
         target = memory.upload(np.full((pixels, 3), 0.5, np.float32), "the targets")
         found.add(views, target)
-
-
-def fit(device: Device) -> None:
-    """Some steps, judged by views that are held out; of an antialiased scene, and rounded on the way."""
-    source, views = random_splats(60, 3, seed=2), _views(5)
-    for antialiased, factors in ((False, UNROUNDED), (True, Factors(200, 500, 20))):
-        original = in_form_of_files(dataclasses.replace(source, antialiased=antialiased))
-        scene = dataclasses.replace(original, means=original.means + np.float32(0.01))
-        with Rasterizer(device, original) as rasterizer:
-            targets = RenderedTargets(rasterizer, views)
-            options = FitOptions(steps=3, rounds=1)
-            fit_scene(device, scene, views, targets, options, factors=factors)
-
-
-def compaction(device: Device) -> None:
-    """The ridge of every SH degree."""
-    views = _views()
-    with (
-        Rasterizer(device, random_splats(60, 3, seed=2)) as rasterizer,
-        RemovalSweep(rasterizer, views, SweepOptions(0, 1)) as removal,
-    ):
-        removal.measure()
-        weights = ViewWeights.from_importances(60, removal.view_importances())
-    for degree in (1, 2, 3):
-        Compactor(device).compact(random_splats(60, degree, seed=2), camera_centres(views), weights)
 
 
 def decoding(device: Device) -> None:
@@ -336,8 +299,8 @@ def filling(device: Device) -> None:
 
 
 STEPS: tuple[Step, ...] = (
-    pictures, long_lists, pruning, several_batches, view_by_view, part_by_part, some_of_a_scene, refit,
-    refit_of_reached, packing, marks, derivatives, fit, compaction, decoding, clusters, check_similarity, filling,
+    pictures, long_lists, all_stages, several_batches, view_by_view, part_by_part, some_of_a_scene, refit,
+    refit_of_reached, packing, marks, decoding, clusters, check_similarity, filling,
 )  # fmt: skip
 
 

@@ -18,6 +18,7 @@ from potr_cl.stages.pruning.sweep_options import SweepOptions
 from tests.reference import raster as reference
 from tools.stress.cases import Case
 from tools.stress.derivatives import check_derivatives, tellable
+from tools.stress.fits import check_fits
 from tools.stress.measures import Measures
 from tools.stress.precise import (
     F64,
@@ -33,7 +34,6 @@ from tools.stress.precise import (
     rounded,
     stand_in,
 )
-from tools.stress.roads import check_roads
 
 Mask = NDArray[np.bool_]
 
@@ -69,7 +69,7 @@ def check(device: Device, case: Case) -> Measures:
     shown = np.isin(true.index, lists.intersections)
     sound = tellable(true.covariance[shown], true.colour[shown])
     draw = partial(stand_in, case)
-    found |= check_roads(device, case)
+    found |= check_fits(device, case)
     return found | check_derivatives(device, case.scene, case.view, case.rules, tellable_pixels, sound, draw, DRAWS)
 
 

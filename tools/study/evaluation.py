@@ -42,7 +42,7 @@ class EvaluatedScene(Owner):
             raise DataError(f"'{folder / 'cameras.json'}' has no test views")
         images = folder / "images"
         self._ground_truth = find_ground_truth(images, self.views) if images.is_dir() else None
-        self._judging = Judging(device, self.source, Looks(ground_truth=self._ground_truth))
+        self._judging = Judging(device, self.source, self.views, Looks(ground_truth=self._ground_truth))
 
     def __call__(self, candidate: Scene) -> dict[str, float | None]:
         """Means over the test views.
@@ -52,9 +52,7 @@ class EvaluatedScene(Owner):
             ``truth_ssim`` against those, and ``psnr_loss`` and ``ssim_loss``, what the uncompressed scene has more.
             A PSNR of None means identical pictures.
         """
-        self._judging.take(candidate)
-        mean = mean_view(list(self._judging.figures(self.views))).figures
-        self._judging.forget()
+        mean = mean_view(self._judging.figures(candidate)).figures
         names = {"b_against_a": ("psnr", "ssim")}
         if self._ground_truth is not None:
             names["b_against_truth"] = ("truth_psnr", "truth_ssim")

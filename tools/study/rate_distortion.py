@@ -145,59 +145,36 @@ def merged(paths: Sequence[Path], chosen: Sequence[str] = ()) -> dict[str, Any]:
         chosen: take these series alone, in this order; empty: all of them. A scene may lack some of them.
 
     Returns:
-        The same structure. "commit" names every commit and, if there are several, the series that each has measured;
-        "machine", "date" and "command" are those of the files that a point is taken of, each once.
+        The same structure; "commit" names those of all points, each once, "machine", "date" and "command" those of the
+        files that a point is taken of.
 
     Raises:
         UsageError: none of the files has a series of that name.
     """
     files = [json.loads(path.read_text()) for path in paths]
-    together: dict[str, Any] = {**files[0], "scenes": {}}
+    scenes: dict[str, Any] = {}
     for number, file in enumerate(files):
         about = {"commit": file.get("commit", "unknown"), "file": number}
         for name, entry in file["scenes"].items():
-            kept = together["scenes"].setdefault(name, {**entry, "series": {}})
+            kept = scenes.setdefault(name, {**entry, "series": {}})["series"]
             for series, curve in entry["series"].items():
-                points = {p["q"]: p for p in kept["series"].get(series, {"encodes": []})["encodes"]}
-                points |= {p["q"]: {**about, **p} for p in curve["encodes"]}
-                kept["series"][series] = {**curve, "encodes": [points[q] for q in sorted(points)]}
-    for entry in together["scenes"].values():
+                points = {p["q"]: p for each in (kept.get(series), curve) if each for p in each["encodes"]}
+                kept[series] = {**curve, "encodes": [{**about, **points[q]} for q in sorted(points)]}
+    for entry in scenes.values():
         order = chosen or list(entry["series"])
         entry["series"] = {name: entry["series"][name] for name in order if name in entry["series"]}
     for name in chosen:
-        if not any(name in entry["series"] for entry in together["scenes"].values()):
+        if not any(name in entry["series"] for entry in scenes.values()):
             raise UsageError(f"{', '.join(map(str, paths))}: there is no series '{name}'")
-    used = {
-        point.pop("file")
-        for entry in together["scenes"].values()
-        for curve in entry["series"].values()
-        for point in curve["encodes"]
+    all_points = [p for entry in scenes.values() for curve in entry["series"].values() for p in curve["encodes"]]
+    used = [files[number] for number in sorted({point.pop("file") for point in all_points})]
+    said = {
+        key: between.join(dict.fromkeys(file[key] for file in used if key in file))
+        for key, between in (("machine", "; "), ("date", ", "))
     }
-    together["commit"] = _commits(together["scenes"])
-    sources = [file for number, file in enumerate(files) if number in used]
-    for key, between in (("machine", "; "), ("date", ", ")):
-        together[key] = between.join(dict.fromkeys(file[key] for file in sources if key in file))
-    together["command"] = list(dict.fromkeys(command for file in sources for command in file.get("command", [])))
-    return together
-
-
-def _commits(scenes: dict[str, Any]) -> str:
-    """The commits of all points: one, or each with the series (and, where they differ, the scenes) that it measured."""
-    of_commit: dict[str, dict[str, list[str]]] = {}
-    for scene, entry in scenes.items():
-        for series, curve in entry["series"].items():
-            for commit in dict.fromkeys(point["commit"] for point in curve["encodes"]):
-                of_commit.setdefault(commit, {}).setdefault(series, []).append(scene)
-    if len(of_commit) <= 1:
-        return "".join(of_commit)
-    parts = []
-    for commit, parted in of_commit.items():
-        texts = [
-            series if len(measured) == len(scenes) else f"{series} of {' and '.join(measured)}"
-            for series, measured in parted.items()
-        ]
-        parts.append(f"{commit} ({', '.join(texts)})")
-    return "; ".join(parts)
+    commands = list(dict.fromkeys(command for file in used for command in file.get("command", [])))
+    commit = "; ".join(dict.fromkeys(point["commit"] for point in all_points))
+    return {**files[0], "scenes": scenes, **said, "command": commands, "commit": commit}
 
 
 def size_at(points: list[dict[str, Any]], key: str, value: float) -> float | None:

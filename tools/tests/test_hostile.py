@@ -142,9 +142,11 @@ def test_findings_are_read_again(tmp_path):
     assert [result["kind"] for result in results] == ["read", "read", "refused"]
 
 
-def test_a_run_goes_on_where_another_ended(tmp_path):
-    whole = attack("png", 5, 0, 300, 600, tmp_path)
-    parts = [attack("png", 5, first, 150, 600, tmp_path) for first in (0, 150)]
-    assert whole.number == 300
+def test_a_run_is_the_same_in_parts_and_by_several_processes(tmp_path):
+    whole, *parts = (
+        attack(Job("png", "", str(tmp_path), seed=5, first=first, count=count), processes)
+        for first, count, processes in ((0, 300, 2), (0, 150, 1), (150, 150, 1))
+    )
+    assert whole.files == 300
     assert whole.read == sum(part.read for part in parts)
     assert whole.findings == 0

@@ -99,7 +99,7 @@ def test_later_files_replace_points_and_add_others(tmp_path):
         (0.5, 4, "bbbbbbb"),
     ]
     assert [p["bytes"] for p in both["scenes"]["t"]["series"]["best"]["encodes"]] == [1, 5]
-    assert both["commit"] == "aaaaaaa (best, fast); bbbbbbb (best of s)"
+    assert both["commit"] == "aaaaaaa; bbbbbbb"
     assert (both["machine"], both["date"]) == ("a; b", "2026-01-01")
     assert both["command"] == ["python aaaaaaa", "python bbbbbbb"]
 
@@ -110,7 +110,7 @@ def test_a_point_s_own_commit_counts(tmp_path):
     content = json.loads(path.read_text())
     content["scenes"]["s"]["series"]["best"]["encodes"][0]["commit"] = "aaaaaaa"
     path.write_text(json.dumps(content))
-    assert merged([path])["commit"] == "aaaaaaa (best); bbbbbbb (best)"
+    assert merged([path])["commit"] == "aaaaaaa; bbbbbbb"
 
 
 def test_series_in_the_order_asked_for(tmp_path):

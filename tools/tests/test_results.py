@@ -52,13 +52,6 @@ def test_a_row_fits_its_table() -> None:
         table.add(1)
 
 
-def test_a_row_takes_the_place_of_another(tmp_path: Path) -> None:
-    table = Results(None, tmp_path / "results.json").table("t", "A table", Column("a"), Column("b"))
-    for row in (("x", 1), ("y", 2), ("x", 3)):
-        table.put(*row)
-    assert json.loads((tmp_path / "results.json").read_text())["t"]["rows"] == [["y", 2], ["x", 3]]
-
-
 def test_what_json_cannot_hold(tmp_path: Path) -> None:
     """A table keeps it as text; where a tool's own content has it, the file that was there stays whole."""
     path = tmp_path / "results.json"

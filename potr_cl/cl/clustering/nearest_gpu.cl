@@ -1,7 +1,9 @@
 /* The best centre of each point, for GPUs: a block of GROUP points a work-group, a point a work-item. The group
    brings some centres at a time into local memory, and each work-item compares its point with them.
 
-   Macros: WIDTH (floats of a row of points and of centres, a multiple of 4; unused ones are 0), GROUP. */
+   Macros: WIDTH (floats of a row of points and of centres, a multiple of 4; unused ones are 0), GROUP.
+
+   On GPUs: WIDTH:4,12,24,48 GROUP=128. */
 
 #include "clustering/candidates.clh"
 

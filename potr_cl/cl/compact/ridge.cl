@@ -14,7 +14,9 @@
        SH_COUNT    coefficients of a channel: 4, 9 or 16;
        BLOCK       rows of the matrix that are reduced at a time;
        ORTHOGONAL  1: reduce by reflections (ridge_orthogonal.clh);
-                   0: by the normal equations (ridge_cholesky.clh). */
+                   0: by the normal equations (ridge_cholesky.clh).
+
+   On GPUs: LANES=1 SH_COUNT=4,9,16 BLOCK=4 ORTHOGONAL=0,1. */
 
 #include "include/reals.clh"
 #include "include/sh_basis.clh"

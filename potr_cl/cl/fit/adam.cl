@@ -6,7 +6,9 @@
 
    A parameter whose gradient was always 0 stays what it was, whatever the limits are. The gradient becomes 0.
 
-   Macros: none. */
+   Macros: none.
+
+   On GPUs: no macros. */
 
 /* steps: for each column the length of a step, which is multiplied by `part`, and the least and the greatest value that
    it may reach.

@@ -11,7 +11,10 @@
    Macros:
        LANES, SH_COUNT                                   splats a work-item, coefficients of a channel;
        ANTIALIASED, LEAST_COMPENSATION_SQUARED, LOW_PASS,
-       LOW_PASS_SQUARED                                  see project.cl. */
+       LOW_PASS_SQUARED                                  see project.cl.
+
+   On GPUs: LANES=1 SH_COUNT=1,4,9,16 ANTIALIASED=-,1 (LEAST_COMPENSATION_SQUARED=2.5e-5f) LOW_PASS=-,0.1f
+       (LOW_PASS_SQUARED=0.01f). */
 
 #include "include/reals.clh"
 #include "include/splat.clh"

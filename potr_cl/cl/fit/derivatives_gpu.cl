@@ -10,7 +10,10 @@
    Macros:
        ALPHA_CAP, TRANSMITTANCE_THRESHOLD, NATIVE_EXP2  see subtile_lists.clh;
        LARGEST_VALUE, LARGEST_GAP                       see sums.clh;
-       INT64_ATOMICS                                    see totals.clh. */
+       INT64_ATOMICS                                    see totals.clh.
+
+   On GPUs: ALPHA_CAP=0.99f TRANSMITTANCE_THRESHOLD=1e-4f NATIVE_EXP2=0,1 LARGEST_VALUE=64.0f LARGEST_GAP=1.0f
+       INT64_ATOMICS=0,1. */
 
 #include "include/subtile_lists.clh"
 #include "fit/sums.clh"

@@ -3,7 +3,9 @@
    Work-item k takes the numbers k, k + n, k + 2 n, … of the pictures, with n work-items in all. So neighbours read what
    lies side by side, and each sum has few terms: the host adds the sums up in double precision.
 
-   Macros: none. */
+   Macros: none.
+
+   On GPUs: no macros. */
 
 /* count: of the numbers in each of the two. sums: work-item by work-item, beginning at first_sum. */
 kernel void squared_error(

@@ -8,7 +8,9 @@
    Columns of parameters are `stride` long, and the bundle's splats begin at `first`.
 
    Macros:
-       BUNDLE  splats of a bundle. */
+       BUNDLE  splats of a bundle.
+
+   On GPUs: BUNDLE=8192. */
 
 kernel void spread(
     global const uint *packed,

@@ -1,6 +1,8 @@
 /* Fills a buffer with two 32-bit words in turn; a work-item does a word. Both kernel families use it.
 
-   Macros: none. */
+   Macros: none.
+
+   On GPUs: no macros. */
 
 kernel void fill(global uint *words, ulong count, uint first, uint second)
 {

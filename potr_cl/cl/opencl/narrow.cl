@@ -2,7 +2,9 @@
 
    Integers may be the columns of a table that lies in rows: number i of them is then in row i % rows. A run is RUN values
    of so many bits, the first one in the lowest bits of its words of 16 bits: as many words as a value has bits. Where
-   runs begin is known of every RUNS-th. */
+   runs begin is known of every RUNS-th.
+
+   On GPUs: no macros. */
 
 #define RUN 16
 #define RUNS 4

@@ -1,6 +1,8 @@
 /* Small kernels by which opencl/device.py finds out what a device does right.
 
-   Macros: LANES (see lanes.clh). With 1 there are more kernels, which have no vectors. */
+   Macros: LANES (see lanes.clh). With 1 there are more kernels, which have no vectors.
+
+   On GPUs: LANES=1,4,8,16 NATIVE_EXP2=-,1. */
 
 #include "include/lanes.clh"
 

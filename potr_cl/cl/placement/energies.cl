@@ -1,7 +1,9 @@
 /* How much splats' colours vary towards places: potr_cl/model/spherical_harmonics.py's energy. A target a work-item, the
    places along the second axis.
 
-   Macros: SH_COUNT (coefficients of a channel: 9 or 16; must be given). */
+   Macros: SH_COUNT (coefficients of a channel: 9 or 16; must be given).
+
+   On GPUs: SH_COUNT=4,9,16. */
 
 #define REAL float
 #define VREAL float

@@ -1,7 +1,9 @@
 /* Rays through the cells of a space (potr_cl/placement/space.py), in units of a cell, from the grid's lowest corner.
 
    A cell knows how many cells the nearest matter is away along the axis where it is farthest, so a ray leaps as far
-   without a look. Macros: none. */
+   without a look. Macros: none.
+
+   On GPUs: no macros. */
 
 /* As in space.py: how far before its end a ray may meet matter, and how far it advances at least. */
 #define BEFORE 1.75f

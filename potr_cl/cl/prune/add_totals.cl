@@ -1,4 +1,6 @@
-/* totals += more, where others have measured more views, or totals -= more: one 64-bit integer a work-item. */
+/* totals += more, where others have measured more views, or totals -= more: one 64-bit integer a work-item.
+
+   On GPUs: no macros. */
 
 kernel void add_totals(global long *totals, global const long *more, ulong count)
 {

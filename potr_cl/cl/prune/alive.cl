@@ -1,4 +1,6 @@
-/* Totals of the splats that are left, in one row, as they travel between devices; and back. */
+/* Totals of the splats that are left, in one row, as they travel between devices; and back.
+
+   On GPUs: no macros. */
 
 #include "prune/removal.clh"
 

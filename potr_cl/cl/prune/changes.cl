@@ -1,4 +1,6 @@
-/* By how much the totals of splats have changed, in one row, as it travels between computers; and adding that up. */
+/* By how much the totals of splats have changed, in one row, as it travels between computers; and adding that up.
+
+   On GPUs: NUMBERED=0,1. */
 
 #include "prune/removal.clh"
 

@@ -5,7 +5,9 @@
    budget. The score of that one is found digit by digit, from histograms of the candidates' importances over 8 bits of
    the score at a time. Importances are integers (totals.clh), so that no sum depends on the order of its terms.
 
-   Macros: INT64_ATOMICS (see totals.clh). */
+   Macros: INT64_ATOMICS (see totals.clh).
+
+   On GPUs: INT64_ATOMICS=0,1. */
 
 #include "include/totals.clh"
 #include "prune/removal.clh"

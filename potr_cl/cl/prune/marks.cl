@@ -1,4 +1,6 @@
-/* Which splats a controller has marked to go, as bits that travel, and back. Eight splats a work-item. */
+/* Which splats a controller has marked to go, as bits that travel, and back. Eight splats a work-item.
+
+   On GPUs: no macros. */
 
 #include "prune/removal.clh"
 

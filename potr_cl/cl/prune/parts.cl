@@ -1,7 +1,9 @@
 /* Parts of the views that have only the splats that they see: a part's splat i is number numbers[i] of the scene, and no
    splat is in a part twice. A work-item does one of the part's splats, but in `lost`.
 
-   Macros: INT64_ATOMICS (see totals.clh). */
+   Macros: INT64_ATOMICS (see totals.clh).
+
+   On GPUs: INT64_ATOMICS=0,1. */
 
 #include "prune/removal.clh"
 

@@ -5,7 +5,9 @@
        ALPHA_CAP, TRANSMITTANCE_THRESHOLD, NATIVE_EXP2  see subtile_lists.clh;
        INT64_ATOMICS                                    see totals.clh;
        PICKED                                           1: splats have other numbers in totals and states, which
-                                                        `numbers` has. */
+                                                        `numbers` has.
+
+   On GPUs: ALPHA_CAP=0.99f TRANSMITTANCE_THRESHOLD=1e-4f NATIVE_EXP2=0,1 INT64_ATOMICS=0,1 PICKED=0,1. */
 
 #if PICKED
 #define SCENE_NUMBER(splat) ((size_t)numbers[splat])

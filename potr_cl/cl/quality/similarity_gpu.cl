@@ -3,7 +3,10 @@
 
    Beyond its borders a picture goes on with zeros.
 
-   Macros: those of similarity.clh. */
+   Macros: those of similarity.clh.
+
+   On GPUs: C1=1e-4f C2=9e-4f WEIGHT_0=0.27f WEIGHT_1=0.21f WEIGHT_2=0.11f WEIGHT_3=0.04f WEIGHT_4=0.01f
+       WEIGHT_5=0.001f. */
 
 #define LANES 1
 #include "include/lanes.clh"

@@ -1,7 +1,9 @@
 /* Turns rows of `width` floats, one row a splat, into columns of `stride` floats. The first row is that of splat
    `first`. Both kernel families use it.
 
-   Macros: none. */
+   Macros: none.
+
+   On GPUs: no macros. */
 
 kernel void columns(global const float *rows, uint first, uint width, uint stride, global float *result)
 {

@@ -10,7 +10,9 @@
        TRANSMITTANCE_THRESHOLD  a pixel ends before its transmittance would fall below it;
        NATIVE_EXP2              see lanes.clh;
        AT_ONCE                  splats whose exponents are computed before the first of them is composited: a divisor of
-                                BATCH, 8 by default. */
+                                BATCH, 8 by default.
+
+   On GPUs: ALPHA_CAP=0.99f TRANSMITTANCE_THRESHOLD=1e-4f NATIVE_EXP2=0,1. */
 
 #define LANES 1
 #include "include/lanes.clh"

@@ -2,7 +2,9 @@
    See subtile_lists.clh for how a tile's work is shared out. composite_cpu.cl is its twin; composite_frame_gpu.cl does
    a view alone.
 
-   Macros: ALPHA_CAP, TRANSMITTANCE_THRESHOLD, NATIVE_EXP2 (see subtile_lists.clh). */
+   Macros: ALPHA_CAP, TRANSMITTANCE_THRESHOLD, NATIVE_EXP2 (see subtile_lists.clh).
+
+   On GPUs: ALPHA_CAP=0.99f TRANSMITTANCE_THRESHOLD=1e-4f NATIVE_EXP2=0,1. */
 
 #include "include/subtile_lists.clh"
 

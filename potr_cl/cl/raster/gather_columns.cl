@@ -1,7 +1,9 @@
 /* Picks some splats' values out of columns: result[c][i] = columns[c][numbers[i]]. get_global_id(1) is the column. Both
    kernel families use it.
 
-   Macros: none. */
+   Macros: none.
+
+   On GPUs: no macros. */
 
 kernel void gather_columns(
     global const float *columns,

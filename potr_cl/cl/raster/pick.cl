@@ -3,7 +3,9 @@
    before it. Both kernel families use it. count_wanted does so for several choices of groups, one after another in
    `wanted` and in `counts`: the second dimension of work-groups.
 
-   Macros: none. */
+   Macros: none.
+
+   On GPUs: no macros. */
 
 #define GROUP 256
 #define ROUNDS 16

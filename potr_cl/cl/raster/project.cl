@@ -16,7 +16,10 @@
        LOW_PASS, LOW_PASS_SQUARED  square pixels added to a splat's variances on screen, and their square;
        PICKED         1: only the splats that `numbers` names are projected, `picked` of them, of a scene that is
                       `whole_stride` long; what is found lies in their order. Each view's numbers begin `apart` behind
-                      those of the view before it; NO_SPLAT among them is drawn nowhere. 0, the default: all. */
+                      those of the view before it; NO_SPLAT among them is drawn nowhere. 0, the default: all.
+
+   On GPUs: LANES=1 SH_COUNT=1,4,9,16 NEAR=0.2f SQUARE_EXTENT=0,1 PICKED=-,1 ANTIALIASED=-,1
+       (LEAST_COMPENSATION_SQUARED=2.5e-5f) LOW_PASS=-,0.1f (LOW_PASS_SQUARED=0.01f). */
 
 #include "include/lanes.clh"
 #include "include/splat.clh"

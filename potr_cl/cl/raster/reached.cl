@@ -3,7 +3,9 @@
    A tile's list is walked from front to back until all pixels have ended (subtile_lists.clh). What is behind that makes
    no difference to any bit of what is composited, or of what goes back to splats: nobody fetches it.
 
-   Macros: ALPHA_CAP, TRANSMITTANCE_THRESHOLD, NATIVE_EXP2 (see subtile_lists.clh). */
+   Macros: ALPHA_CAP, TRANSMITTANCE_THRESHOLD, NATIVE_EXP2 (see subtile_lists.clh).
+
+   On GPUs: ALPHA_CAP=0.99f TRANSMITTANCE_THRESHOLD=1e-4f NATIVE_EXP2=0,1. */
 
 #include "include/subtile_lists.clh"
 

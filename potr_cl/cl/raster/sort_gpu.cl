@@ -5,7 +5,9 @@
    smaller key first, and positions beyond the end behave like infinite keys without being stored. Lists of up to
    SORT_CAPACITY keys stay in local memory. In longer ones, steps that reach further than that run in global memory.
 
-   Macros: SORT_CAPACITY (a power of two; must be given), COUNTER_STRIDE (as in tile_lists_gpu.cl; 1 by default). */
+   Macros: SORT_CAPACITY (a power of two; must be given), COUNTER_STRIDE (as in tile_lists_gpu.cl; 1 by default).
+
+   On GPUs: SORT_CAPACITY:2048 COUNTER_STRIDE=8. */
 
 #include "include/splat.clh"
 #include "include/view_set.clh"

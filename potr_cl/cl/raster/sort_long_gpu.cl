@@ -5,7 +5,9 @@
    the keys of one piece of what comes out (merge path: Odeh, Green, Mwassi, Shmueli, Birk: "Merge Path - Parallel Merging
    Made Simple", 2012). The lists go to and fro between `keys` and `others`.
 
-   Macros: PIECE (a power of two; must be given). */
+   Macros: PIECE (a power of two; must be given).
+
+   On GPUs: PIECE:2048. */
 
 #define GROUP 256
 

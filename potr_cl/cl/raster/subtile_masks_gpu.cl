@@ -1,7 +1,9 @@
 /* Which sub-tiles of its tile each intersection touches, for GPUs: one work-group a tile; get_group_id(1) is the view's
    number in its set. It is found once for a view, however often its lists are swept. subtile_masks_cpu.cl is its twin.
 
-   Macros: none. */
+   Macros: none.
+
+   On GPUs: no macros. */
 
 #define LANES 1
 #define SUBTILE_WIDTH 4

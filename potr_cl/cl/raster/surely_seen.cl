@@ -1,7 +1,9 @@
 /* Which splats reach into the picture of one view at least, and which into none, without a doubt: potr_cl/model/unseen.py
    asks the same in double precision, of which this is a quick part. One splat a work-item.
 
-   Macros: none. */
+   Macros: none.
+
+   On GPUs: no macros. */
 
 /* Of a coordinate's terms: many times what single precision loses on their way through a view. */
 #define ROUNDING 1e-5f

@@ -8,7 +8,9 @@
    The unit of work is one row of tiles of one splat. A work-group strings the rows of its 256 splats together and deals
    them out evenly, so that one huge splat does not keep one work-item busy while the others wait.
 
-   Macros: COUNTER_STRIDE (see scan_tiles.clh; sort_gpu.cl must be given the same). */
+   Macros: COUNTER_STRIDE (see scan_tiles.clh; sort_gpu.cl must be given the same).
+
+   On GPUs: COUNTER_STRIDE=8. */
 
 #include "include/splat.clh"
 #include "include/view_set.clh"

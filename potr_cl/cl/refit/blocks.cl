@@ -1,7 +1,9 @@
 /* The splats' own blocks of the normal equations. `precondition` applies their inverses, `select_active` finds by them
    which coefficients are given up.
 
-   Macros: LANES (splats a work-item), SH_COUNT (coefficients of a channel). */
+   Macros: LANES (splats a work-item), SH_COUNT (coefficients of a channel).
+
+   On GPUs: LANES=1 SH_COUNT=1,4,9,16. */
 
 #include "refit/coefficients.clh"
 
@@ -21,7 +23,7 @@
 #endif
 
 /* result = the inverse of each splat's own block of the normal equations, restricted to the active coefficients, times
-   residual: a Cholesky factorisation a channel. The squared lengths of Y, Co and Cg in R, G, B are 3, 2 and 3. */
+   residual: a Cholesky factorisation a channel, which is the second dimension. The squared lengths of Y, Co and Cg in R, G, B are 3, 2 and 3. */
 kernel void precondition(
     global const float *residual,
     global const float *blocks,
@@ -40,130 +42,153 @@ kernel void precondition(
     UNROLL
     for (int i = 0; i < SH_COUNT; ++i)
         trace += VLOAD(index, blocks + AT(i, i) * stride);
-    for (int c = 0; c < 3; ++c) {
-        const float length = c == 1 ? 2.0f : 3.0f;
-        const float lambda = c == 0 ? lambda_luma : lambda_chroma;
-        const vfloat least = trace * (DAMPING * length / SH_COUNT);
-        /* Row by row, U with U^T U = block. The diagonal holds the pivots' inverse square roots, and 0 for what is left
-           out. */
-        vfloat factor[TRIANGLE], y[SH_COUNT];
+    const size_t c = get_global_id(1);
+    const float length = c == 1 ? 2.0f : 3.0f;
+    const float lambda = c == 0 ? lambda_luma : lambda_chroma;
+    const vfloat least = trace * (DAMPING * length / SH_COUNT);
+    /* Row by row, U with U^T U = block. The diagonal holds the pivots' inverse square roots, and 0 for what is left
+       out. */
+    vfloat factor[TRIANGLE], y[SH_COUNT];
+    UNROLL
+    for (int j = 0; j < SH_COUNT; ++j) {
+        const size_t column = 3 * j + c;
+        const vfloat own = VLOAD(index, blocks + AT(j, j) * stride);
+        const vfloat diagonal = FUSED((vfloat)(length), own, least + (prior + (j ? lambda : 0.0f)));
+        vfloat pivot = diagonal, rest = VLOAD(index, residual + column * stride);
         UNROLL
-        for (int j = 0; j < SH_COUNT; ++j) {
-            const size_t column = 3 * j + c;
-            const vfloat own = VLOAD(index, blocks + AT(j, j) * stride);
-            const vfloat diagonal = FUSED((vfloat)(length), own, least + (prior + (j ? lambda : 0.0f)));
-            vfloat pivot = diagonal, rest = VLOAD(index, residual + column * stride);
-            UNROLL
-            for (int i = 0; i < j; ++i) {
-                pivot = FUSED(-factor[AT(i, j)], factor[AT(i, j)], pivot);
-                rest = FUSED(-factor[AT(i, j)], y[i], rest);
-            }
-            const vint keep = (pivot > LEAST_PIVOT * diagonal) && (pivot > 1e-30f);
-            const vfloat inverse =
-                (keep ? 1.0f / sqrt(pivot) : (vfloat)(0.0f)) * active_lanes(active, stride, index, column);
-            factor[AT(j, j)] = inverse;
-            y[j] = rest * inverse;
-            UNROLL
-            for (int k = j + 1; k < SH_COUNT; ++k) {
-                vfloat sum = length * VLOAD(index, blocks + AT(j, k) * stride);
-                UNROLL
-                for (int i = 0; i < j; ++i)
-                    sum = FUSED(-factor[AT(i, j)], factor[AT(i, k)], sum);
-                factor[AT(j, k)] = sum * inverse * active_lanes(active, stride, index, 3 * k + c);
-            }
+        for (int i = 0; i < j; ++i) {
+            pivot = FUSED(-factor[AT(i, j)], factor[AT(i, j)], pivot);
+            rest = FUSED(-factor[AT(i, j)], y[i], rest);
         }
+        const vint keep = (pivot > LEAST_PIVOT * diagonal) && (pivot > 1e-30f);
+        const vfloat inverse =
+            (keep ? 1.0f / sqrt(pivot) : (vfloat)(0.0f)) * active_lanes(active, stride, index, column);
+        factor[AT(j, j)] = inverse;
+        y[j] = rest * inverse;
         UNROLL
-        for (int j = SH_COUNT - 1; j >= 0; --j) {
+        for (int k = j + 1; k < SH_COUNT; ++k) {
+            vfloat sum = length * VLOAD(index, blocks + AT(j, k) * stride);
             UNROLL
-            for (int k = j + 1; k < SH_COUNT; ++k)
-                y[j] = FUSED(-factor[AT(j, k)], y[k], y[j]);
-            y[j] *= factor[AT(j, j)];
-            VSTORE(y[j], index, result + (3 * j + c) * stride);
+            for (int i = 0; i < j; ++i)
+                sum = FUSED(-factor[AT(i, j)], factor[AT(i, k)], sum);
+            factor[AT(j, k)] = sum * inverse * active_lanes(active, stride, index, 3 * k + c);
         }
     }
+    UNROLL
+    for (int j = SH_COUNT - 1; j >= 0; --j) {
+        UNROLL
+        for (int k = j + 1; k < SH_COUNT; ++k)
+            y[j] = FUSED(-factor[AT(j, k)], y[k], y[j]);
+        y[j] *= factor[AT(j, j)];
+        VSTORE(y[j], index, result + (3 * j + c) * stride);
+    }
 }
+
+/* Where select_active keeps a splat's block, which it indexes while it runs: local memory where a work-item does one splat.
+   Registers would not hold it beside the others. GIVING_UP splats a work-group. */
+#if LANES == 1
+#define GIVING_UP 32
+#define BLOCK_MEMORY local float block[TRIANGLE * GIVING_UP]
+#define P(i, j) block[AT(i, j) * GIVING_UP + get_local_id(0)]
+#else
+#define BLOCK_MEMORY vfloat block[TRIANGLE]
+#define P(i, j) block[AT(i, j)]
+#endif
 
 /* Gives up AC coefficients, splat by splat and channel by channel: again and again the one whose loss costs least, as
    long as that is less than `least`. The other coefficients of the channel make up for it as well as they can; all
    other splats stay as they are. With P the inverse of the block, the loss of x_m costs x_m^2 / P_mm, moves the others
-   by -x_m P_jm / P_mm, and takes P_im P_jm / P_mm off P. */
+   by -x_m P_jm / P_mm, and takes P_im P_jm / P_mm off P. A launch does channel c: flags of all channels share words. */
 kernel void select_active(
     global float *coefficients,
     global const float *blocks,
     global uint *active,
     ulong stride,
     float prior,
-    float least)
+    float least,
+    int c)
 {
     const size_t index = get_global_id(0);
-    for (int c = 0; c < 3; ++c) {
-        const float length = c == 1 ? 2.0f : 3.0f;
-        /* Scaled to a unit diagonal; what is not active has an empty row and column. */
-        vfloat p[TRIANGLE], x[SH_COUNT], scale[SH_COUNT], keep[SH_COUNT];
-        for (int j = 0; j < SH_COUNT; ++j) {
-            const vfloat diagonal = MAD(length, VLOAD(index, blocks + AT(j, j) * stride), (vfloat)(prior));
-            keep[j] = active_lanes(active, stride, index, 3 * j + c);
-            scale[j] = sqrt(fmax(diagonal, (vfloat)(1e-30f)));
-            x[j] = keep[j] * scale[j] * VLOAD(index, coefficients + (3 * j + c) * stride);
+    const float length = c == 1 ? 2.0f : 3.0f;
+    /* Scaled to a unit diagonal; what is not active has an empty row and column. */
+    BLOCK_MEMORY;
+    vfloat x[SH_COUNT], scale[SH_COUNT], keep[SH_COUNT];
+    UNROLL
+    for (int j = 0; j < SH_COUNT; ++j) {
+        const vfloat diagonal = MAD(length, VLOAD(index, blocks + AT(j, j) * stride), (vfloat)(prior));
+        keep[j] = active_lanes(active, stride, index, 3 * j + c);
+        scale[j] = sqrt(fmax(diagonal, (vfloat)(1e-30f)));
+        x[j] = keep[j] * scale[j] * VLOAD(index, coefficients + (3 * j + c) * stride);
+    }
+    UNROLL
+    for (int i = 0; i < SH_COUNT; ++i)
+        UNROLL
+        for (int j = i; j < SH_COUNT; ++j) {
+            const vfloat product = length * VLOAD(index, blocks + AT(i, j) * stride) / (scale[i] * scale[j]);
+            P(i, j) = i == j ? (vfloat)(1.0f + UNIT_DAMPING) : product * keep[i] * keep[j];
         }
+    /* p becomes minus the inverse: one sweep a column, symmetric all the way. */
+    for (int k = 0; k < SH_COUNT; ++k) {
+        vfloat column[SH_COUNT];
+        UNROLL
+        for (int j = 0; j < SH_COUNT; ++j)
+            column[j] = j < k ? P(j, k) : P(k, j);
+        const vfloat inverse = 1.0f / fmax(P(k, k), (vfloat)(UNIT_DAMPING));
+        UNROLL
         for (int i = 0; i < SH_COUNT; ++i)
-            for (int j = i; j < SH_COUNT; ++j) {
-                const vfloat product = length * VLOAD(index, blocks + AT(i, j) * stride) / (scale[i] * scale[j]);
-                p[AT(i, j)] = i == j ? (vfloat)(1.0f + UNIT_DAMPING) : product * keep[i] * keep[j];
-            }
-        /* p becomes minus the inverse: one sweep a column, symmetric all the way. */
-        for (int k = 0; k < SH_COUNT; ++k) {
-            vfloat column[SH_COUNT];
-            for (int j = 0; j < SH_COUNT; ++j)
-                column[j] = j < k ? p[AT(j, k)] : p[AT(k, j)];
-            const vfloat inverse = 1.0f / fmax(column[k], (vfloat)(UNIT_DAMPING));
-            for (int i = 0; i < SH_COUNT; ++i)
-                for (int j = i; j < SH_COUNT; ++j)
-                    if (i == k || j == k)
-                        p[AT(i, j)] = i == j ? -inverse : column[i == k ? j : i] * inverse;
-                    else
-                        p[AT(i, j)] = MAD(-column[i] * inverse, column[j], p[AT(i, j)]);
+            UNROLL
+            for (int j = i; j < SH_COUNT; ++j)
+                if (i == k || j == k)
+                    P(i, j) = i == j ? -inverse : column[i == k ? j : i] * inverse;
+                else
+                    P(i, j) = MAD(-column[i] * inverse, column[j], P(i, j));
+    }
+    for (int round = 1; round < SH_COUNT; ++round) {
+        vfloat best = (vfloat)(least);
+        vint worst = (vint)(0);
+        UNROLL
+        for (int m = 1; m < SH_COUNT; ++m) {
+            const vfloat cost = x[m] * x[m] / fmax(-P(m, m), (vfloat)(1e-30f));
+            const vint cheaper = (keep[m] > 0.0f) && !(cost >= best);
+            best = cheaper ? cost : best;
+            worst = cheaper ? (vint)(m) : worst;
         }
-        for (int round = 1; round < SH_COUNT; ++round) {
-            vfloat best = (vfloat)(least);
-            vint worst = (vint)(0);
-            for (int m = 1; m < SH_COUNT; ++m) {
-                const vfloat cost = x[m] * x[m] / fmax(-p[AT(m, m)], (vfloat)(1e-30f));
-                const vint cheaper = (keep[m] > 0.0f) && !(cost >= best);
-                best = cheaper ? cost : best;
-                worst = cheaper ? (vint)(m) : worst;
-            }
-            if (!VANY(worst > 0))
-                break;
-            vfloat column[SH_COUNT], value = (vfloat)(0.0f), pivot = (vfloat)(-1.0f);
-            for (int j = 0; j < SH_COUNT; ++j) {
-                column[j] = (vfloat)(0.0f);
-                for (int m = 1; m < SH_COUNT; ++m)
-                    column[j] = worst == m ? p[j < m ? AT(j, m) : AT(m, j)] : column[j];
-            }
-            for (int m = 1; m < SH_COUNT; ++m) {
-                value = worst == m ? x[m] : value;
-                pivot = worst == m ? p[AT(m, m)] : pivot;
-                keep[m] = worst == m ? (vfloat)(0.0f) : keep[m];
-            }
-            const vfloat inverse = 1.0f / fmin(pivot, (vfloat)(-1e-30f));
-            for (int i = 0; i < SH_COUNT; ++i) {
-                x[i] = (MAD(-column[i] * inverse, value, x[i])) * (i ? keep[i] : (vfloat)(1.0f));
-                for (int j = i; j < SH_COUNT; ++j)
-                    p[AT(i, j)] = MAD(-column[i] * inverse, column[j], p[AT(i, j)]);
-            }
-        }
+        if (!VANY(worst > 0))
+            break;
+        vfloat column[SH_COUNT], value = (vfloat)(0.0f), pivot = (vfloat)(-1.0f);
+        UNROLL
         for (int j = 0; j < SH_COUNT; ++j) {
-            const size_t column = 3 * j + c;
-            const vfloat was = VLOAD(index, coefficients + column * stride), value = x[j] / scale[j];
-            const vint changed = active_lanes(active, stride, index, column) > 0.0f;
-            VSTORE(
-                changed ? (fabs(value) < 1e30f ? value : (vfloat)(0.0f)) : was, index, coefficients + column * stride);
-            float kept[LANES];
-            VSTORE(keep[j], 0, kept);
-            for (int lane = 0; lane < LANES; ++lane)
-                if (j && kept[lane] == 0.0f)
-                    active[(column / 24) * stride + index * LANES + lane] &= ~(1u << (column % 24));
+            column[j] = (vfloat)(0.0f);
+            UNROLL
+            for (int m = 1; m < SH_COUNT; ++m)
+                column[j] = worst == m ? (j < m ? P(j, m) : P(m, j)) : column[j];
         }
+        UNROLL
+        for (int m = 1; m < SH_COUNT; ++m) {
+            value = worst == m ? x[m] : value;
+            pivot = worst == m ? P(m, m) : pivot;
+            keep[m] = worst == m ? (vfloat)(0.0f) : keep[m];
+        }
+        const vfloat inverse = 1.0f / fmin(pivot, (vfloat)(-1e-30f));
+        UNROLL
+        for (int i = 0; i < SH_COUNT; ++i) {
+            x[i] = (MAD(-column[i] * inverse, value, x[i])) * (i ? keep[i] : (vfloat)(1.0f));
+            UNROLL
+            for (int j = i; j < SH_COUNT; ++j)
+                P(i, j) = MAD(-column[i] * inverse, column[j], P(i, j));
+        }
+    }
+    UNROLL
+    for (int j = 0; j < SH_COUNT; ++j) {
+        const size_t column = 3 * j + c;
+        const vfloat was = VLOAD(index, coefficients + column * stride), value = x[j] / scale[j];
+        const vint changed = active_lanes(active, stride, index, column) > 0.0f;
+        VSTORE(
+            changed ? (fabs(value) < 1e30f ? value : (vfloat)(0.0f)) : was, index, coefficients + column * stride);
+        float kept[LANES];
+        VSTORE(keep[j], 0, kept);
+        for (int lane = 0; lane < LANES; ++lane)
+            if (j && kept[lane] == 0.0f)
+                active[(column / 24) * stride + index * LANES + lane] &= ~(1u << (column % 24));
     }
 }

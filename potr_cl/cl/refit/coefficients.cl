@@ -1,6 +1,8 @@
 /* Sums and products of vectors of coefficients.
 
-   Macros: LANES (splats a work-item of those kernels that go over splats), SH_COUNT. */
+   Macros: LANES (splats a work-item of those kernels that go over splats), SH_COUNT.
+
+   On GPUs: LANES=1 SH_COUNT=1,4,9,16. */
 
 #include "refit/coefficients.clh"
 

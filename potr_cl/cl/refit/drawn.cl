@@ -1,4 +1,6 @@
-/* Which splats a view draws: those in the list of any of its tiles. */
+/* Which splats a view draws: those in the list of any of its tiles.
+
+   On GPUs: no macros. */
 
 #include "include/view_set.clh"
 

@@ -7,7 +7,9 @@
    Macros: LANES (splats a work-item), SH_COUNT, WEIGHTS (1: the totals hold the sums of w^2 too, for the blocks),
    SOME_BLOCKS (1: only the blocks of some splats are added up), PICKED (1: each view has some splats only, in an order
    of its own, which `numbers` names. Then views are done one after another, because two of them may have the same
-   splat. 0: all views have all). */
+   splat. 0: all views have all).
+
+   On GPUs: LANES=1 SH_COUNT=1,4,9,16 WEIGHTS=0,1 SOME_BLOCKS=0,1 PICKED=-,0,1. */
 
 #include "refit/refit.clh"
 #include "refit/view_colours.clh"

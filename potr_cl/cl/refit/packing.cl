@@ -1,7 +1,9 @@
 /* Coefficients that may change, splat by splat in one row, as they travel between devices; and back into columns. One
    splat a work-item.
 
-   Macros: SH_COUNT; LANES (1); RUN, splats that a work-item counts. */
+   Macros: SH_COUNT; LANES (1); RUN, splats that a work-item counts.
+
+   On GPUs: SH_COUNT=1,4,9,16 LANES=1 RUN=64. */
 
 #include "refit/coefficients.clh"
 

@@ -5,7 +5,10 @@
    Macros:
        ALPHA_CAP, TRANSMITTANCE_THRESHOLD, NATIVE_EXP2  see subtile_lists.clh;
        INT64_ATOMICS                                    see totals.clh;
-       WEIGHTS, LARGEST_VALUE                           see refit.clh. */
+       WEIGHTS, LARGEST_VALUE                           see refit.clh.
+
+   On GPUs: ALPHA_CAP=0.99f TRANSMITTANCE_THRESHOLD=1e-4f NATIVE_EXP2=0,1 INT64_ATOMICS=0,1 WEIGHTS=0,1
+       LARGEST_VALUE=64.0f. */
 
 /* A splat's sums of w times the pixel's three channels, and of w^2; of four splats at a time. */
 #define SUMS (3 + WEIGHTS)

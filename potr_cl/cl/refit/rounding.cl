@@ -2,7 +2,9 @@
 
    The coefficients of a splat that a round does not touch are still free: the re-fit solves for them again after it.
 
-   Macros: LANES (splats a work-item), SH_COUNT (coefficients of a channel). */
+   Macros: LANES (splats a work-item), SH_COUNT (coefficients of a channel).
+
+   On GPUs: LANES=1 SH_COUNT=1,4,9,16. */
 
 #include "refit/coefficients.clh"
 
@@ -34,6 +36,9 @@ inline vfloat cheap_level(vfloat value, vfloat squared, float to_zero)
    channel, the constant coefficient at the end, goes to where the splat's colours change least by its own block of the
    normal equations. Coefficients that were rounded are not active any more.
 
+   A launch does channel c: a work-item that did all three would hold the addresses of all blocks' elements in registers
+   beside the factorisation, more than any GPU has. Flags of all channels share words.
+
    steps: of AC coefficients, one a splat. to_zero: a weighted squared error, see cheap_level. */
 kernel void round_ac(
     global float *coefficients,
@@ -43,7 +48,8 @@ kernel void round_ac(
     global const float *steps,
     ulong stride,
     int turn,
-    float to_zero)
+    float to_zero,
+    int c)
 {
     const size_t index = get_global_id(0);
     const vint due = due_lanes(turns, index, turn);
@@ -54,58 +60,56 @@ kernel void round_ac(
     UNROLL
     for (int i = 0; i < SH_COUNT; ++i)
         trace += VLOAD(index, blocks + AT(i, i) * stride);
-    for (int c = 0; c < 3; ++c) {
-        const float length = c == 1 ? 2.0f : 3.0f;
-        const vfloat more = trace * (DAMPING * length / SH_COUNT) + FLOOR;
-        vfloat free[SH_COUNT];
+    const float length = c == 1 ? 2.0f : 3.0f;
+    const vfloat more = trace * (DAMPING * length / SH_COUNT) + FLOOR;
+    vfloat free[SH_COUNT];
+    UNROLL
+    for (int j = 0; j < SH_COUNT; ++j)
+        free[j] = active_lanes(active, stride, index, 3 * j + c);
+    /* U with U^T U = block, row by row; rows of what is not free are empty. `pivots` are squares of U's diagonal,
+       and what stands beside the diagonal is divided by it. */
+    vfloat factor[TRIANGLE], pivots[SH_COUNT];
+    UNROLL
+    for (int j = 0; j < SH_COUNT; ++j) {
+        const vfloat diagonal = MAD((vfloat)(length), VLOAD(index, blocks + AT(j, j) * stride), more);
+        vfloat pivot = diagonal;
         UNROLL
-        for (int j = 0; j < SH_COUNT; ++j)
-            free[j] = active_lanes(active, stride, index, 3 * j + c);
-        /* U with U^T U = block, row by row; rows of what is not free are empty. `pivots` are squares of U's diagonal,
-           and what stands beside the diagonal is divided by it. */
-        vfloat factor[TRIANGLE], pivots[SH_COUNT];
+        for (int i = 0; i < j; ++i)
+            pivot = MAD(-pivots[i] * factor[AT(i, j)], factor[AT(i, j)], pivot);
+        pivots[j] = fmax(pivot, more) * free[j];
+        const vfloat inverse = pivots[j] > 0.0f ? 1.0f / pivots[j] : (vfloat)(0.0f);
         UNROLL
-        for (int j = 0; j < SH_COUNT; ++j) {
-            const vfloat diagonal = MAD((vfloat)(length), VLOAD(index, blocks + AT(j, j) * stride), more);
-            vfloat pivot = diagonal;
+        for (int k = j + 1; k < SH_COUNT; ++k) {
+            vfloat sum = length * VLOAD(index, blocks + AT(j, k) * stride);
             UNROLL
             for (int i = 0; i < j; ++i)
-                pivot = MAD(-pivots[i] * factor[AT(i, j)], factor[AT(i, j)], pivot);
-            pivots[j] = fmax(pivot, more) * free[j];
-            const vfloat inverse = pivots[j] > 0.0f ? 1.0f / pivots[j] : (vfloat)(0.0f);
-            UNROLL
-            for (int k = j + 1; k < SH_COUNT; ++k) {
-                vfloat sum = length * VLOAD(index, blocks + AT(j, k) * stride);
-                UNROLL
-                for (int i = 0; i < j; ++i)
-                    sum = MAD(-pivots[i] * factor[AT(i, j)], factor[AT(i, k)], sum);
-                factor[AT(j, k)] = sum * inverse * free[k];
-            }
+                sum = MAD(-pivots[i] * factor[AT(i, j)], factor[AT(i, k)], sum);
+            factor[AT(j, k)] = sum * inverse * free[k];
         }
-        vfloat error[SH_COUNT];
+    }
+    vfloat error[SH_COUNT];
+    UNROLL
+    for (int j = SH_COUNT - 1; j >= 0; --j) {
+        const size_t column = 3 * j + c;
+        const vfloat was = VLOAD(index, coefficients + column * stride);
+        vfloat wanted = was;
         UNROLL
-        for (int j = SH_COUNT - 1; j >= 0; --j) {
-            const size_t column = 3 * j + c;
-            const vfloat was = VLOAD(index, coefficients + column * stride);
-            vfloat wanted = was;
-            UNROLL
-            for (int k = j + 1; k < SH_COUNT; ++k)
-                wanted = MAD(factor[AT(j, k)], error[k], wanted);
-            vfloat held = wanted;
-            if (j)
-                /* What no view shows is left as it is, though it costs nothing. */
-                held =
-                    step * cheap_level(wanted / step, trace > 0.0f ? pivots[j] * step * step : (vfloat)(1e30f), to_zero);
-            const vint changed = due && free[j] > 0.0f && fabs(held) < 1e30f;
-            held = changed ? held : was;
-            error[j] = was - held;
-            VSTORE(held, index, coefficients + column * stride);
-            int lanes[LANES];
-            VSTORE(due, 0, lanes);
-            for (int lane = 0; lane < LANES; ++lane)
-                if (j && lanes[lane])
-                    active[(column / 24) * stride + index * LANES + lane] &= ~(1u << (column % 24));
-        }
+        for (int k = j + 1; k < SH_COUNT; ++k)
+            wanted = MAD(factor[AT(j, k)], error[k], wanted);
+        vfloat held = wanted;
+        if (j)
+            /* What no view shows is left as it is, though it costs nothing. */
+            held =
+                step * cheap_level(wanted / step, trace > 0.0f ? pivots[j] * step * step : (vfloat)(1e30f), to_zero);
+        const vint changed = due && free[j] > 0.0f && fabs(held) < 1e30f;
+        held = changed ? held : was;
+        error[j] = was - held;
+        VSTORE(held, index, coefficients + column * stride);
+        int lanes[LANES];
+        VSTORE(due, 0, lanes);
+        for (int lane = 0; lane < LANES; ++lane)
+            if (j && lanes[lane])
+                active[(column / 24) * stride + index * LANES + lane] &= ~(1u << (column % 24));
     }
 }
 

@@ -1,7 +1,9 @@
 /* From coefficients to the splats' colours in each view: the first half of the map from coefficients to pictures.
 
    Macros: LANES (splats a work-item), SH_COUNT; PICKED (1: each view has some splats only, in an order of its own, which
-   `numbers` names. 0: all views have all). */
+   `numbers` names. 0: all views have all).
+
+   On GPUs: LANES=1 SH_COUNT=1,4,9,16 PICKED=0,1. */
 
 #include "refit/view_colours.clh"
 

@@ -4,5 +4,6 @@
   parts:
 - derivatives.py goes from numbers for pixels back to the splats' parameters; launcher.py runs it on a device;
 - adam.py takes steps down such a gradient;
-- views.py says which views are looked at in which order, and which are held out; pictures.py has their targets.
+- together.py takes such steps with one device or several;
+- views.py says which views are looked at in which order, and which are held out.
 """

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -132,6 +132,22 @@ class Adam(Parameters):
         )
         self._step.launch((buffers.stride, self._moving), (SPLAT_GROUP, 1))
         self.give(colours=False)
+
+    def state(self) -> list[FloatArray]:
+        """All numbers that the next steps depend on, for :meth:`adopt`."""
+        shape = self._start.shape
+        return [self._device.download(buffer, shape, np.float32) for buffer in self._moving_buffers]
+
+    def adopt(self, taken: int, state: Sequence[FloatArray]) -> None:
+        """Go on from where another one was after so many steps."""
+        self._taken = taken
+        for buffer, values in zip(self._moving_buffers, state, strict=True):
+            cl.enqueue_copy(self._device.queue, buffer, values, is_blocking=True)
+        self.give()
+
+    @property
+    def _moving_buffers(self) -> list[cl.Buffer]:
+        return [self.values, *self._moments, self._averages]
 
     @contextmanager
     def averaged(self) -> Iterator[None]:

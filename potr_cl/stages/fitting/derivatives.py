@@ -14,7 +14,7 @@ What the rasterizer decides by comparing numbers is taken as constant (:mod:`tes
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyopencl as cl
@@ -24,6 +24,7 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner, Scratch
+from potr_cl.opencl.narrow import Narrowed, Narrowing
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.raster.scene_buffers import SPLAT_GROUP
@@ -94,7 +95,9 @@ class PictureDerivatives(Owner):
         self._totals = Scratch(device, "the derivatives' sums")
         self._factors = Scratch(device, "the views' weights")
         self._written: list[float] | None = None
+        self._arrived, self._narrowing = Scratch(device, "sums of views"), Narrowing(device)
         self._views: ViewSet | None = None
+        self._shown: ViewSet | None = None
         self.rasterizer = Rasterizer(device, scene, rules, background)
         try:
             parameters = self.rasterizer.parameters
@@ -147,6 +150,79 @@ class PictureDerivatives(Owner):
             number += len(some)
             pixels += views.pixels
 
+    def add_prepared(
+        self, views: ViewSet, target: cl.Buffer, first_pixel: int = 0, given: bool = False, unit: float = 1.0
+    ) -> None:
+        """:meth:`add` views that the rasterizer has prepared since the parameters changed last.
+
+        Args:
+            views: as many as one launch can do.
+            target, given, unit: as of :meth:`add`.
+            first_pixel: where the views' pixels begin in ``target``.
+
+        Raises:
+            DeviceError: the sums do not fit the device, or the device failed.
+        """
+        self._reserve(views)
+        scale = _scale([view.camera for view in views.views])
+        self._sweep(views, target, first_pixel, given, unit, scale)
+        self._follow(views, scale * (1.0 if given else unit))
+
+    def sums(
+        self, cameras: Sequence[Camera], places: Sequence[int], target: cl.Buffer, unit: float
+    ) -> list[tuple[int, Narrowed]]:
+        """The sums of some of the views that :meth:`add` would add, for :meth:`add_sums` on any device of the kind.
+
+        Args:
+            cameras: of all the views.
+            places: of those that are meant among them, ascending.
+            target: the pictures of these. unit: as of :meth:`add`.
+
+        Returns:
+            Each view's place, and (9 stride,) int64.
+        """
+        found, pixels = [], 0
+        for group in self._launches(cameras):
+            own = [place for place in places if place in group]
+            if not own:
+                continue
+            views = self._prepared([cameras[place] for place in own])
+            self._reserve(views)
+            self._sweep(views, target, pixels, False, unit, _scale([cameras[place] for place in group]))
+            pixels += views.pixels
+            count = _SUMS // 8 * views.stride
+            for number, place in enumerate(own):
+                narrowed = self._narrowing.download(self._totals.buffer, (count,), number * count)
+                found.append((place, replace(narrowed, data=narrowed.data.copy())))
+            self._device.fill(self._totals.buffer, np.uint32(0), 8 * count * len(own))
+        return found
+
+    def add_sums(self, cameras: Sequence[Camera], sums: Sequence[tuple[int, Narrowed]], unit: float) -> None:
+        """:meth:`add` views of which all sums are known: the same bits.
+
+        Raises:
+            DeviceError: the views' projections and sums do not fit the device, or the device failed.
+        """
+        known = dict(sums)
+        for group in self._launches(cameras):
+            some = [cameras[place] for place in group]
+            self._shown = views = self.rasterizer.projected(some, self._shown)
+            self._reserve(views)
+            nbytes = _SUMS * views.stride
+            self._arrived.reserve(nbytes)
+            for number, place in enumerate(group):
+                self._narrowing.upload(self._arrived.buffer, known[place])
+                cl.enqueue_copy(
+                    self._device.queue, self._totals.buffer, self._arrived.buffer, byte_count=nbytes,
+                    dst_offset=number * nbytes,
+                )  # fmt: skip
+            self._follow(views, _scale(some) * unit)
+
+    def _launches(self, cameras: Sequence[Camera]) -> list[range]:
+        """Places of the views that a launch does."""
+        most = self._launcher.most_views
+        return [range(first, min(first + most, len(cameras))) for first in range(0, len(cameras), most)]
+
     def _prepared(self, cameras: Sequence[Camera]) -> ViewSet:
         if self._views is None or not self.rasterizer.prepare_again(self._views, cameras):
             if self._views is not None:
@@ -162,27 +238,10 @@ class PictureDerivatives(Owner):
         if self._factors.reserve(4 * len(views.views)):
             self._written = None
 
-    def add_prepared(
-        self, views: ViewSet, target: cl.Buffer, first_pixel: int = 0, given: bool = False, unit: float = 1.0
+    def _sweep(
+        self, views: ViewSet, target: cl.Buffer, first_pixel: int, given: bool, unit: float, scale: float
     ) -> None:
-        """:meth:`add` views that the rasterizer has prepared since the parameters changed last.
-
-        Args:
-            views: as many as one launch can do.
-            target, given, unit: as of :meth:`add`.
-            first_pixel: where the views' pixels begin in ``target``.
-
-        Raises:
-            DeviceError: the sums do not fit the device, or the device failed.
-        """
-        self._reserve(views)
-        cameras = [view.camera for view in views.views]
-        queue = self._device.queue
-        scale = fixed_point_scale(max(c.width for c in cameras), max(c.height for c in cameras))
-        factors = [REFERENCE_PIXELS / (c.width * c.height) / (scale * (1.0 if given else unit)) for c in cameras]
-        if factors != self._written:  # whoever writes waits for the device
-            cl.enqueue_copy(queue, self._factors.buffer, np.array(factors, np.float32), is_blocking=True)
-            self._written = factors
+        """From the pixels to the sums."""
         self._launcher.sweep(
             PixelSums(
                 views=views,
@@ -195,6 +254,15 @@ class PictureDerivatives(Owner):
                 totals=self._totals.buffer,
             )
         )
+
+    def _follow(self, views: ViewSet, scale: float) -> None:
+        """From the sums, which were multiplied by this, to the gradient."""
+        cameras = [view.camera for view in views.views]
+        factors = [REFERENCE_PIXELS / (camera.width * camera.height) / scale for camera in cameras]
+        if factors != self._written:  # whoever writes waits for the device
+            written = np.array(factors, np.float32)
+            cl.enqueue_copy(self._device.queue, self._factors.buffer, written, is_blocking=True)
+            self._written = factors
         parameters = self.rasterizer.parameters
         self._chain.bind(
             **parameters.geometry,
@@ -217,10 +285,11 @@ class PictureDerivatives(Owner):
 
     def _release(self) -> None:
         """Give back what the next call can make again."""
-        if self._views is not None:
-            self._views.close()
-            self._views = None
-        for scratch in (self._totals, self._factors):
+        for views in (self._views, self._shown):
+            if views is not None:
+                views.close()
+        self._views = self._shown = None
+        for scratch in (self._totals, self._factors, self._arrived, self._narrowing):
             scratch.close()
 
     def close(self) -> None:
@@ -228,3 +297,8 @@ class PictureDerivatives(Owner):
         self._release()
         self._memory.close()
         self.rasterizer.close()
+
+
+def _scale(cameras: Sequence[Camera]) -> float:
+    """The fixed point of views that a launch does."""
+    return fixed_point_scale(max(each.width for each in cameras), max(each.height for each in cameras))

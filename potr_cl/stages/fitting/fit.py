@@ -28,18 +28,15 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.stages.fitting.adam import Adam, Limits, Rates
 from potr_cl.stages.fitting.at_photographs import FittedToPhotographs
-from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from potr_cl.stages.fitting.files import TwoFiles
 from potr_cl.stages.fitting.judges import Judges
 from potr_cl.stages.fitting.parameters import UNROUNDED, Factors
-from potr_cl.stages.fitting.pictures import TargetPictures
+from potr_cl.stages.fitting.together import Batch, Descent, Ground, Helpers, Together, room_for_pictures, together
 from potr_cl.stages.fitting.views import batches, share_out
-from potr_cl.stages.refitting.targets import Targets
+from potr_cl.views.targets import TargetPictures, Targets
 
 logger = logging.getLogger("potr_cl")
 
-#: Part of the device's memory not yet taken that the targets may take unless the caller says how much.
-_SHARE = 0.25
 #: The opacity below which a splat is not drawn is 1/255, of logit -5.54: none falls so far that nothing can bring it
 #: back. Single precision tells opacities up to a logit of 16 from 1.
 _LEAST_LOGIT, _GREATEST_LOGIT = -5.5, 16.0
@@ -193,6 +190,7 @@ def fit_scene(
     held_out: Sequence[int] | None = None,
     fit_to: Sequence[int] | None = None,
     factors: Factors = UNROUNDED,
+    helpers: Helpers | None = None,
 ) -> Fitted:
     """Fit all parameters of a scene to pictures of some views.
 
@@ -211,6 +209,7 @@ def fit_scene(
         fit_to: numbers of the views to look at, where the judges are given; None: all others.
         factors: what a file will round shapes and opacities with. All is looked at as it is rounded, but what comes of
             it is not. The scene as :class:`potr_cl.stages.fitting.parameters.Parameters` takes it then.
+        helpers: do some of the views; the result is the same.
 
     Raises:
         UsageError: there are fewer than two given views, so that none can be held out.
@@ -223,22 +222,20 @@ def fit_scene(
         fit_to = [number for number in range(len(cameras)) if number not in set(held_out)]
     if not held_out or not fit_to:
         raise UsageError("a fit needs two training views or more: one of them is held out and tells whether it helps")
+    rates = dataclasses.replace(options.rates, means=options.rates.means * _usual_size(scene))
+    ground = Ground(scene, cameras, background, rates, _limits(scene), factors)
     with (
-        PictureDerivatives(device, scene, background=background) as derivatives,
         _pictures_of(device, cameras, targets, options.memory) as pictures,
+        Descent(device, ground, pictures) as descent,
     ):
         if options.memory is None and options.steps * options.batch >= len(fit_to):
-            pictures.prepare([*held_out, *(number for number in fit_to if number not in held_out)])
-        rasterizer = derivatives.rasterizer
-        rates = dataclasses.replace(options.rates, means=options.rates.means * _usual_size(scene))
+            pictures.fill([(number,) for number in (*held_out, *fit_to)])
+        batch = min(options.batch, len(fit_to))
         with (
-            Judges(device, rasterizer, cameras, pictures, held_out) as judges,
-            Adam(device, scene, rasterizer.parameters, derivatives.columns, rates, _limits(scene), factors) as adam,
+            Judges(device, descent.derivatives.rasterizer, cameras, pictures, held_out) as judges,
+            together(descent, ground, helpers if options.steps else None, options.memory, batch) as steps,
         ):
-            if factors != UNROUNDED:
-                adam.give()
-            fit = _Fit(options, derivatives, adam, pictures, judges, cameras)
-            return fit.run(fit_to, progress, tell or logger.debug, asked)
+            return _run(options, steps, descent.adam, judges, fit_to, progress, tell or logger.debug, asked)
 
 
 def held_out_error(
@@ -272,8 +269,7 @@ def kept_pictures(
         device, cameras, targets: as of :func:`fit_scene`.
         memory: bytes of device memory that they may take; None: a quarter of what is free.
     """
-    free = device.info.memory - device.allocated
-    return TargetPictures(device, cameras, targets, free * _SHARE if memory is None else memory)
+    return TargetPictures(device, cameras, room_for_pictures(device, memory), targets)
 
 
 def _pictures_of(
@@ -285,58 +281,44 @@ def _pictures_of(
     return kept_pictures(device, cameras, targets, memory)
 
 
-class _Fit:
-    """One fit while it runs."""
-
-    def __init__(
-        self,
-        options: FitOptions,
-        derivatives: PictureDerivatives,
-        adam: Adam,
-        pictures: TargetPictures,
-        judges: Judges,
-        cameras: Sequence[Camera],
-    ) -> None:
-        self._options, self._derivatives, self._adam = options, derivatives, adam
-        self._pictures, self._judges, self._cameras = pictures, judges, cameras
-
-    def run(
-        self, fit_to: Sequence[int], progress: FitProgress | None, tell: Callable[[str], None], asked: SupportsBool
-    ) -> Fitted:
-        options = self._options
-        errors = [self._judges.error()]
-        pace = options.start * min(max(math.sqrt(errors[0]) / _USUAL_ERROR, _SLOWEST), 1.0)
-        slowing = options.last ** (1 / max(options.steps - 1, 1))
-        kept = done = since = 0
-        order = batches(fit_to, options.batch, options.seed)
-        rounds = min(options.rounds, options.steps)
-        for round_number in range(1, rounds + 1):
-            end = options.steps * round_number // rounds
-            unit = _unit(errors[-1])
-            while done < end and not asked:
-                self._step(next(order), unit, pace * slowing**done)
-                done += 1
-                if progress is not None:
-                    progress(done, options.steps)
-            if done < end:
-                break
-            with self._adam.averaged():
-                errors.append(self._judges.error())
-                if errors[-1] < min(errors[:-1]):
-                    self._adam.keep()
-                    kept, since = done, 0
-                else:
-                    since += 1
-            now, first = _decibels(errors[-1]), _decibels(errors[0])
-            tell(f"fit: {done} steps, held-out views {now:.2f} dB, {first:.2f} dB at first")
-            if since >= options.patience:
-                break
-        return Fitted(self._adam.kept(), done, kept, tuple(errors), len(self._judges), bool(asked))
-
-    def _step(self, numbers: Sequence[int], unit: float, part: float) -> None:
-        cameras = [self._cameras[number] for number in numbers]
-        self._derivatives.add(cameras, self._pictures.of(numbers), unit=unit)
-        self._adam.step(self._derivatives.gradient, part)
+def _run(
+    options: FitOptions,
+    steps: Together,
+    adam: Adam,
+    judges: Judges,
+    fit_to: Sequence[int],
+    progress: FitProgress | None,
+    tell: Callable[[str], None],
+    asked: SupportsBool,
+) -> Fitted:
+    errors = [judges.error()]
+    pace = options.start * min(max(math.sqrt(errors[0]) / _USUAL_ERROR, _SLOWEST), 1.0)
+    slowing = options.last ** (1 / max(options.steps - 1, 1))
+    kept = done = since = 0
+    order = batches(fit_to, options.batch, options.seed)
+    rounds = min(options.rounds, options.steps)
+    for round_number in range(1, rounds + 1):
+        end = options.steps * round_number // rounds
+        unit = _unit(errors[-1])
+        while done < end and not asked:
+            steps.step(Batch(next(order), unit, pace * slowing**done))
+            done += 1
+            if progress is not None:
+                progress(done, options.steps)
+        if done < end:
+            break
+        with adam.averaged():
+            errors.append(judges.error())
+            if errors[-1] < min(errors[:-1]):
+                adam.keep()
+                kept, since = done, 0
+            else:
+                since += 1
+        now, first = _decibels(errors[-1]), _decibels(errors[0])
+        tell(f"fit: {done} steps, held-out views {now:.2f} dB, {first:.2f} dB at first")
+        if since >= options.patience:
+            break
+    return Fitted(adam.kept(), done, kept, tuple(errors), len(judges), bool(asked))
 
 
 def _decibels(error: float) -> float:

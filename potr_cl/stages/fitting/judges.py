@@ -10,7 +10,7 @@ from potr_cl.model.camera import Camera
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.fitting.pictures import TargetPictures
+from potr_cl.views.targets import TargetPictures
 
 #: Work-items that sum up a picture's squared differences, and those of a group.
 _ITEMS, _GROUP = 1 << 14, 64

@@ -20,7 +20,7 @@ from potr_cl.stages.fitting.adam import Rates
 from potr_cl.stages.fitting.at_photographs import FittedToPhotographs
 from potr_cl.stages.fitting.fit import FitOptions, FitProgress, SupportsBool, fit_scene, kept_pictures
 from potr_cl.stages.refitting.photographs import hold_out
-from potr_cl.stages.refitting.targets import GroundTruthTargets, Photographs
+from potr_cl.views.targets import Photographs, PhotographTargets
 
 #: The trial: its steps, the parts after which held-out photographs are looked at, and its rates as parts of the fit's.
 _TRIAL_STEPS, _TRIAL_LOOKS, _TRIAL_RATES = 40, 4, 0.1
@@ -68,7 +68,7 @@ def fit_to_photographs(
         options, steps=_TRIAL_STEPS, rounds=_TRIAL_LOOKS, patience=_TRIAL_LOOKS, last=1.0,
         rates=times(options.rates, _TRIAL_RATES),
     )  # fmt: skip
-    with kept_pictures(device, cameras, GroundTruthTargets(device, photographs, cameras), options.memory) as pictures:
+    with kept_pictures(device, cameras, PhotographTargets(device, photographs, cameras), options.memory) as pictures:
         trial = fit_scene(
             device,
             scene,

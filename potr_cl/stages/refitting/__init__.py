@@ -5,5 +5,5 @@
 - colour_map.py is the linear map from colours to pictures, whose sweeps are those of sweep.py;
 - solver.py minimises the error, by conjugate_gradients.py on the vectors of coefficients.py, with blocks.py as
   preconditioner;
-- targets.py has the pictures to come near to, own_views.py walks the views that one worker does.
+- own_views.py walks the views that one worker does.
 """

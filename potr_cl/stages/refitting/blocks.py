@@ -12,9 +12,11 @@ import pyopencl as cl
 from potr_cl.model.scene import FloatArray
 from potr_cl.raster.scene_buffers import SPLAT_GROUP
 from potr_cl.stages.refitting.coefficients import Coefficients, Vector
-from potr_cl.stages.refitting.layout import Ridge
+from potr_cl.stages.refitting.layout import CHANNELS, Ridge
 
 _SOURCE = "refit/blocks.cl"
+#: Splats of a work-group, GIVING_UP of the kernels.
+_GIVING_UP = 32
 
 
 class SplatBlocks:
@@ -87,7 +89,7 @@ class SplatBlocks:
                 result=part[result],
                 **ridge.scalars,
             )
-            part.run(self._precondition)
+            part.run(self._precondition, CHANNELS)
 
     def give_up(self, x: Vector, prior: float, least: float) -> None:
         """Set AC coefficients that cost less than ``least`` to 0 and make them inactive.
@@ -102,12 +104,14 @@ class SplatBlocks:
         """
         active = self._coefficients.active
         for part in self._coefficients.slices((x, active, self.array), (x, active)):
-            self._select_active.bind(
-                coefficients=part[x],
-                blocks=part[self.array],
-                active=part[active],
-                stride=part.stride,
-                prior=np.float32(prior),
-                least=np.float32(least),
-            )
-            part.run(self._select_active)
+            for channel in range(CHANNELS):
+                self._select_active.bind(
+                    coefficients=part[x],
+                    blocks=part[self.array],
+                    active=part[active],
+                    stride=part.stride,
+                    prior=np.float32(prior),
+                    least=np.float32(least),
+                    c=channel,
+                )
+                part.run(self._select_active, group=_GIVING_UP)

@@ -20,7 +20,7 @@ from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.coefficients import Coefficients, Vector
 from potr_cl.stages.refitting.own_views import OwnViews
-from potr_cl.stages.refitting.targets import Targets
+from potr_cl.views.targets import Targets
 
 
 class Helpers(Protocol):

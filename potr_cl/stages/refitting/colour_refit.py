@@ -29,16 +29,15 @@ from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.coming_scene import AnyScene, ComingScene, arrived, colourless
 from potr_cl.stages.refitting.layout import Layout, Ridge
 from potr_cl.stages.refitting.own_views import OwnViews
-from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.stages.refitting.placement import Place, placed
 from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
 from potr_cl.stages.refitting.rounding import ROUNDS, Rounding, Steps
 from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts, colour_shares
 from potr_cl.stages.refitting.solver import ColourSolver, Descent, Selection, Solved
 from potr_cl.stages.refitting.sweep import Sweep
-from potr_cl.stages.refitting.targets import Targets
 from potr_cl.views.reached import Reach, reached_splats
 from potr_cl.views.shares import ViewShares
+from potr_cl.views.targets import PicturesAhead, Targets
 from potr_cl.workers.dealing import Shares
 from potr_cl.workers.pool import Pool
 

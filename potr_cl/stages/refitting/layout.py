@@ -8,7 +8,9 @@ import numpy as np
 
 from potr_cl.opencl.kernel import Kernel
 
-#: Work-items of a work-group.
+#: Y, Co and Cg.
+CHANNELS = 3
+#: Splats of a work-group.
 _GROUP = 64
 
 
@@ -46,9 +48,9 @@ class Layout:
         """The same for kernels that look at all coefficients, or at the constant ones, whose columns come first."""
         return {**self.macros, "SH_COUNT": 1} if constant else self.macros
 
-    def over_splats(self, kernel: Kernel, *others: int, stride: int | None = None) -> None:
+    def over_splats(self, kernel: Kernel, *others: int, stride: int | None = None, group: int = _GROUP) -> None:
         """Launch a bound kernel over all splats, or so many, and in the second dimension over ``others``."""
-        group = max(_GROUP // self.lanes, 1)
+        group = max(group // self.lanes, 1)
         kernel.launch(((stride or self.stride) // self.lanes, *others), (group, *(1 for _ in others)))
 
 

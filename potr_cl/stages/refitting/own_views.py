@@ -22,9 +22,7 @@ from potr_cl.raster.view_set import TABLE_ENTRY, ViewSet
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.refitting.coefficients import Coefficients, Vector
 from potr_cl.stages.refitting.fixed_point import gathered_scale
-from potr_cl.stages.refitting.kept_pictures import KeptPictures
 from potr_cl.stages.refitting.sweep import Sweep
-from potr_cl.stages.refitting.targets import Targets
 from potr_cl.stages.refitting.view_errors import ViewErrors
 from potr_cl.stages.refitting.view_kernels import Picks, SweptSums, ViewKernels
 from potr_cl.views import plan as plans
@@ -32,6 +30,7 @@ from potr_cl.views.budget import free_memory, target_bytes
 from potr_cl.views.engine import Launch, Ready, ViewEngine
 from potr_cl.views.reached import Reach
 from potr_cl.views.subsets import ListedSplats, Subset, WholeScene
+from potr_cl.views.targets import TargetPictures, Targets
 
 #: Bytes a splat and view of a sweep's own buffers: the colours' change and the sums.
 _CHANGE, _TOTALS = 16, 32
@@ -130,7 +129,7 @@ class OwnViews(Owner):
             ratios = [self.one * weights[each] / self._fixed_points[each] for some in sets for each in some]
             scales = self._memory.upload(np.array(ratios, np.float32), "the views' scales")
             self._kernels = ViewKernels(device, layout, rasterizer.parameters.means, scales)
-            self._targets = KeptPictures(device, cameras, self._cache, sets)
+            self._targets = TargetPictures(device, cameras, self._cache, sets=sets)
             self._owned.append(self._targets)
         except BaseException:
             self.close()
@@ -147,7 +146,7 @@ class OwnViews(Owner):
         Raises:
             DeviceError: the device failed. What the targets raise.
         """
-        self._targets.fill(targets, [each.launch.numbers for each in self._launches])
+        self._targets.fill([each.launch.numbers for each in self._launches], targets)
 
     def gradient(
         self,
@@ -169,7 +168,7 @@ class OwnViews(Owner):
         def sweep(own: _Own, ready: Ready[_Attached], slot: _Slot) -> None:
             views, (_, colours) = ready.views, ready.geometry
             self._kernels.colour(views, own.picks(ready), x, colours, colours)
-            pictures = self._targets.of(targets, own.launch.numbers)
+            pictures = self._targets.of(own.launch.numbers, targets)
             self._enqueue_sweep(ready, colours, pictures, blocks is not None, slot)
             if drawn is not None:
                 self._kernels.mark_drawn(views, drawn)

@@ -27,10 +27,9 @@ from potr_cl.stages.refitting.coming_scene import AnyScene, arrived, colourless
 from potr_cl.stages.refitting.exchange import Exchange, SentVector
 from potr_cl.stages.refitting.layout import Layout
 from potr_cl.stages.refitting.own_views import OwnViews
-from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.stages.refitting.sweep import Sweep
-from potr_cl.stages.refitting.targets import Targets, targets_of
 from potr_cl.views.reached import reached_splats
+from potr_cl.views.targets import PicturesAhead, Targets, targets_of
 from potr_cl.views.visibility import Visibility
 from potr_cl.workers.pool import Part
 

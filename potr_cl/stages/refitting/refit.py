@@ -30,7 +30,7 @@ from potr_cl.stages.refitting.coming_scene import AnyScene
 from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
 from potr_cl.stages.refitting.rounding import Steps
 from potr_cl.stages.refitting.solver import Solved
-from potr_cl.stages.refitting.targets import Targets
+from potr_cl.views.targets import Targets
 
 #: Steps in which the constant coefficients are solved for once more, after the others have been rounded.
 _CONSTANT_STEPS = 3

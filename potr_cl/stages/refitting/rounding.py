@@ -23,6 +23,7 @@ from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.coefficients import Coefficients, Vector
+from potr_cl.stages.refitting.layout import CHANNELS
 
 _SOURCE = "refit/rounding.cl"
 #: Splats are due in so many turns: every fourth one in the order of the file in turn 0, the next ones in turn 1, …
@@ -109,14 +110,16 @@ class Rounding(Owner):
         read = (x, active, blocks.array, turns, self._constant, self._others)
         for part in self._coefficients.slices(read, (x, active)):
             own = {"coefficients": part[x], "active": part[active], "turns": part[turns], "stride": part.stride}
-            self._round_ac.bind(
-                **own,
-                blocks=part[blocks.array],
-                steps=part[self._others],
-                turn=this.others,
-                to_zero=np.float32(worth),
-            )
-            part.run(self._round_ac)
+            for channel in range(CHANNELS):
+                self._round_ac.bind(
+                    **own,
+                    blocks=part[blocks.array],
+                    steps=part[self._others],
+                    turn=this.others,
+                    to_zero=np.float32(worth),
+                    c=channel,
+                )
+                part.run(self._round_ac)
             self._round_constant.bind(**own, steps=part[self._constant], turn=this.constant)
             part.run(self._round_constant)
 

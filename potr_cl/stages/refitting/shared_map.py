@@ -25,8 +25,8 @@ from potr_cl.stages.refitting.drawn_rows import DrawnRows
 from potr_cl.stages.refitting.exchange import Exchange
 from potr_cl.stages.refitting.own_views import parts_of
 from potr_cl.stages.refitting.part import ColourPart, Gradient, unpacked
-from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.views.shares import ViewShares
+from potr_cl.views.targets import PicturesAhead
 from potr_cl.views.visibility import Visibility
 from potr_cl.workers.dealing import Shares, shares
 from potr_cl.workers.parts import Each, Parts, Pending

@@ -76,9 +76,9 @@ class Slice:
     def __getitem__(self, array: Array) -> cl.Buffer:
         return self.buffers[array]
 
-    def run(self, kernel: Kernel) -> None:
-        """Launch a bound kernel over the splats."""
-        self.layout.over_splats(kernel, stride=len(self.splats))
+    def run(self, kernel: Kernel, *others: int, **group: int) -> None:
+        """Launch a bound kernel over the splats, as :meth:`.layout.Layout.over_splats` does it."""
+        self.layout.over_splats(kernel, *others, stride=len(self.splats), **group)
 
 
 class SlicedArrays(Owner):

@@ -24,7 +24,7 @@ from potr_cl.stages.refitting.coefficients import Coefficients, Vector
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.conjugate_gradients import ConjugateGradients
 from potr_cl.stages.refitting.layout import Ridge
-from potr_cl.stages.refitting.targets import Targets
+from potr_cl.views.targets import Targets
 
 #: Half steps tried when a solution is worse than its start because colours were cut at 0 on the way.
 _HALVINGS = 4

@@ -11,13 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from potr_cl import UsageError
 from potr_cl.formats import load_cameras
-from tests.cases.cameras import load_or_refuse, refused, write_image
-from tests.cases.own_warnings import warnings_are_errors
+from tests.cases.cameras import refused, write_image
 
 
 @pytest.fixture
@@ -225,19 +222,3 @@ def test_numbers_that_stand_twice(text_model: Path, text_model_lines: Callable[[
 def test_numbers_that_only_python_reads(text_model_lines: Callable[[str], Path], field: str) -> None:
     refused(text_model_lines(f"1 PINHOLE 990 742 {field} 800 495 371\n"), "is not a number|is truncated")
     refused(text_model_lines(f"1 PINHOLE {field} 742 800 800 495 371\n"), "is not a whole number|is truncated")
-
-
-@warnings_are_errors
-@pytest.mark.parametrize("model", ["plush_sparse_binary", "plush_sparse_text"])
-@given(draw=st.data())
-@settings(max_examples=200, deadline=None)
-def test_mutated_models(model: str, draw: st.DataObject, data: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    folder = tmp_path_factory.getbasetemp() / f"fuzz_{model}"
-    folder.mkdir(exist_ok=True)
-    for source in (data / model).iterdir():
-        content = bytearray(source.read_bytes())
-        for _ in range(draw.draw(st.integers(0, 4))):
-            at = draw.draw(st.integers(0, len(content)))
-            content[at : at + draw.draw(st.integers(0, 9))] = draw.draw(st.binary(max_size=9))
-        (folder / source.name).write_bytes(content)
-    load_or_refuse(folder)

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from potr_cl import DataError, PotrError, Scene, UsageError
+from potr_cl import DataError, Scene, UsageError
 from potr_cl.formats import load_scene
 from potr_cl.formats.scenes import ply
 from tests.cases.own_warnings import warnings_are_errors
@@ -379,72 +379,6 @@ def test_list_properties_are_refused(tmp_path: Path) -> None:
     damaged(path, "list properties")
     path.write_bytes(data.replace(b"element vertex", b"element face 0\nproperty list uchar int i\nelement vertex"))
     damaged(path, "list properties")
-
-
-# Fuzzing ------------------------------------------------------------------------------------------------------------
-
-TOKENS = [
-    *(b"ply", b"format", b"ascii", b"binary_big_endian", b"1.0", b"element", b"vertex", b"property", b"list", b"float"),
-    *(b"double", b"uchar", b"x", b"opacity", b"f_rest_0", b"f_rest_44", b"comment", b"obj_info", b"end_header", b"-1"),
-    *(b"0", b"3", b"99999999999999999999", b"nan", b"1e999", b"\n", b"\r", b"\r\n", b" ", b"\x1c", b"\x00", b"\xff"),
-]
-
-
-@pytest.fixture(scope="module")
-def fuzz_seeds(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
-    folder = tmp_path_factory.mktemp("seeds")
-    return [
-        write(folder / "a.ply", random_scene(4, degree), form=form, tail=tail).read_bytes()
-        for form in ("binary_little_endian", "binary_big_endian", "ascii")
-        for degree, tail in ((0, ((), b"")), (1, (["element face 1", "property list uchar int i"], b"1 7\n0000")))
-    ]
-
-
-def load_or_refuse(content: bytes, folder: Path) -> None:
-    path = folder / "fuzz.ply"
-    path.write_bytes(content)
-    message = ""
-    try:
-        ply.load(path)
-    except PotrError as error:
-        message = str(error)
-    assert "\n" not in message
-    assert len(message) < 1000
-
-
-def check_mutations(draw: st.DataObject, seeds: list[bytes], folder: Path) -> None:
-    content = bytearray(draw.draw(st.sampled_from(seeds)))
-    for _ in range(draw.draw(st.integers(1, 6))):
-        at = draw.draw(st.integers(0, len(content)))
-        length = draw.draw(st.integers(0, 12))
-        piece = draw.draw(st.sampled_from(TOKENS) | st.binary(max_size=8))
-        content[at : at + length] = piece
-    load_or_refuse(bytes(content), folder)
-
-
-@warnings_are_errors
-@given(draw=st.data())
-@settings(max_examples=300, deadline=None)
-def test_mutated_files(draw: st.DataObject, fuzz_seeds: list[bytes], tmp_path_factory: pytest.TempPathFactory) -> None:
-    check_mutations(draw, fuzz_seeds, tmp_path_factory.getbasetemp())
-
-
-@warnings_are_errors
-@given(tokens=st.lists(st.sampled_from(TOKENS), max_size=40), body=st.binary(max_size=60))
-@settings(max_examples=300, deadline=None)
-def test_made_up_headers(tokens: list[bytes], body: bytes, tmp_path_factory: pytest.TempPathFactory) -> None:
-    content = b"ply\nformat ascii 1.0\nelement vertex 3\n" + b" ".join(tokens) + b"\nend_header\n" + body
-    load_or_refuse(content, tmp_path_factory.getbasetemp())
-
-
-@pytest.mark.slow
-@warnings_are_errors
-@given(draw=st.data())
-@settings(max_examples=1_500, deadline=None)
-def test_many_mutated_files(
-    draw: st.DataObject, fuzz_seeds: list[bytes], tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    check_mutations(draw, fuzz_seeds, tmp_path_factory.getbasetemp())
 
 
 @pytest.mark.parametrize("form", ["binary_little_endian", "ascii"])

@@ -9,6 +9,7 @@ import dataclasses
 import itertools
 import struct
 import zlib
+from collections.abc import Sequence
 from functools import cache
 from random import Random
 
@@ -51,7 +52,7 @@ _ORIGINALS: list[tuple[int, int, Preset, str, int, int]] = [
     (20, 1, "best", "bundles", 20, 2),
 ]
 #: Of these: the ones of most work least.
-_HOW_OFTEN = (3, 4, 3, 5, 4, 12, 8, 2, 2, 4, 4, 4)
+HOW_OFTEN = (3, 4, 3, 5, 4, 12, 8, 2, 2, 4, 4, 4)
 
 
 @cache
@@ -87,9 +88,9 @@ def file_of(scenes: list[Scene], parameters: HyperParameters, entropy: str, most
     return b"".join(code_levels(levels, metadata, EntropyCoder(entropy, 3), 1).pieces)
 
 
-def changed(rng: Random) -> bytes:
-    """One of the originals, changed."""
-    data = rng.choices(originals(), _HOW_OFTEN)[0]
+def changed(rng: Random, files: Sequence[bytes] = (), often: Sequence[int] = HOW_OFTEN) -> bytes:
+    """One of some files, by default of the originals, changed."""
+    data = rng.choices(files or originals(), often)[0]
     if rng.random() < 0.15:  # as it comes, checksums and all
         for _ in range(1 + rng.randrange(3)):
             data = damaged(data, rng)

@@ -12,6 +12,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -27,39 +28,55 @@ _A_PROCESS = 20_000
 _MOST_CRASHES = 20
 
 
-def attack(form: str, seed: int, first: int, count: int, seconds: float, findings: Path) -> Tally:
-    """Have changed files of a format read.
+def attack(job: Job, processes: int = 1) -> Tally:
+    """Have changed files of a format read, by so many processes at a time.
 
     Args:
-        seed, first, count: which: number ``first`` and so on of a seed.
-        seconds: to end after, though not all were read.
-        findings: folder for those of which something is wrong.
+        job: which files: number ``first`` and so on of a seed; ends after its seconds, though not all were read.
 
     Returns:
-        What came of them; ``number`` is of the next one.
+        What came of them.
     """
-    total, stop, end, crashes = Tally(first), first + count, time.monotonic() + seconds, 0
-    while total.number < stop and time.monotonic() < end and crashes < _MOST_CRASHES:
-        with _place() as folder:
-            most = min(_A_PROCESS, stop - total.number)
-            job = Job(form, str(folder), str(findings), seed, total.number, most, end - time.monotonic())
-            code, said = _run(job)
-            tally = Tally(**json.loads((folder / "tally").read_text()))
-            if code != 0:
-                crashes += 1
-                number, files, verdict = tally.number, _files(folder), _ending(code, said)
-                kind = _alone(job, files, number) if verdict.kind == "hang" else verdict.kind
-                tally.add(kind)
-                if kind not in ("read", "refused"):
-                    keep(findings, job, number, files, verdict)
-        for name in ("read", "refused", "findings"):
-            setattr(total, name, getattr(total, name) + getattr(tally, name))
-        total.number = tally.number
-        total.memory, total.slowest = max(total.memory, tally.memory), max(total.slowest, tally.slowest)
+    share = max(1, min(_A_PROCESS, -(-job.count // processes)))
+    shares, end = iter(range(job.first, job.first + job.count, share)), time.monotonic() + job.seconds
+    crashes: list[int] = []
+
+    def some() -> Tally:
+        total = Tally()
+        for first in shares:
+            stop = min(first + share, job.first + job.count)
+            while first < stop and time.monotonic() < end and len(crashes) < _MOST_CRASHES:
+                own = dataclasses.replace(job, first=first, count=stop - first, seconds=end - time.monotonic())
+                tally = _attack(own, crashes)
+                total.take(tally)
+                first = tally.number
+        return total
+
+    total = Tally()
+    with ThreadPoolExecutor(processes) as pool:
+        for found in [pool.submit(some) for _ in range(processes)]:
+            total.take(found.result())
     return total
 
 
-def read_again(folders: list[Path], findings: Path, longest: float = LONGEST) -> list[dict[str, Any]]:
+def _attack(job: Job, crashes: list[int]) -> Tally:
+    """By one process, up to the file that ends it, whose number is kept."""
+    with _place() as folder:
+        code, said = _run(job := dataclasses.replace(job, folder=str(folder)))
+        tally = Tally(**json.loads((folder / "tally").read_text()))
+        if code != 0:
+            number, files, verdict = tally.number, _files(folder), _ending(code, said)
+            crashes.append(number)
+            kind = _alone(job, files, number) if verdict.kind == "hang" else verdict.kind
+            tally.add(kind)
+            if kind not in ("read", "refused"):
+                keep(Path(job.findings), job, number, files, verdict)
+    return tally
+
+
+def read_again(
+    folders: list[Path], findings: Path, longest: float = LONGEST, environment: dict[str, str] | None = None
+) -> list[dict[str, Any]]:
     """Read files that were kept, as :func:`tools.stress.hostile.worker.keep` leaves them.
 
     Args:
@@ -73,12 +90,13 @@ def read_again(folders: list[Path], findings: Path, longest: float = LONGEST) ->
     for source in folders:
         by_format.setdefault(_about(source)["format"], []).append(source)
     for form, sources in by_format.items():
+        job = Job(form, "", str(findings), longest=longest, environment=environment or {})
         # One process is faster; where a file ends it, each gets its own.
-        if _read_given(form, sources, findings, longest)[0] != 0:
+        if _read_given(job, sources)[0] != 0:
             for source in sources:
-                code, said, files = _read_given(form, [source], findings, longest)
+                code, said, files = _read_given(job, [source])
                 if code != 0:
-                    keep(findings, Job(form, "", "", given=[str(source)]), 0, files, _ending(code, said))
+                    keep(findings, dataclasses.replace(job, given=[str(source)]), 0, files, _ending(code, said))
     return [_about(findings / source.name) for source in folders]
 
 
@@ -87,11 +105,10 @@ def _about(folder: Path) -> dict[str, Any]:
     return about
 
 
-def _read_given(form: str, sources: list[Path], findings: Path, longest: float) -> tuple[int, str, Files]:
+def _read_given(job: Job, sources: list[Path]) -> tuple[int, str, Files]:
     """A worker's exit code, what it said, and the files that it was at."""
     with _place() as folder:
-        job = Job(form, str(folder), str(findings), given=[str(source) for source in sources], longest=longest)
-        code, said = _run(job)
+        code, said = _run(dataclasses.replace(job, folder=str(folder), given=list(map(str, sources))))
         return code, said, _files(folder, _about(sources[0])["names"] if sources[1:] == [] else None)
 
 
@@ -104,7 +121,7 @@ def _run(job: Job) -> tuple[int, str]:
         **os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1",
         "PYTHONMALLOC": "malloc", "MALLOC_ARENA_MAX": "2", "MALLOC_MMAP_THRESHOLD_": "131072",
         "MALLOC_TRIM_THRESHOLD_": "131072", "TMPDIR": f"{job.folder}/tmp", "PYTHONPATH": str(ROOT),
-        "PYTHONFAULTHANDLER": "1",
+        "PYTHONFAULTHANDLER": "1", **job.environment,
     }  # fmt: skip
     done = subprocess.run(
         [sys.executable, "-m", "tools.stress.hostile.worker"], input=json.dumps(dataclasses.asdict(job)), env=settings,
@@ -140,7 +157,7 @@ def _alone(job: Job, files: Files, number: int) -> str:
     """What becomes of a file that seemed to hang when it is tried alone: the machine may have been busy."""
     with tempfile.TemporaryDirectory() as scratch:
         source = keep(Path(scratch), job, number, files, Verdict("hang", "", 0.0, 0))
-        return str(read_again([source], Path(scratch, "again"))[0]["kind"])
+        return str(read_again([source], Path(scratch, "again"), environment=job.environment)[0]["kind"])
 
 
 def _files(folder: Path, names: list[str] | None = None) -> Files:

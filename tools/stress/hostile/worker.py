@@ -7,6 +7,7 @@ folder how far it came, and finds the file that ended it in the folder ``input``
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import json
 import os
 import sys
@@ -16,7 +17,7 @@ from pathlib import Path
 from random import Random
 
 from tools.stress.hostile.changes import Files
-from tools.stress.hostile.formats import FORMATS
+from tools.stress.hostile.formats import FORMATS, Format
 from tools.stress.hostile.judge import LONGEST, Judge, Verdict
 
 #: Findings of one sort that are kept.
@@ -28,13 +29,14 @@ class Job:
     """What a worker is to do: files that it makes itself, or given ones.
 
     Attributes:
-        form: name of the format.
+        form: name of the format; or of the module of tools.stress whose FORM it is.
         folder: with the folders input, tmp and cwd.
         findings: folder to keep what is wrong in.
         seed, first, count: of the files to make: number ``first`` to ``first + count - 1`` of a seed.
         seconds: to end after.
         given: folders, each with files to read and ``finding.json``; instead of made ones.
         longest: seconds that a file may take.
+        environment: variables of the worker.
     """
 
     form: str
@@ -46,6 +48,7 @@ class Job:
     seconds: float = 1e9
     given: list[str] = dataclasses.field(default_factory=list)
     longest: float = LONGEST
+    environment: dict[str, str] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass
@@ -59,6 +62,11 @@ class Tally:
     memory: int = 0
     slowest: float = 0.0
 
+    @property
+    def files(self) -> int:
+        """Those that something became of."""
+        return self.read + self.refused + self.findings
+
     def add(self, kind: str, seconds: float = 0.0, memory: int = 0) -> None:
         """Count a file."""
         self.number += 1
@@ -67,6 +75,12 @@ class Tally:
         self.findings += kind not in ("read", "refused")
         self.slowest, self.memory = max(self.slowest, seconds), max(self.memory, memory)
 
+    def take(self, other: Tally) -> None:
+        """Count another's files, too."""
+        self.number, self.read, self.refused = other.number, self.read + other.read, self.refused + other.refused
+        self.findings += other.findings
+        self.slowest, self.memory = max(self.slowest, other.slowest), max(self.memory, other.memory)
+
 
 def main() -> None:
     work(Job(**json.load(sys.stdin)))
@@ -74,7 +88,7 @@ def main() -> None:
 
 def work(job: Job) -> None:
     """Read file after file."""
-    form, folder = FORMATS[job.form], Path(job.folder)
+    form, folder = format_of(job.form), Path(job.folder)
     shared = os.open(folder / "tally", os.O_WRONLY | os.O_CREAT, 0o600)
     tally = Tally(number=job.first)
     judge = Judge(form, folder, job.longest)
@@ -103,9 +117,15 @@ def _tell(shared: int, tally: Tally) -> None:
     os.pwrite(shared, json.dumps(dataclasses.asdict(tally)).ljust(200).encode(), 0)
 
 
+def format_of(name: str) -> Format:
+    """That of a name, as of :attr:`Job.form`."""
+    found: Format = FORMATS.get(name) or importlib.import_module(f"tools.stress.{name}").FORM
+    return found
+
+
 def changed_files(form: str, seed: int, number: int) -> Files:
     """The changed files of a seed, each for itself: number 7 is the same whether or not 6 was made."""
-    return FORMATS[form].changed(Random(f"{seed}/{form}/{number}"))
+    return format_of(form).changed(Random(f"{seed}/{form}/{number}"))
 
 
 def keep(findings: Path, job: Job, number: int, files: Files, verdict: Verdict) -> Path:

@@ -1,35 +1,25 @@
-"""Other roads to the same result, at their worst (:func:`check_roads`): a part of tools.stress.run.
+"""Fits at their worst (:func:`check_fits`): a part of tools.stress.run.
 
-A file whose values are spread over a device's memory must give the bits that the host gives, and what is told to be
-seen must be so. (The tests hold that other roads of large scenes give the same bits.) And the fit's steps, with the
-choice of coefficients and the roundings after them, may leave nothing that is not finite, and no worse scene.
+The fit's steps, with the choice of coefficients and the roundings after them, may leave nothing that is not finite, and
+no worse scene. (The tests hold that other roads to the same result give the same bits.)
 """
 
 from __future__ import annotations
 
 import dataclasses
-from unittest.mock import patch
 
 import numpy as np
-from numpy.typing import NDArray
 
-from potr_cl.codec.bundles import encoder
-from potr_cl.codec.decoder import decode, open_file
-from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import DataError
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
-from potr_cl.model.unseen import unseen_splats
-from potr_cl.ondevice.decode import decode_to_device
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.scene_buffers import SceneBuffers, uploaded
-from potr_cl.raster.surely_seen import Seen, surely_seen
 from potr_cl.stages.fitting.fit import FitOptions, fit_scene
 from potr_cl.stages.fitting.settling import Looking, Settling, settle
-from potr_cl.stages.refitting.targets import RenderedTargets
 from potr_cl.stages.stage import State, Workbench
+from potr_cl.views.targets import RenderedTargets
 from tools.stress.cases import Case
 from tools.stress.measures import Measures
 
@@ -38,49 +28,10 @@ _STEPS = FitOptions(steps=6, rounds=2, batch=1)
 _PARAMETERS = HyperParameters.from_quality(0.3, "best")
 
 
-def check_roads(device: Device, case: Case) -> Measures:
-    """The measures "same bits: …", "surely seen" and "fit: steps", "fit: settling" of a view."""
+def check_fits(device: Device, case: Case) -> Measures:
+    """The measures "fit: steps" and "fit: settling" of a view."""
     scene, view = case.scene, case.view
-    found = {
-        "surely seen": (_wrongly_seen(device, scene, view), 1.0),
-        "fit: steps": (_fitted(device, scene, view), 1e-9),
-        "fit: settling": (_settled(device, scene, view), 1.0),
-    }
-    differing = _to_device(device, scene)
-    if differing is not None:
-        found["same bits: to a device"] = differing, 1.0
-    return found
-
-
-def differing(one: NDArray[np.generic], other: NDArray[np.generic]) -> float:
-    """How many values of two arrays are not the same; two that are no numbers are."""
-    same = (one == other) | ((one != one) & (other != other))
-    return float(same.size - np.count_nonzero(same))
-
-
-def _wrongly_seen(device: Device, scene: Scene, view: Camera) -> float:
-    """Splats that are said to be seen, or not to be, and float64 says the other."""
-    unseen = unseen_splats(scene, [view])
-    with uploaded(device, scene) as there:
-        found = surely_seen(there, [view])
-    return float(np.count_nonzero(np.where(unseen, found == Seen.YES, found == Seen.NO)))
-
-
-def _to_device(device: Device, scene: Scene) -> float | None:
-    """Values of a file on the device that differ from those of the scene on the host; None where no file holds it."""
-    try:
-        with patch.object(encoder, "_FEW", 0):  # the coder of large scenes
-            data = b"".join(code_scene(scene, _PARAMETERS).pieces)
-    except DataError:
-        return None
-    with uploaded(device, decode(data)) as wanted, decode_to_device(open_file(data), device) as found:
-        pairs = zip(_values(wanted), _values(found), strict=True)
-        return sum(differing(one, other) for one, other in pairs)
-
-
-def _values(buffers: SceneBuffers) -> list[NDArray[np.uint32]]:
-    parameters = (buffers.means, buffers.scales, buffers.quaternions, buffers.log2_opacities, buffers.sh)
-    return [buffers.device.download(each, (each.size // 4,), np.uint32) for each in parameters]
+    return {"fit: steps": (_fitted(device, scene, view), 1e-9), "fit: settling": (_settled(device, scene, view), 1.0)}
 
 
 def _looked_at(view: Camera) -> list[Camera]:
@@ -95,9 +46,7 @@ def _shaken(scene: Scene) -> Scene:
         means = (scene.means * (1 + 1e-3 * rng.normal(size=scene.means.shape))).astype(np.float32)
         sh = (scene.sh * (1 + 0.05 * rng.normal(size=scene.sh.shape))).astype(np.float32)
     return dataclasses.replace(
-        scene,
-        means=np.where(np.isfinite(means), means, scene.means),
-        sh=np.where(np.isfinite(sh), sh, scene.sh),
+        scene, means=np.where(np.isfinite(means), means, scene.means), sh=np.where(np.isfinite(sh), sh, scene.sh)
     )
 
 

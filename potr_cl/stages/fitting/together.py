@@ -1,0 +1,302 @@
+"""The steps of a fit, by one device or by several together: :class:`Descent`, :class:`Together`.
+
+Every device has all parameters and takes every step. What a step costs are the views' sums, so the views of a batch are
+dealt out, and each device tells the others its views' sums. These are integers that do not depend on who found them,
+and each adds them up in the order of the batch: the bits are those of one device.
+
+A device that is made anew on the way, because another one was lost, does not know what the others do by now; it is
+given all of the first one's numbers then.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from potr_cl.errors import DeviceError
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Owner
+from potr_cl.opencl.narrow import Narrowed
+from potr_cl.raster.kept_scene import KeptScene, lying_on
+from potr_cl.raster.scene_buffers import Drawable
+from potr_cl.stages.fitting.adam import Adam, Limits, Rates
+from potr_cl.stages.fitting.derivatives import PictureDerivatives
+from potr_cl.stages.fitting.parameters import UNROUNDED, Factors
+from potr_cl.views.targets import Room, TargetPictures, targets_of
+from potr_cl.workers.parts import Each, Parts
+from potr_cl.workers.pool import Part, Pool
+
+#: Part of a device's memory not yet taken that target pictures may take unless the caller says how much.
+_SHARE = 0.25
+#: So many steps are taken together, then alone, to see which is faster; before, so many that do not count.
+_TRIED, _FIRST = 6, 2
+
+_log = logging.getLogger("potr_cl")
+
+#: Sums of some of a batch's views, by their places.
+Sums = Sequence[tuple[int, Narrowed]]
+
+
+@dataclass(frozen=True)
+class Helpers:
+    """Workers that do some of the views of a fit.
+
+    Attributes:
+        pool: the workers.
+        source: the scene whose pictures are the targets, perhaps kept on devices.
+    """
+
+    pool: Pool
+    source: Scene | KeptScene
+
+
+@dataclass(frozen=True)
+class Ground:
+    """What a fit begins with.
+
+    Attributes:
+        scene: whose parameters move.
+        cameras: all views.
+        background: R, G, B behind the scene.
+        rates, limits, factors: as of :class:`potr_cl.stages.fitting.adam.Adam`.
+    """
+
+    scene: Scene
+    cameras: Sequence[Camera]
+    background: tuple[float, float, float]
+    rates: Rates
+    limits: Limits
+    factors: Factors = UNROUNDED
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What a step looks at.
+
+    Attributes:
+        numbers: of the views.
+        unit: as of :meth:`potr_cl.stages.fitting.derivatives.PictureDerivatives.add`.
+        part: of the rates that the step is long.
+    """
+
+    numbers: Sequence[int]
+    unit: float
+    part: float
+
+
+def room_for_pictures(device: Device, memory: int | None) -> Room:
+    """Bytes that target pictures may take; None: a quarter of what is free."""
+    return Room((device.info.memory - device.allocated) * _SHARE if memory is None else memory)
+
+
+class Descent(Owner):
+    """A fit on one device.
+
+    Args:
+        device: to compute on.
+        ground: where it begins.
+        pictures: the targets; the caller's.
+
+    Attributes:
+        derivatives, adam: of the scene.
+        taken: steps, so far.
+
+    Raises:
+        DeviceError: the scene does not fit the device.
+    """
+
+    def __init__(self, device: Device, ground: Ground, pictures: TargetPictures) -> None:
+        self.device, self.taken = device, 0
+        self._cameras, self._pictures = ground.cameras, pictures
+        with ExitStack() as owned:
+            self.derivatives = owned.enter_context(
+                PictureDerivatives(device, ground.scene, background=ground.background)
+            )
+            buffers, columns = self.derivatives.rasterizer.parameters, self.derivatives.columns
+            self.adam = owned.enter_context(
+                Adam(device, ground.scene, buffers, columns, ground.rates, ground.limits, ground.factors)
+            )
+            if ground.factors != UNROUNDED:
+                self.adam.give()
+            self._owned = owned.pop_all()
+
+    def step(self, batch: Batch) -> None:
+        """Take a step alone."""
+        self.derivatives.add(self._of(batch), self._pictures.of(batch.numbers), unit=batch.unit)
+        self._take(batch)
+
+    def sums(self, batch: Batch, places: Sequence[int]) -> Sums:
+        """The sums of some of a batch's views."""
+        if not places:
+            return []
+        target = self._pictures.of([batch.numbers[place] for place in places])
+        return self.derivatives.sums(self._of(batch), places, target, batch.unit)
+
+    def follow(self, batch: Batch, sums: Sums) -> None:
+        """Take the step for which these are the sums."""
+        self.derivatives.add_sums(self._of(batch), sums, batch.unit)
+        self._take(batch)
+
+    def _take(self, batch: Batch) -> None:
+        self.adam.step(self.derivatives.gradient, batch.part)
+        self.taken += 1
+
+    def _of(self, batch: Batch) -> list[Camera]:
+        return [self._cameras[number] for number in batch.numbers]
+
+    def close(self) -> None:
+        """Give all device memory back."""
+        self._owned.close()
+
+
+class FitPart(Part):
+    """A :class:`Descent` that follows another one.
+
+    Args:
+        device: to compute on.
+        memory: bytes of its memory that target pictures may take; None: a quarter of what is free.
+        ground: where it begins.
+        source: the scene whose pictures are the targets.
+    """
+
+    def __init__(self, device: Device, memory: int | None, ground: Ground, source: Drawable | KeptScene) -> None:
+        with ExitStack() as owned:
+            scene = owned.enter_context(lying_on(device, source))
+            targets = owned.enter_context(targets_of(device, scene, ground.cameras, ground.background))
+            room = room_for_pictures(device, memory)
+            pictures = owned.enter_context(TargetPictures(device, ground.cameras, room, targets))
+            self._descent = owned.enter_context(Descent(device, ground, pictures))
+            self._owned = owned.pop_all()
+
+    def sums(self, taken: int, before: tuple[Batch, Sums] | None, batch: Batch, places: Sequence[int]) -> Sums | None:
+        """The sums of some of a batch's views.
+
+        Args:
+            taken: how many steps the others have taken.
+            before: the last one of these, which is taken here too.
+            batch, places: the batch, and the views.
+
+        Returns:
+            The sums; None: it has not been there in all steps, see :meth:`adopt`.
+        """
+        descent = self._descent
+        if before is not None and descent.taken == taken - 1:
+            descent.follow(*before)
+        return descent.sums(batch, places) if descent.taken == taken else None
+
+    def adopt(self, taken: int, state: Sequence[FloatArray]) -> None:
+        """Go on from another one's numbers after so many steps."""
+        self._descent.adam.adopt(taken, state)
+        self._descent.taken = taken
+
+    def close(self) -> None:
+        """Give all device memory back."""
+        self._owned.close()
+
+
+class Together:
+    """A fit that others help with, as long as this is faster.
+
+    Args:
+        descent: the first device's.
+        parts: the others', each a :class:`FitPart`; None: there are none.
+        takes_part: whether the first device does views too.
+    """
+
+    def __init__(self, descent: Descent, parts: Parts | None, takes_part: bool) -> None:
+        self._descent, self._parts, self._takes_part = descent, parts, takes_part
+        self._before: tuple[Batch, Sums] | None = None
+        self._steps = 0
+        self._since, self._seconds = 0.0, list[float]()
+
+    def step(self, batch: Batch) -> None:
+        """Take a step.
+
+        Raises:
+            DeviceError: the first device failed.
+        """
+        self._look_at_the_time()
+        if self._parts is None or _FIRST + _TRIED <= self._steps < _FIRST + 2 * _TRIED:
+            self._descent.step(batch)
+        else:
+            self._step_together(self._parts, batch)
+        self._steps += 1
+
+    def _step_together(self, parts: Parts, batch: Batch) -> None:
+        descent, count = self._descent, len(batch.numbers)
+        doing = len(parts) + self._takes_part
+        dealt = [list(range(first, count, doing)) for first in range(doing)]
+        own, others = (dealt[0], dealt[1:]) if self._takes_part else ([], dealt)
+        before = self._before if self._before is not None and descent.taken else None
+        try:
+            pending = parts.begin("sums", descent.taken, before, batch, Each(others), logged=False)
+            begun = True
+        except DeviceError as error:
+            begun = self._go_on_alone(error)
+        sums = [*descent.sums(batch, own)]
+        if begun:
+            try:
+                for place, found in enumerate(pending.results()):
+                    if found is None:
+                        parts.ask(place, "adopt", descent.taken, descent.adam.state())
+                        found = parts.ask(place, "sums", descent.taken, None, batch, others[place])
+                    sums += found
+            except DeviceError as error:
+                self._go_on_alone(error)
+        known = {place for place, _ in sums}
+        sums += descent.sums(batch, [place for place in range(count) if place not in known])
+        descent.follow(batch, sums)
+        self._before = batch, sums
+
+    def _look_at_the_time(self) -> None:
+        """Measure both ways once, and stay with the faster one: the bits are the same."""
+        if self._parts is None or self._steps not in (_FIRST, _FIRST + _TRIED, _FIRST + 2 * _TRIED):
+            return
+        with self._descent.device.errors("failed while computing"):
+            self._descent.device.queue.finish()
+        now = time.perf_counter()
+        self._seconds.append(now - self._since)
+        self._since = now
+        if len(self._seconds) == 3 and self._seconds[1] > self._seconds[2]:
+            self._parts.close()
+            self._parts = None
+
+    def _go_on_alone(self, error: DeviceError) -> bool:
+        _log.warning("no worker can fit (%s); using %s instead", str(error).split(": ")[0], self._descent.device.info)
+        self._parts = None
+        return False
+
+
+@contextmanager
+def together(
+    descent: Descent, ground: Ground, helpers: Helpers | None, memory: int | None, batch: int
+) -> Iterator[Together]:
+    """A fit by all who are there.
+
+    Args:
+        descent: the first device's.
+        ground: where it begins.
+        helpers: who does views besides; None: nobody.
+        memory: bytes of a device's memory that target pictures may take; None: a quarter of what is free.
+        batch: views of a step: there is no use for more workers.
+    """
+    with ExitStack() as stack:
+        parts: Parts | None = None
+        if helpers is not None and helpers.pool.first is descent.device:
+            pool = helpers.pool
+            try:
+                count = min(len(pool.workers()), batch - pool.takes_part)
+                given: list[Any] = [stack.enter_context(pool.shared(each)) for each in (ground, helpers.source)]
+                if count > 0:
+                    parts = stack.enter_context(Parts(pool, FitPart, [given] * count, memory))
+                    parts.ready()
+            except DeviceError as error:
+                parts = None
+                _log.warning("no worker can fit (%s); using %s instead", str(error).split(": ")[0], descent.device.info)
+        yield Together(descent, parts, helpers is not None and helpers.pool.takes_part)
