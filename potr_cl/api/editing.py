@@ -42,13 +42,13 @@ from potr_cl.model.scene import Scene
 from potr_cl.model.views_between import views_between as place_between
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.amounts import as_bytes
 from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.forecast import log_forecast
 from potr_cl.pipeline.frame import check_frame
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.run import Run
 from potr_cl.pipeline.stopwatch import Stopwatch
+from potr_cl.pipeline.target import as_bytes
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer

@@ -16,7 +16,7 @@ from potr_cl.errors import DeviceError, UsageError
 from potr_cl.formats import load_scene
 from potr_cl.formats.scenes import ply
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.amounts import size_in_bytes
+from potr_cl.pipeline.target import size_in_bytes
 from tests.cli.calls import KEEP, cameras_json, fails, run
 from tests.reference.scenes import random_scene, ring_of_cameras
 
