@@ -9,7 +9,7 @@ from potr_cl.raster.view_set import camera_struct
 from potr_cl.stages.fitting.pixel_sums import PixelSums, sums_macros
 
 
-class CpuLauncher:
+class CpuFitLauncher:
     """A :class:`potr_cl.stages.fitting.launcher.Launcher`.
 
     Args:

@@ -11,7 +11,7 @@ from potr_cl.stages.fitting.pixel_sums import PixelSums, sums_macros
 _GROUP = 128
 
 
-class GpuLauncher:
+class GpuFitLauncher:
     """A :class:`potr_cl.stages.fitting.launcher.Launcher`.
 
     Args:

@@ -6,8 +6,8 @@ from typing import Protocol
 
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rules import RasterRules
-from potr_cl.stages.fitting.launch_cpu import CpuLauncher
-from potr_cl.stages.fitting.launch_gpu import GpuLauncher
+from potr_cl.stages.fitting.launch_cpu import CpuFitLauncher
+from potr_cl.stages.fitting.launch_gpu import GpuFitLauncher
 from potr_cl.stages.fitting.pixel_sums import PixelSums
 
 
@@ -39,4 +39,4 @@ def launcher_for(device: Device, rules: RasterRules) -> Launcher:
     Raises:
         DeviceError: the kernels cannot be built.
     """
-    return CpuLauncher(device, rules) if device.family == "cpu" else GpuLauncher(device, rules)
+    return CpuFitLauncher(device, rules) if device.family == "cpu" else GpuFitLauncher(device, rules)

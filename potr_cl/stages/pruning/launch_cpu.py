@@ -18,7 +18,7 @@ _SOURCE = "prune/removal_cpu.cl"
 _GROUP = (1,)
 
 
-class CpuLauncher:
+class CpuRemovalLauncher:
     """See :class:`potr_cl.stages.pruning.launcher.SweepLauncher`.
 
     Args:

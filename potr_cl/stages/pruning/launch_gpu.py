@@ -18,7 +18,7 @@ _SOURCE = "prune/removal_gpu.cl"
 _GROUP = 128
 
 
-class GpuLauncher:
+class GpuRemovalLauncher:
     """See :class:`potr_cl.stages.pruning.launcher.SweepLauncher`.
 
     Args:

@@ -10,8 +10,8 @@ from potr_cl.opencl.device import Device
 from potr_cl.raster.macros import totals_limits
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.fixed_point import FixedPoint
-from potr_cl.stages.pruning.launch_cpu import CpuLauncher
-from potr_cl.stages.pruning.launch_gpu import GpuLauncher
+from potr_cl.stages.pruning.launch_cpu import CpuRemovalLauncher
+from potr_cl.stages.pruning.launch_gpu import GpuRemovalLauncher
 from potr_cl.stages.pruning.prepared_set import PreparedSet
 from potr_cl.stages.pruning.sweep_buffers import SweepBuffers
 from potr_cl.stages.pruning.sweep_options import SweepOptions
@@ -92,6 +92,6 @@ def launcher_for(rasterizer: Rasterizer, options: SweepOptions, fixed_point: Fix
     return launchers(device)(rasterizer, fixed_point, macros)
 
 
-def launchers(device: Device) -> type[CpuLauncher | GpuLauncher]:
+def launchers(device: Device) -> type[CpuRemovalLauncher | GpuRemovalLauncher]:
     """The kind of a device's launchers."""
-    return GpuLauncher if device.family == "gpu" else CpuLauncher
+    return GpuRemovalLauncher if device.family == "gpu" else CpuRemovalLauncher

@@ -24,7 +24,7 @@ F64 = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
-class RemovalEffects(Protocol):
+class EffectsMeasurer(Protocol):
     """What the controller asks of whoever measures the effects."""
 
     def measure(self) -> tuple[F64, F64]:
@@ -138,7 +138,7 @@ class SmoothedEffects:
         newest: (N,) ΔMSE_k as last measured.
     """
 
-    def __init__(self, effects: RemovalEffects, decay: float) -> None:
+    def __init__(self, effects: EffectsMeasurer, decay: float) -> None:
         self._effects, self._decay = effects, decay
         self._weight = 0.0
         self._mean: F64 = np.zeros(0)
@@ -227,7 +227,7 @@ def _cheapest(score: F64, weight: F64, remaining: int) -> Indices:
 
 
 def prune(
-    effects: RemovalEffects,
+    effects: EffectsMeasurer,
     splats: int,
     options: PruningOptions,
     progress: Callable[[int, int], None] | None = None,
