@@ -5,36 +5,25 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import json
+import os
 import random
 import shutil
 import struct
 import subprocess
-import threading
 import zlib
-from collections.abc import Iterator
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 
 import potr_cl
-from potr_cl.codec.decoder import decode
-from potr_cl.errors import DataError
 from potr_cl.pipeline.options import EncodeOptions
+from tests.cases.web import GOLDEN, WEB, judged
 from tests.reference.scenes import random_scene
 
-ROOT = Path(__file__).parents[1]
-WEB = ROOT / "web"
 NODE = shutil.which("node")
-GOLDEN = sorted((ROOT / "tests" / "data").glob("golden_*.potr"))
-#: Changed files of each golden one.
-CHANGES = 12
+#: Changed files of each golden one; more by the same variable as in Node.
+CHANGES = int(os.environ.get("POTR_FUZZ", "12"))
 
 pytestmark = [
     pytest.mark.one_family,
@@ -57,17 +46,6 @@ def test_its_own_tests() -> None:
     run("--test", *(str(path.relative_to(WEB)) for path in sorted((WEB / "test").glob("*.test.mjs"))))
 
 
-def judged(data: bytes) -> str:
-    try:
-        scene = decode(data)
-    except DataError as error:
-        return str(error)
-    digest = hashlib.sha256()
-    for array in (scene.means, scene.log_scales, scene.quaternions, scene.opacity_logits, scene.sh):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
-
-
 @pytest.mark.parametrize("preset", ["best", "paper"])
 @pytest.mark.parametrize("build", ["simd", "general"])
 def test_large_sections(build: str, preset: str, tmp_path: Path) -> None:
@@ -76,54 +54,6 @@ def test_large_sections(build: str, preset: str, tmp_path: Path) -> None:
     encoded = potr_cl.encode(random_scene(50_001, degree=2, seed=3), None, options)
     encoded.save(tmp_path / "large.potr")
     assert json.loads(run("test/judge.mjs", build, str(tmp_path / "large.potr"))) == [judged(encoded.data)]
-
-
-@pytest.fixture
-def server() -> Iterator[str]:
-    """Gives a browser the checkout's files."""
-
-    class Quiet(SimpleHTTPRequestHandler):
-        def log_message(self, *_: object) -> None:
-            pass
-
-    handler = partial(Quiet, directory=str(WEB))
-    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as http:
-        threading.Thread(target=http.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{http.server_address[1]}"
-        http.shutdown()
-
-
-_IN_BROWSER = """async ([data, workers, simd]) => {
-  const { decode } = await import('/dist/potr.js');
-  const bytes = Uint8Array.from(atob(data), (c) => c.charCodeAt(0)), wasm = simd ? {} : { simd: null };
-  const blocks = [], scene = await decode(bytes, { workers, wasm, onBlock: ({ block }) => blocks.push(block) });
-  const names = ['positions', 'scales', 'rotations', 'opacities', 'sh'];
-  const all = await new Blob(names.map((name) => scene[name])).arrayBuffer();
-  const digest = new Uint8Array(await crypto.subtle.digest('SHA-256', all));
-  return [Array.from(digest, (byte) => byte.toString(16).padStart(2, '0')).join(''), blocks.length];
-}"""
-
-
-@pytest.mark.browser
-@pytest.mark.slow
-def test_in_chromium(browser: Any, server: str) -> None:
-    """Golden files in the page's thread, and a scene of several parts by two workers, with SIMD and without."""
-    large = potr_cl.encode(
-        random_scene(150_000, degree=1, seed=4), None, EncodeOptions().changed(prune=False, refit=False, compact=False)
-    )
-    tab = browser.new_context().new_page()
-    tab.goto(f"{server}/README.md")
-    for simd in (True, False):
-        for path in GOLDEN:
-            data = path.read_bytes()
-            digest, _ = tab.evaluate(_IN_BROWSER, [base64.b64encode(data).decode(), 0, simd])
-            assert digest == judged(data), path.name
-        digest, blocks = tab.evaluate(_IN_BROWSER, [base64.b64encode(large.data).decode(), 2, simd])
-        assert (digest, blocks) == (judged(large.data), 1)
-    broken = bytearray(large.data)
-    broken[-1] ^= 1
-    with pytest.raises(Exception, match="is damaged"):
-        tab.evaluate(_IN_BROWSER, [base64.b64encode(broken).decode(), 2, True])
 
 
 def with_sums(data: bytearray) -> bytearray:
@@ -160,10 +90,10 @@ def changed(data: bytes, chance: random.Random) -> bytes:
     return bytes(with_sums(out) if chance.random() < 0.8 else out)
 
 
-def alike(ours: str, theirs: str) -> bool:
-    """Whether both mean the same. Libraries differ in which changed Zstandard frames they refuse, and in what words."""
+def frame_differs(ours: str, theirs: str) -> bool:
+    """Whether a Zstandard frame was changed and summed anew: decoders differ in which of these they refuse, and how."""
     frames = ("decompress", "describes its contexts at an impossible length", "describes impossible contexts")
-    return ours == theirs or any(words in ours for words in frames)
+    return "does not decompress" in theirs or any(words in ours for words in frames)
 
 
 @pytest.mark.parametrize("build", ["simd", "general"])
@@ -176,11 +106,13 @@ def test_says_what_python_says(build: str, tmp_path: Path) -> None:
         names.append(tmp_path / f"{number}.potr")
         names[-1].write_bytes(data)
     found = json.loads(run("test/judge.mjs", build, *map(str, names)))
-    wrong = [
+    differ = [
         (path.name, ours, theirs)
         for path, data, ours in zip(names, files, found, strict=True)
-        if not alike(ours, theirs := judged(data))
+        if ours != (theirs := judged(data))
     ]
+    wrong = [each for each in differ if not frame_differs(*each[1:])]
     assert found[: len(GOLDEN)] == [judged(data) for data in files[: len(GOLDEN)]]
     assert not wrong, json.dumps(wrong, indent=1)
+    assert len(differ) < len(files) / 10, json.dumps(differ, indent=1)
     assert sum(" " in words for words in found) > len(files) / 4, "hardly a change was noticed"

@@ -7,7 +7,7 @@ import { build } from 'esbuild';
 import { minify } from 'terser';
 
 /** What pages that encode makes are made of. */
-const PAGE = '../potr_cl/outputs/page.html';
+const PAGE = '../potr_cl/formats/scenes/page.html';
 
 /** @param {string} name @param {object} options of esbuild @returns {Promise<string>} */
 async function bundled(name, options = {}) {

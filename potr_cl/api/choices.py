@@ -102,6 +102,7 @@ class EncodeChoices(StageChoices, total=False):
     Attributes:
         to: suffix of the kind of file (".spz") where there is no ``output`` to tell it; .potr by default.
         spz_version: of an .spz file: 2, 3 or 4.
+        title, author: shown on a page (.html).
         virtual_views: how many views to place without cameras.
         cameras_anyway: use the cameras even if they do not seem to be in the scene's frame.
         background: R, G, B from 0 to 1, or a colour's name; black by default.
@@ -115,6 +116,8 @@ class EncodeChoices(StageChoices, total=False):
 
     to: str | None
     spz_version: int | None
+    title: str | None
+    author: str | None
     virtual_views: int | None
     cameras_anyway: bool | None
     background: ColourSource | None

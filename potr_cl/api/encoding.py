@@ -12,6 +12,7 @@ from potr_cl.api.encoder import Encoder
 from potr_cl.api.inputs import CamerasSource, SceneSource
 from potr_cl.codec.quantize import Preset
 from potr_cl.formats.ladder import Ladder, qualities
+from potr_cl.outputs.output import Output
 from potr_cl.pipeline.encoded import Encoded
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.target import Target
@@ -66,7 +67,7 @@ def encode(
         DataError: a file is damaged, or a value is too large to quantise.
         DeviceError: no device does the work.
     """
-    kind = output_choice(output, choices.pop("to", None), version=choices.pop("spz_version", None))
+    kind = _kind(output, choices)
     judge = report is not None if judge is None else judge
     target = encode_target(q, max_size, min_psnr)
     with _encoder(options, preset, choices, target, cameras, device, judge, q=q, output=kind) as encoder:
@@ -102,9 +103,14 @@ def encode_ladder(
         DataError, DeviceError: as of :func:`potr_cl.encode`.
     """
     steps = qualities(ladder)
-    kind = output_choice(None, choices.pop("to", None), version=choices.pop("spz_version", None))
+    kind = _kind(None, choices)
     with _encoder(options, preset, choices, None, cameras, device, judge, output=kind) as encoder:
         return encoder.ladder(scene, steps, Path(output), progress=progress)
+
+
+def _kind(path: str | os.PathLike[str] | None, choices: EncodeChoices) -> Output | None:
+    version, title, author = (choices.pop(name, None) for name in ("spz_version", "title", "author"))
+    return output_choice(path, choices.pop("to", None), version=version, title=title, author=author)
 
 
 def _encoder(

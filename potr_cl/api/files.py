@@ -81,6 +81,8 @@ def convert(
     output: str | os.PathLike[str],
     *,
     spz_version: int | None = None,
+    title: str | None = None,
+    author: str | None = None,
     trust: bool = False,
     antialiased: bool | None = None,
 ) -> Scene:
@@ -90,6 +92,7 @@ def convert(
         scene: its file, usually.
         output: the file to write; its suffixes tell the format.
         spz_version: of an .spz file, 2, 3 or 4; by default the one that all readers that were tried take.
+        title, author: shown on a page (.html). A .potr file goes into it as it is.
         trust, antialiased: as of :func:`potr_cl.load_scene`.
 
     Returns:
@@ -100,7 +103,8 @@ def convert(
     """
     from potr_cl.formats import scene_writer
 
-    write = scene_writer(output, spz_version)
+    source = Path(scene) if isinstance(scene, (str, os.PathLike)) and antialiased is None else None
+    write = scene_writer(output, version=spz_version, title=title, author=author, source=source)
     read = scene_of(scene, trust, antialiased)
     write(read)
     return read

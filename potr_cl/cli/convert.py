@@ -10,9 +10,11 @@ from potr_cl.cli.options import Commands
 from potr_cl.cli.outputs import WrittenScene, place
 from potr_cl.cli.scenes import (
     add_antialiased_option,
+    add_format_options,
     add_from_option,
-    add_spz_version_option,
     add_trust_option,
+    as_file,
+    format_choices,
     read_scene,
     size_of_file,
     write_scene,
@@ -21,6 +23,7 @@ from potr_cl.cli.terminal import say_done
 from potr_cl.errors import UsageError
 from potr_cl.formats import scene_writer
 from potr_cl.formats.registry import extras_needed, suffixes_read, suffixes_written
+from potr_cl.formats.scenes import page
 
 
 def _arrange(args: argparse.Namespace) -> None:
@@ -34,18 +37,22 @@ def _arrange(args: argparse.Namespace) -> None:
 
 def _convert(args: argparse.Namespace) -> None:
     works = jobs(args, WrittenScene, None)
-    for work in works:  # a version that the format has not is told before anything is read
+    for work in works:  # a choice that the format has not is told before anything is read
         name = f"scene{work.to}" if isinstance(work.output, StandardOutput) else work.output
-        scene_writer(name, args.spz_version)
+        scene_writer(name, **format_choices(args))
     for_each_scene(works, _convert_one)
 
 
 def _convert_one(args: argparse.Namespace) -> None:
     before = size_of_file(args.scene)
     scene = read_scene(args, args.scene)
-    after = write_scene(args.output, scene, args.to, args.spz_version)
-    said = f"{len(scene):,} splats of SH degree {scene.sh_degree}, {after:,} bytes; {args.scene} has {before:,}"
-    say_done(f"{args.output}: {said}")
+    with as_file(args.scene) as source:
+        kept = source if args.antialiased == "auto" else None
+        after = write_scene(args.output, scene, args.to, **format_choices(args), source=kept)
+    said = f"{len(scene):,} splats of SH degree {scene.sh_degree}, {after:,} bytes"
+    if args.output.suffix.lower() in page.FORMAT.suffixes:
+        said += f" ({page.TEMPLATE.stat().st_size:,} of them the viewer)"
+    say_done(f"{args.output}: {said}; {args.scene} has {before:,}")
 
 
 def add_convert(commands: Commands) -> None:
@@ -67,7 +74,7 @@ def add_convert(commands: Commands) -> None:
     p.add_argument("-o", "--output", type=place, metavar="OUT", help='a file, a folder, or "-" for standard output')
     add_batch_options(p)
     add_from_option(p)
-    add_spz_version_option(p)
+    add_format_options(p)
     add_trust_option(p)
     add_antialiased_option(p)
     p.set_defaults(run=_convert, arrange=_arrange)

@@ -16,10 +16,11 @@ from potr_cl.cli.progress import Progress
 from potr_cl.cli.scenes import (
     ANTIALIASED,
     add_antialiased_option,
+    add_format_options,
     add_from_option,
-    add_spz_version_option,
     add_trust_option,
     as_file,
+    format_choices,
 )
 from potr_cl.cli.stage_flags import add_stage_flags, stage_choices
 from potr_cl.cli.terminal import note, say_document, say_done, say_line
@@ -58,9 +59,9 @@ def _encode(args: argparse.Namespace) -> None:
         raise UsageError("--report-view needs --report, the page that shows it")
     if args.report is not None and len(works) > 1:
         raise UsageError("--report is about one scene: encode one at a time")
-    version, first = args.spz_version, works[0]
+    choices, first = format_choices(args), works[0]
     streamed = isinstance(first.output, StandardOutput)
-    output = output_of_suffix(first.to, version=version) if streamed else output_of(first.output, version=version)
+    output = output_of_suffix(first.to, **choices) if streamed else output_of(first.output, **choices)
     several = len(works) > 1
     with _encoder(args, output) as encoder:
         if several:
@@ -106,7 +107,7 @@ def _ladder(args: argparse.Namespace) -> None:
     named_as_file = args.output.exists() or args.output.suffix.lower() in extensions()
     if not isinstance(args.output, WrittenFolder) and named_as_file:
         raise UsageError(f"--ladder writes several files: give -o a folder instead of '{args.output}'")
-    output = output_of_suffix(args.to or OUTPUTS[0].suffixes()[0], version=args.spz_version)
+    output = output_of_suffix(args.to or OUTPUTS[0].suffixes()[0], **format_choices(args))
     name = Path("scene") if isinstance(args.scene, StandardInput) else Path(args.scene)
     check_files(args, ladder_files(args.output, name, steps, output.suffix))
     with _encoder(args, output) as encoder, as_file(args.scene) as scene, Progress() as progress:
@@ -151,7 +152,7 @@ def add_encode(commands: Commands) -> None:
         help=f'{suffixes_encoded()}, a folder, or "-" for standard output; .potr is the smallest',
     )
     add_batch_options(p)
-    add_spz_version_option(p)
+    add_format_options(p)
     goal = p.add_mutually_exclusive_group()
     goal.add_argument(
         "-q", "--quality", type=float, default=0.5, metavar="Q", help="0 (smallest) to 1 (best); default 0.5"

@@ -51,8 +51,8 @@ def add_antialiased_option(p: argparse._ActionsContainer) -> None:
     )
 
 
-def add_spz_version_option(p: argparse._ActionsContainer) -> None:
-    """``--spz-version``, for commands that write scenes in formats of other programs."""
+def add_format_options(p: argparse._ActionsContainer) -> None:
+    """What some formats leave to choose, for commands that write scenes in formats of other programs."""
     p.add_argument(
         "--spz-version",
         type=int,
@@ -61,6 +61,13 @@ def add_spz_version_option(p: argparse._ActionsContainer) -> None:
         help=f"of .spz files: {', '.join(f'{version}, {what}' for version, what in spz.VERSIONS.items())}; default "
         f"{spz.FORMAT.versions[0]}",
     )
+    p.add_argument("--title", metavar="TEXT", help="of .html pages: shown on the page")
+    p.add_argument("--author", metavar="TEXT", help="of .html pages: shown on the page")
+
+
+def format_choices(args: argparse.Namespace) -> dict[str, Any]:
+    """What the options of :func:`add_format_options` say, None where they are not given."""
+    return {"version": args.spz_version, "title": args.title, "author": args.author}
 
 
 def trust(args: argparse.Namespace) -> dict[str, Any]:
@@ -78,14 +85,14 @@ def read_scene(args: argparse.Namespace, path: Path) -> Scene:
         return scene_of(file, args.trust, ANTIALIASED[args.antialiased])
 
 
-def write_scene(path: Path, scene: Scene, to: str | None = None, version: int | None = None) -> int:
+def write_scene(path: Path, scene: Scene, to: str | None = None, **choices: Any) -> int:
     """Write a scene to a file, in the format that its suffix tells, or to standard output.
 
     Args:
         path: of the file, or standard output.
         scene: to write.
         to: the suffix of the format for standard output; ".ply" by default.
-        version: of the format.
+        choices: of the format, as of :func:`potr_cl.formats.scene_writer`.
 
     Returns:
         The number of bytes, of all files where the format has several.
@@ -95,8 +102,8 @@ def write_scene(path: Path, scene: Scene, to: str | None = None, version: int | 
     """
     if isinstance(path, StandardOutput):
         suffix = to or ".ply"
-        return send(path.stream, suffix, lambda file: scene_writer(file, version)(scene))
-    scene_writer(path, version)(scene)
+        return send(path.stream, suffix, lambda file: scene_writer(file, **choices)(scene))
+    scene_writer(path, **choices)(scene)
     return bytes_of_scene(path) or os.stat(path).st_size
 
 

@@ -48,42 +48,46 @@ def load_scene(path: str | os.PathLike[str], trust: bool = False, antialiased: b
         return registry.reader_of(file)(file, trust).rendered(antialiased)
 
 
-def scene_writer(path: str | os.PathLike[str], version: int | None = None) -> Callable[[Scene], None]:
+def scene_writer(path: str | os.PathLike[str], **choices: Any) -> Callable[[Scene], None]:
     """What writes a scene to ``path`` in the format that its suffixes tell; nothing is written yet.
 
     Args:
         path: of the file to write.
-        version: of the format, where it has several; by default the one that most readers take.
+        choices: of the format, those that are not None: ``version``, where it has several; ``title`` and ``author`` of
+            a page; ``source``, the file that the scene was read from, where it matters to the format.
 
     Raises:
         UsageError: no format that is written has these suffixes (a .potr file is what an encoder makes), or it has no
-            such version.
+            such choice or version.
     """
     path = Path(path)
-    if version is None:
-        return partial(registry.writer_of(path), path)
-    entry = registry.written_format(path)
-    if version not in entry.versions:
+    entry, save = registry.written_format(path), registry.writer_of(path)
+    if "source" not in entry.choices:
+        choices.pop("source", None)
+    given = {name: value for name, value in choices.items() if value is not None}
+    version = given.get("version")
+    if version is not None and version not in entry.versions:
         known = registry.listed([str(each) for each in sorted(entry.versions)])
         has = f"is written in version {known}" if known else "has no versions to choose from"
         raise UsageError(f"'{path}': {entry.name} {has}, not {version}")
-    save: Callable[..., None] = registry.writer_of(path)
-    return partial(save, path, version=version)
+    for name in given.keys() - {"version", *entry.choices}:
+        raise UsageError(f"'{path}': {entry.name} has no {name} to choose")
+    return partial(save, path, **given)
 
 
-def save_scene(path: str | os.PathLike[str], scene: Scene, version: int | None = None) -> None:
+def save_scene(path: str | os.PathLike[str], scene: Scene, **choices: Any) -> None:
     """Write a scene in the format that the suffixes of ``path`` tell.
 
     Args:
         path: of the file to write.
         scene: to write.
-        version: see :func:`scene_writer`.
+        choices: see :func:`scene_writer`.
 
     Raises:
         UsageError: see :func:`scene_writer`; or ``path`` cannot be written to, or an extra is missing.
         PotrError: the format cannot hold the scene, or the system failed to write.
     """
-    scene_writer(path, version)(scene)
+    scene_writer(path, **choices)(scene)
 
 
 def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:

@@ -30,7 +30,8 @@ class SceneLoader(Protocol):
 class SceneSaver(Protocol):
     """Writes a scene file, which appears under its name only when it is whole.
 
-    Where a format's declaration lists ``versions``, it takes one of them as the keyword ``version`` too.
+    Where a format's declaration lists ``versions``, it takes one of them as the keyword ``version`` too; and each of
+    its ``choices``.
 
     Args:
         path: of the file.
@@ -67,6 +68,7 @@ class SceneFormat:
         gzipped: whether files of the format are gzip files themselves; ``starts`` is what they unpack to then.
         versions: that ``save`` can be asked for by its argument ``version``, the usual one first; none where there is
             only one way to write.
+        choices: other keywords of ``save``; "source", the file that the scene was read from, is no user's to choose.
         names: of files that tell the format whatever their suffix, in lower case. A folder that holds such a file is
             read too, and ``load`` takes either, with ``#`` and a number behind if the format has levels of detail.
         files: all files of a scene, from a path that ``load`` takes too, without its level; None where a scene is the
@@ -86,6 +88,7 @@ class SceneFormat:
     starts: tuple[bytes, ...] = ()
     gzipped: bool = False
     versions: tuple[int, ...] = ()
+    choices: tuple[str, ...] = ()
     names: tuple[str, ...] = ()
     files: Callable[[Path], list[Path]] | None = None
     packed: bool = False

@@ -1,51 +1,44 @@
-"""A web page that holds a .potr file and what shows it: one file to send, which opens without a server or a network.
-
-What the page is made of, ``page.html`` beside this module, has the viewer, its decoder and their licences in it;
-``python -m tools.make.web`` builds it from web/.
-"""
+"""A web page as an output: :mod:`potr_cl.formats.scenes.page`."""
 
 from __future__ import annotations
 
-import base64
-import json
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.encoder import Coded
-from potr_cl.errors import UsageError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes.page import FORMAT, scene_in
+from potr_cl.formats.scenes.page import FORMAT, check_viewer, page_around, scene_in, sizes
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import Request, Rounded
 from potr_cl.outputs.potr import Potr
 from potr_cl.raster.scene_buffers import Drawable
 
-TEMPLATE = Path(__file__).with_name("page.html")
-_TITLE = "3D scene"
-
 
 @dataclass(frozen=True)
 class Page(Potr):
     """A page (.html).
 
+    Attributes:
+        title, author: shown on it.
+
     Raises:
         UsageError: this installation has no viewer to put into it.
     """
 
+    title: str | None = None
+    author: str | None = None
     format: ClassVar[SceneFormat] = FORMAT
     bytes_a_splat: ClassVar[float] = 4 / 3
 
     def __post_init__(self) -> None:
-        if not TEMPLATE.exists():
-            raise UsageError("this installation cannot make pages: build their viewer by 'python -m tools.make.web'")
+        check_viewer()
 
     def losses(self, scene: Scene) -> list[str]:
         """What three.js does not do."""
@@ -54,11 +47,10 @@ class Page(Potr):
     def file(self, scene: Scene, rounded: Rounded | None, request: Request) -> Coded:
         """The .potr file, within the page."""
         coded = super().file(scene, rounded, request)
-        about = {
-            "words": f"{len(coded.order):,} splats, {coded.nbytes / 1e6:.2f} MB",
-            "view": _view(scene.means, request),
-        }
-        return replace(coded, pieces=pieces_of(coded.pieces, about))
+        view = _view(scene.means, request)
+        return replace(
+            coded, pieces=page_around(b"".join(coded.pieces), len(coded.order), self.title, self.author, view)
+        )
 
     def read(self, data: bytes, trust: bool = False) -> Scene:
         """The scene in a page. Raises DataError if there is none, or it is damaged."""
@@ -71,17 +63,8 @@ class Page(Potr):
             yield scene
 
     def properties(self, data: bytes) -> dict[str, int]:
-        """Bytes by attribute; those of the page are "other"."""
-        sums = super().properties(scene_in(data))
-        return {**sums, "other": sums.get("other", 0) + len(data) - sum(sums.values())}
-
-
-def pieces_of(scene: list[bytes], about: dict[str, Any]) -> list[bytes]:
-    """The pieces of a page around those of a .potr file."""
-    said = json.dumps(about).replace("<", "\\u003c")
-    page = TEMPLATE.read_text("utf-8").replace("@title@", _TITLE).replace("@about@", said)
-    before, after = page.encode().split(b"@scene@")
-    return [before, base64.b64encode(b"".join(scene)), after]
+        """Bytes by attribute; those of the viewer, and what the scene takes more because a page is text."""
+        return {**super().properties(scene_in(data)), **sizes(data)}
 
 
 def _view(means: NDArray[np.float32], request: Request) -> dict[str, Any] | None:

@@ -103,6 +103,8 @@ VALUES: dict[str, tuple[list[str], Any]] = {
     "--sh-degree": (["1"], 1),
     "--box": (["-100", "-100", "2.7", "100", "100", "100"], [-100, -100, 2.7, 100, 100, 100]),
     "--spz-version": (["3"], 3),
+    "--title": (["A title"], "A title"),
+    "--author": (["Somebody"], "Somebody"),
     "--cameras-anyway": ([], True),
     "--unseen": (["drop"], "drop"),
     "--views-between": (["1"], 1),
@@ -295,6 +297,7 @@ def called(command: str, flags: list[str], files: dict[str, Path], folder: Path,
         here.mkdir(parents=True)
         suffix = {"encode": ".potr", "render": "", "compare": ".png"}.get(command, ".ply")
         suffix = ".spz" if "--spz-version" in flags else suffix
+        suffix = ".html" if {"--title", "--author"} & {*flags} else suffix
         names = {**files, "output": here / f"out{suffix}", "report": here / "page.html", "order": here / "order.npy"}
         paths = {name: str(path) for name, path in names.items()}
         sources = {"decode": ["potr"], "refit": ["reduced"], "fit": ["reduced"], "compare": ["scene", "reduced"]}.get(

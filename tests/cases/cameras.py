@@ -12,6 +12,7 @@ from PIL import Image
 
 from potr_cl import Camera, DataError, PotrError
 from potr_cl.formats import load_cameras
+from potr_cl.model.camera import resized
 
 
 def assert_same_views(a: list[Camera], b: list[Camera], tolerance: float = 1e-5) -> None:
@@ -44,6 +45,11 @@ def refused(path: Path, message: str, kind: type[PotrError] = DataError) -> None
         load_cameras(path)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 600
+
+
+def small(camera: Camera, width: int = 80) -> Camera:
+    """The same view in so many columns."""
+    return resized(camera, width, round(camera.height * width / camera.width))
 
 
 def pixel(camera: Camera, point: list[float]) -> tuple[float, float]:

@@ -162,7 +162,7 @@ EXTREME = st.one_of(st.floats(-80, 14, width=32), st.sampled_from([0.0, -80.0, 1
 
 
 @pytest.mark.slow
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(st.data(), st.integers(0, 3), st.integers(1, 30), st.floats(0, 1), st.booleans())
 def test_any_scene(data, degree, splats, q, balanced):
     def array(shape, elements):

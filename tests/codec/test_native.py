@@ -30,7 +30,7 @@ ATTRIBUTES = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
 PATHS = {"numpy": "0", "native": "1"}
 #: A path is chosen by the environment: hypothesis need not undo it between its examples, as each sets it anew.
 SETTINGS = settings(
-    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+    max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
 )
 
 
@@ -210,14 +210,14 @@ def test_changed_files(choose):
     rng = random.Random(7)
     originals = files_to_change()
     read = 0
-    for number in range(400):
+    for number in range(150):
         data = bytearray(originals[number % len(originals)])
         for _ in range(rng.choice([1, 1, 1, 2, 8])):
             data[rng.randrange(int.from_bytes(data[12:16], "little"), len(data))] = rng.choice(
                 [0, 1, 127, 128, 255, rng.getrandbits(8)]
             )
         read += assert_alike(sealed(bytes(data)), choose)
-    assert 40 < read < 360  # both must occur for this to mean anything
+    assert 15 < read < 135  # both must occur for this to mean anything
 
 
 @pytest.mark.slow
@@ -226,7 +226,7 @@ def test_changed_octrees(choose):
     means = rng.normal(size=(200, 3)).astype(np.float32)
     means = np.concatenate([means, means[:20], means[:5]])
     reasons = set()
-    for number in range(1500):
+    for number in range(500):
         tree, _ = octree.build(means, 1e-3, absolute=bool(number % 2))
         fields = {
             name: np.array(getattr(tree, name))

@@ -111,7 +111,7 @@ COORDINATE = st.one_of(
 )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(
     hnp.arrays(np.float32, st.tuples(st.integers(1, 40), st.just(3)), elements=COORDINATE),
     st.floats(1e-7, 1e3),
@@ -120,7 +120,7 @@ def test_any_scene(means, tolerance):
     roundtrip(means, tolerance)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(st.data())
 def test_damaged_streams_are_refused_or_parse_to_the_right_count(data):
     means = np.vstack([SHELL[:30], np.zeros((3, 3))]).astype(np.float32)

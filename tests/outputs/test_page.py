@@ -1,27 +1,25 @@
-"""Pages that hold a scene: what encode writes, what reads it, and what a browser shows of it."""
+"""Pages that hold a scene: what encode and convert write, and what reads it."""
 
 from __future__ import annotations
 
 import base64
-import dataclasses
-import io
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 import potr_cl
+from potr_cl.cli import main
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.scenes import page as pages
-from potr_cl.outputs import page
 from potr_cl.outputs.page import Page
 from potr_cl.outputs.potr import Potr
 from potr_cl.pipeline.options import EncodeOptions
 
 pytestmark = [pytest.mark.one_family, pytest.mark.one_runtime]
 needs_viewer = pytest.mark.skipif(
-    not page.TEMPLATE.exists(), reason="the viewer of pages is not built: python -m tools.make.web"
+    not pages.TEMPLATE.exists(), reason="the viewer of pages is not built: python -m tools.make.web"
 )
 FAST = {"prune": False, "refit": False, "compact": False}
 
@@ -43,6 +41,7 @@ def test_holds_what_a_potr_file_holds(plush_excerpt, tmp_path):
     scene = potr_cl.load_scene(_written(tmp_path / "a.html", whole.data))
     assert np.array_equal(scene.means, potr_cl.decode(inner).means)
     assert sum(Page().properties(whole.data).values()) == len(whole.data)
+    assert Page().properties(whole.data)["viewer"] == pages.TEMPLATE.stat().st_size
 
 
 @needs_viewer
@@ -52,10 +51,60 @@ def test_loads_nothing_from_elsewhere(encoded):
     assert "@" not in text.split('<script id="viewer"')[0].replace("@media", "")
 
 
-def test_needs_its_viewer(monkeypatch, tmp_path):
-    monkeypatch.setattr(page, "TEMPLATE", tmp_path / "none")
+def test_needs_its_viewer(monkeypatch, tmp_path, data, capsys):
+    monkeypatch.setattr(pages, "TEMPLATE", tmp_path / "none")
     with pytest.raises(UsageError, match=r"python -m tools.make.web"):
         Page()
+    assert main(["convert", str(data / "golden_blocks.potr"), str(tmp_path / "a.html")]) == 2
+    assert "python -m tools.make.web" in capsys.readouterr().err
+    assert not any(tmp_path.iterdir())
+
+
+@needs_viewer
+def test_convert_takes_over_a_file_as_it_is(data, tmp_path, capsys):
+    first, second, third = (tmp_path / f"{name}.html" for name in "abc")
+    sound = data / "golden_bundles_antialiased.potr"
+    assert main(["convert", str(sound), str(first)]) == 0
+    assert f"{pages.TEMPLATE.stat().st_size:,} of them the viewer" in capsys.readouterr().out
+    assert pages.scene_in(first.read_bytes()) == sound.read_bytes()
+    potr_cl.convert(first, second, title="Again")
+    assert pages.scene_in(second.read_bytes()) == sound.read_bytes()
+    broken = bytearray(sound.read_bytes())
+    broken[-1] ^= 1
+    assert main(["convert", str(_written(tmp_path / "b.potr", bytes(broken))), str(third)]) != 0
+    assert not third.exists()
+
+
+@needs_viewer
+def test_convert_leaves_no_splat_out(data, plush_excerpt, tmp_path):
+    path = tmp_path / "a.html"
+    assert main(["convert", str(data / "plush_excerpt.ply"), "-o", str(path)]) == 0
+    scene = potr_cl.load_scene(path)
+    assert len(scene) == len(plush_excerpt)
+    assert scene.sh_degree == plush_excerpt.sh_degree
+
+
+@needs_viewer
+def test_titles_are_text(data, tmp_path):
+    path, title = tmp_path / "a.html", '</script><b>@about@ @scene@ & "x"\n\udc80'
+    named = ["--title", title, "--author", "<Ada>"]
+    assert main(["convert", str(data / "golden_blocks.potr"), str(path), *named]) == 0
+    text = path.read_text("utf-8")
+    shown = "&lt;/script&gt;&lt;b&gt;@about@ @scene@ &amp; &quot;x&quot;"
+    assert f"<title>{shown}" in text
+    assert '<meta name="author" content="&lt;Ada&gt;">' in text
+    about = json.loads(text.split('type="application/json">')[1].split("</script>")[0])
+    assert about["words"].startswith('</script><b>@about@ @scene@ & "x"')
+    assert "by <Ada> · " in about["words"]
+    assert pages.scene_in(path.read_bytes()) == (data / "golden_blocks.potr").read_bytes()
+
+
+def test_only_pages_have_titles(data, tmp_path, capsys):
+    assert main(["convert", str(data / "golden_blocks.potr"), str(tmp_path / "a.ply"), "--title", "x"]) == 2
+    assert "PLY has no title to choose" in capsys.readouterr().err
+    encode = ["encode", str(data / "plush_excerpt.ply"), "-o", str(tmp_path / "a.potr"), "--author", "x"]
+    assert main(encode) == 2
+    assert "has no author to choose" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -74,98 +123,6 @@ def test_refuses_other_pages(content, words, tmp_path):
     assert str(path) in str(caught.value)
 
 
-# In a browser --------------------------------------------------------------------------------------------------------
-
-
 def _written(path: Path, content: bytes) -> Path:
     path.write_bytes(content)
     return path
-
-
-def shown(browser, path: Path, width: int, height: int, **context):
-    tab = browser.new_context(viewport={"width": width, "height": height}, **context).new_page()
-    asked = []
-    tab.on("request", lambda request: asked.append(request.url))
-    tab.goto(path.as_uri())
-    tab.wait_for_selector("body[data-shown], body[data-failed]", state="attached")
-    assert [url for url in asked if url.startswith("http")] == []
-    return tab
-
-
-def picture(tab) -> np.ndarray:
-    tab.evaluate("document.getElementById('words').remove()")
-    tab.wait_for_timeout(500)
-    return np.asarray(Image.open(io.BytesIO(tab.screenshot())).convert("RGB")) / 255
-
-
-def psnr(a: np.ndarray, b: np.ndarray) -> float:
-    return float(-10 * np.log10(np.square(a - b).mean()))
-
-
-def until(tab, expression: str, wanted) -> None:
-    """Wait for a value, however slowly this machine draws."""
-    for _ in range(600):
-        if wanted(tab.evaluate(expression)):
-            return
-        tab.wait_for_timeout(100)
-    raise AssertionError(f"it never came: {expression}")
-
-
-@pytest.mark.browser
-@pytest.mark.slow
-@needs_viewer
-@pytest.mark.parametrize("size", [(640, 480), (390, 844)], ids=["desktop", "phone"])
-def test_shows_what_our_renderer_does(browser, encoded, plush_excerpt_cameras, size):
-    width, height = size
-    tab = shown(browser, encoded, width, height, has_touch=width < height)
-    assert tab.evaluate("document.body.dataset.failed") is None
-    first = next(camera for camera in plush_excerpt_cameras if camera.split == "train")
-    # The page looks from the first view to the scene's middle, with the principal point in the middle.
-    focal = first.fy * height / first.height
-    matrix = np.array(tab.evaluate("Array.from(potr.camera.matrixWorldInverse.elements)")).reshape(4, 4).T
-    pose = np.diag([1.0, -1.0, -1.0]) @ matrix[:3]
-    camera = dataclasses.replace(
-        first, width=width, height=height, fx=focal, fy=focal, cx=width / 2, cy=height / 2,
-        rotation=pose[:, :3], translation=pose[:, 3], lens=None,
-    )  # fmt: skip
-    ours = np.clip(potr_cl.render(potr_cl.load_scene(encoded), camera).image, 0, 1)
-    theirs = picture(tab)
-    # three.js has splats end at 1 / 55 of their opacity, ours at 1 / 255 of full opacity; and 8 bits of each colour.
-    alike = psnr(ours, theirs)
-    assert alike > 30
-    assert alike > psnr(np.roll(ours, 2, axis=1), theirs) + 2
-    assert alike > psnr(ours[:, ::-1], theirs) + 5
-
-
-@pytest.mark.browser
-@pytest.mark.slow
-@needs_viewer
-def test_turns_and_flies(browser, encoded):
-    tab = shown(browser, encoded, 200, 150)
-    place, away = "potr.camera.position.toArray()", "potr.camera.position.distanceTo(potr.controls.target)"
-    before = tab.evaluate(place)
-    tab.mouse.move(80, 80)
-    tab.mouse.down()
-    tab.mouse.move(120, 90, steps=3)
-    tab.mouse.up()
-    until(tab, place, lambda now: not np.allclose(before, now))
-    distance = tab.evaluate(away)
-    target = tab.evaluate("potr.controls.target.toArray()")
-    tab.keyboard.down("w")
-    until(tab, "potr.controls.target.toArray()", lambda now: not np.allclose(target, now))
-    tab.keyboard.up("w")
-    assert tab.evaluate(away) == pytest.approx(distance, rel=1e-3)
-
-
-@pytest.mark.browser
-@pytest.mark.slow
-@needs_viewer
-def test_says_what_is_wrong_with_a_file(browser, encoded, tmp_path):
-    data = encoded.read_bytes()
-    scene = bytearray(pages.scene_in(data))
-    scene[-1] ^= 1
-    begin = data.index(pages.BEGIN) + len(pages.BEGIN)
-    end = data.index(pages.END, begin)
-    path = _written(tmp_path / "broken.html", data[:begin] + base64.b64encode(scene) + data[end:])
-    tab = shown(browser, path, 200, 150)
-    assert "is damaged (its checksum does not match)" in tab.inner_text("#words")

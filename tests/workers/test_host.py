@@ -27,6 +27,7 @@ from potr_cl.workers.host import HostPool
 from potr_cl.workers.opening import open_workers
 from potr_cl.workers.parts import Parts
 from potr_cl.workers.pool import Part
+from tests.cases.cameras import small
 from tests.cases.streets import street
 from tests.devices import FAMILIES, open_device
 
@@ -41,21 +42,10 @@ OPTIONS = EncodeOptions.for_preset(
 )
 
 
-def few(cameras, size=80):
+def few(cameras):
     """Five training views and a test view, small."""
     chosen = [c for c in cameras if c.split == "train"][:5] + [c for c in cameras if c.split == "test"][:1]
-    factor = size / chosen[0].width
-    return [
-        dataclasses.replace(
-            c, width=round(c.width * factor), height=round(c.height * factor), fx=c.fx * factor, fy=c.fy * factor,
-            cx=c.cx * factor, cy=c.cy * factor,
-        )
-        for c in chosen
-    ]  # fmt: skip
-
-
-#: Ways of :func:`test_the_same_bytes` that are tried in the quick subset: each family once.
-QUICK = {("cpu", "nothing is kept of any view"), ("gpu", "a GPU decides itself")}
+    return [small(camera) for camera in chosen]
 
 
 @pytest.fixture(scope="module", params=FAMILIES)
@@ -63,16 +53,17 @@ def family(request):
     return request.param
 
 
+#: Nothing is kept of any view, and a GPU decides itself.
+LITTLE_MEMORY, BY_THRESHOLD = OPTIONS.changed(memory=0), OPTIONS.changed(prune={"keep": None})
+
+
 @pytest.mark.parametrize(
     ("family", "options"),
     [
-        pytest.param(family, options, marks=() if (family, name) in QUICK else pytest.mark.slow)
-        for family in FAMILIES
-        for name, options in {
-            "by number": OPTIONS,
-            "nothing is kept of any view": OPTIONS.changed(memory=0),
-            "a GPU decides itself": OPTIONS.changed(prune={"keep": None}),
-        }.items()
+        ("cpu", LITTLE_MEMORY),
+        ("gpu", BY_THRESHOLD),
+        pytest.param("cpu", OPTIONS, marks=pytest.mark.slow),
+        pytest.param("gpu", LITTLE_MEMORY, marks=pytest.mark.slow),
     ],
 )
 def test_the_same_bytes(plush_excerpt, plush_excerpt_cameras, family, options):
@@ -146,6 +137,7 @@ def test_more_devices_than_views(plush_excerpt, plush_excerpt_cameras, family):
         assert encode(plush_excerpt, cameras, OPTIONS, device=devices[0], pool=pool).data == expected
 
 
+@pytest.mark.one_family
 def test_pruning_alone_removes_the_same_splats(plush_excerpt, plush_excerpt_cameras, family):
     """All that is known of the course, not only what is left: the order, and the sums of each iteration."""
     cameras = few(plush_excerpt_cameras)
@@ -161,7 +153,7 @@ def test_pruning_alone_removes_the_same_splats(plush_excerpt, plush_excerpt_came
     assert len(expected.history) > 1
 
 
-def small(device: Device, memory: int) -> Device:
+def poor(device: Device, memory: int) -> Device:
     """The same device with less memory."""
     return Device(dataclasses.replace(device.info, memory=memory), family=device.family)
 
@@ -170,7 +162,7 @@ def test_a_device_with_too_little_memory_leaves_its_views_to_others(plush_excerp
     cameras = few(plush_excerpt_cameras)
     first = Device(choose_device())
     expected = encode(plush_excerpt, cameras, OPTIONS, device=first).data
-    devices = [first, small(first, 100_000)]
+    devices = [first, poor(first, 100_000)]
     with HostPool(devices) as pool:
         assert encode(plush_excerpt, cameras, OPTIONS, device=first, pool=pool).data == expected
     assert "reassigning its views to 0:" in caplog.text
@@ -180,8 +172,8 @@ def test_a_device_with_too_little_memory_leaves_its_views_to_others(plush_excerp
 @pytest.fixture(scope="module")
 def pruned_by_threshold(plush_excerpt, plush_excerpt_cameras):
     """Options with which a GPU decides itself, and the file that one device makes."""
-    options = OPTIONS.changed(prune={"keep": None})
-    return options, encode(plush_excerpt, few(plush_excerpt_cameras), options, device=open_device("gpu")).data
+    encoded = encode(plush_excerpt, few(plush_excerpt_cameras), BY_THRESHOLD, device=open_device("gpu"))
+    return BY_THRESHOLD, encoded.data
 
 
 @pytest.mark.slow
@@ -219,7 +211,7 @@ def test_a_device_that_fails_on_the_way(
 
 
 def test_no_device_has_enough_memory(plush_excerpt, plush_excerpt_cameras):
-    devices = [small(Device(choose_device()), 100_000) for _ in range(2)]
+    devices = [poor(Device(choose_device()), 100_000) for _ in range(2)]
     with HostPool(devices) as pool, pytest.raises(DeviceMemoryError):
         encode(plush_excerpt, few(plush_excerpt_cameras), OPTIONS, device=devices[0], pool=pool)
     assert [device.allocated for device in devices] == [0, 0]

@@ -28,6 +28,7 @@ from potr_cl.raster.scene_buffers import SceneBuffers, uploaded
 from potr_cl.views import pictures, visibility
 from potr_cl.views.pictures import SeenRasterizer, rasterizer_of
 from potr_cl.workers.host import HostPool
+from tests.cases.cameras import small
 from tests.cases.elsewhere import ElsewherePool
 from tests.cases.streets import street
 from tests.devices import FAMILIES, open_device
@@ -44,15 +45,10 @@ def family(request):
 @pytest.fixture(scope="module")
 def cameras(plush_excerpt_cameras):
     """Eleven views, small, five of which are held out."""
-    chosen = plush_excerpt_cameras[:11]
-    factor = 80 / chosen[0].width
     return [
-        dataclasses.replace(
-            c, width=80, height=round(c.height * factor), fx=c.fx * factor, fy=c.fy * factor, cx=40, cy=c.cy * factor,
-            split="test" if number % 2 else "train",
-        )
-        for number, c in enumerate(chosen)
-    ]  # fmt: skip
+        dataclasses.replace(small(camera), split="test" if number % 2 else "train")
+        for number, camera in enumerate(plush_excerpt_cameras[:11])
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -99,6 +95,7 @@ def test_the_same_figures(plush_excerpt, cameras, coded, family, kind):
     assert [device.allocated for device in devices] == [0] * 3
 
 
+@pytest.mark.one_family
 def test_a_scene_that_is_kept_is_not_sent_again(plush_excerpt, cameras, coded, family, monkeypatch):
     views = EvaluationViews.of(cameras)
     expected = judged(open_device(family), plush_excerpt, coded, views)
@@ -112,6 +109,7 @@ def test_a_scene_that_is_kept_is_not_sent_again(plush_excerpt, cameras, coded, f
 
 
 @pytest.mark.slow
+@pytest.mark.one_family
 def test_a_candidate_of_the_host_is_judged_too(plush_excerpt, cameras, coded, family):
     """As files are whose readers make no scene on a device; and pictures are remembered from one to the next."""
     views, worse = EvaluationViews.of(cameras), coded.output.read(coded.data)
@@ -126,6 +124,7 @@ def test_a_candidate_of_the_host_is_judged_too(plush_excerpt, cameras, coded, fa
         assert [device.allocated for device in devices] == [0] * 2
 
 
+@pytest.mark.one_family
 def test_views_of_the_same_name(plush_excerpt, cameras, coded, family):
     """As cameras made in Python may have it."""
     alike = [dataclasses.replace(camera, name="view", split="test") for camera in cameras[:4]]
@@ -199,6 +198,7 @@ def test_a_search_for_a_psnr_judges_together(plush_excerpt, cameras, monkeypatch
     assert [device.allocated for device in devices] == [0] * 2
 
 
+@pytest.mark.one_family
 def test_photographs_are_judged_by_together(plush_excerpt, cameras, coded, tmp_path, family):
     for camera in cameras[1:4]:
         with (tmp_path / f"{camera.name}.png").open("wb") as file:
@@ -232,6 +232,7 @@ def _small_groups(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_small_groups")
+@pytest.mark.one_family
 def test_views_of_a_large_scene_are_judged_by_what_they_see(family, monkeypatch):
     scene, cameras = street(5, 500, across=True)
     cameras = [dataclasses.replace(c, split="test" if k % 2 else "train") for k, c in enumerate(cameras)]
@@ -299,6 +300,7 @@ def test_with_little_memory_a_decoded_file_is_judged_by_what_views_see_too(famil
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_small_groups")
+@pytest.mark.one_family
 def test_an_encode_leaves_the_groups_that_it_has_found(family, monkeypatch):
     monkeypatch.setattr("potr_cl.views.visibility.LEAST_SPLATS", 1)
     scene, cameras = street(5, 500, across=True)
@@ -343,6 +345,7 @@ def test_pictures_of_what_views_see(family, where, rules):
     assert device.allocated == 0
 
 
+@pytest.mark.one_family
 def test_scenes_are_compared_together(plush_excerpt, cameras, coded, family, monkeypatch):
     """Scenes of the host and scenes of files."""
     alone = open_device(family)

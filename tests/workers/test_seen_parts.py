@@ -23,6 +23,7 @@ from potr_cl.stages.refitting.part import ColourPart
 from potr_cl.views import visibility
 from potr_cl.views.shares import ViewShares
 from potr_cl.views.visibility import Visibility
+from tests.cases.cameras import small
 from tests.cases.elsewhere import ElsewherePool
 from tests.cases.streets import street
 from tests.devices import FAMILIES, open_device
@@ -56,15 +57,6 @@ def with_a_house_that_nobody_sees(scene):
     return dataclasses.replace(scene, **named)
 
 
-def smaller(camera, width):
-    factor = width / camera.width
-    height = round(camera.height * factor)
-    return dataclasses.replace(
-        camera, width=width, height=height, fx=camera.fx * factor, fy=camera.fy * factor, cx=width / 2,
-        cy=camera.cy * factor,
-    )  # fmt: skip
-
-
 def array_fields(scene):
     return [f for f in dataclasses.fields(scene) if isinstance(getattr(scene, f.name), np.ndarray)]
 
@@ -74,9 +66,9 @@ def array_fields(scene):
     "options",
     [
         # The host decides, as it does on a CPU whatever the options.
-        pytest.param(OPTIONS, marks=pytest.mark.slow),
+        pytest.param(OPTIONS, marks=pytest.mark.one_family),
         # Nothing is kept of any view; tests/workers/test_host.py has that without slow ones.
-        pytest.param(OPTIONS.changed(memory=0, prune={"tolerance": 0.0}), marks=pytest.mark.slow),
+        pytest.param(OPTIONS.changed(memory=0, prune={"tolerance": 0.0}), marks=pytest.mark.one_family),
         OPTIONS.changed(prune={"keep": None}),  # a GPU decides itself, and what nobody sees stays
     ],
     ids=["by number", "little memory", "by threshold"],
@@ -112,6 +104,7 @@ def test_the_same_bytes(family, options, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.one_family
 def test_a_re_fit_sends_what_views_draw(family, monkeypatch):
     """Of a direction, each worker gets the coefficients of these splats alone; what it finds is the same."""
     scene, cameras = street(5, 500, across=True)
@@ -137,7 +130,7 @@ def test_who_is_told_again_is_told_the_colours_of_then(lost_at, monkeypatch, plu
         "best", q=0.3, prune={"keep": 0.4, "iterations": 8}, refit={"at": (0.3, 0.6), "steps": 3, "drop": 1e-7},
         between=False,
     )  # fmt: skip
-    cameras = [smaller(camera, 80) for camera in plush_excerpt_cameras[:5]]
+    cameras = [small(camera) for camera in plush_excerpt_cameras[:5]]
     devices = [open_device("cpu") for _ in range(3)]
     expected = encode(plush_excerpt, cameras, options, device=devices[0]).data
     measure, asked = part.RemovalPart.changes, []
@@ -178,6 +171,7 @@ def test_a_re_fit_without_room_for_that_sends_all(monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.one_family
 def test_the_uncompressed_scene_travels_once(family, monkeypatch):
     """Where workers get all of it: of what is pruned, once unseen splats are set aside, they get the numbers."""
     monkeypatch.setattr(visibility, "LEAST_SPLATS", 1 << 40)

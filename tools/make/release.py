@@ -24,7 +24,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from potr_cl import __version__
-from potr_cl.outputs.page import TEMPLATE
+from potr_cl.formats.scenes.page import TEMPLATE
 from tools.make import web
 
 ROOT = Path(__file__).parents[2]

@@ -1,6 +1,8 @@
-"""Build the npm package of the decoder for browsers (web/), and what pages are made of (potr_cl/outputs/page.html).
+"""Build the npm package of the decoder for browsers (web/), and the viewer of pages.
 
     python -m tools.make.web [--only-wasm]
+
+The package goes to web/dist, the viewer to potr_cl/formats/scenes/page.html.
 
 The C is compiled to WebAssembly by Zig's C compiler, which PyPI has (pip install ziglang), or by clang, wasi-libc and
 lld of Debian, whichever is there. All else is npm's: web/package-lock.json says what is installed.
@@ -20,7 +22,8 @@ import potr_cl.codec.native
 
 WEB = Path(__file__).parents[2] / "web"
 _NATIVE = Path(potr_cl.codec.native.__file__).parent
-_SOURCES = ("bundles", "bundles_tokens", "bundles_values", "steps", "octree", "quantise")
+#: bundles_tokens.c is part of web/src/tokens.c.
+_SOURCES = ("bundles", "bundles_values", "steps", "octree", "quantise")
 _ALWAYS = (
     "--target=wasm32-wasi", "-mexec-model=reactor", "-std=c11", "-flto", "-ffp-contract=off", "-fno-math-errno",
     "-fvisibility=hidden", "-fno-stack-protector", "-mbulk-memory", "-mnontrapping-fptoint", "-msign-ext",
@@ -46,7 +49,7 @@ def compiler() -> list[str]:
 def compile_wasm(folder: Path) -> None:
     """Compile all :data:`BUILDS` to a folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    sources = [WEB / "src" / "decoder.c", *(_NATIVE / f"{name}.c" for name in _SOURCES)]
+    sources = [*sorted((WEB / "src").glob("*.c")), *(_NATIVE / f"{name}.c" for name in _SOURCES)]
     for name, options in BUILDS.items():
         _run([*compiler(), *_ALWAYS, *options, f"-I{_NATIVE}", *map(str, sources), "-o", str(folder / name)])
 

@@ -117,8 +117,8 @@ def long_lists(device: Device) -> None:
 
 
 def all_stages(device: Device) -> None:
-    """A whole encode: pruning that a GPU steers, the fit with its roundings, compaction, re-fit and judging."""
-    changes = {"prune": {"iterations": 3}, "fit": {"steps": 6}, "compact": True, "refit": {"steps": 1}}
+    """Whole encodes: pruning that a GPU steers, the fit with its roundings, compaction and judging."""
+    changes = {"prune": {"iterations": 3}, "fit": {"steps": 3}, "compact": True, "refit": False}
     options = EncodeOptions.for_preset("smallest", between=False, cameras_anyway=True, **changes)
     for degree in (1, 3):
         encode(random_splats(60, degree, seed=2), _views(5), options, device=device)
@@ -197,8 +197,9 @@ def some_of_a_scene(device: Device) -> None:
             rasterizer.render(views[0])
 
 
-def refit(device: Device) -> None:
-    """With AC coefficients rounded in rounds; with the vectors on the device, and on the host in slices."""
+def refits(device: Device) -> None:
+    """With AC coefficients rounded in rounds, to the same: the vectors on the device, and on the host in slices; on a
+    GPU also of views with the splats that they reach, in pieces of lists that many work-groups sort."""
     # Two slices: of 256 splats, and of the rest.
     scene, views = random_splats(270, 1, seed=2), _views()
     rng = np.random.default_rng(0)
@@ -207,19 +208,7 @@ def refit(device: Device) -> None:
     found = []
     with Rasterizer(device, scene) as rasterizer:
         targets = RenderedTargets(rasterizer, views)
-        for slices in (None, 256):
-            options = RefitOptions(steps=2, gain=0, drop=1e-9, slices=slices)
-            found.append(refit_colours(device, scene, views, targets, options, colour_grid=lambda _: grid).sh)
-    assert np.array_equal(found[0], found[1])
-
-
-def refit_of_reached(device: Device) -> None:
-    """Of views with the splats that they reach, in pieces of lists that many work-groups sort: on a GPU."""
-    scene, views = random_splats(270, 1, seed=2), _views()
-    found = []
-    with Rasterizer(device, scene) as rasterizer:
-        targets = RenderedTargets(rasterizer, views)
-        for least, longest in ((1 << 30, 1 << 30), (1, 100)):
+        for slices, least, longest in ((None, 1 << 30, 1 << 30), (256, 1 << 30, 1 << 30), (None, 1, 100)):
             with (
                 patch.object(reached, "LEAST_SPLATS", least),
                 patch.object(reached, "WORTH_IT", 1.0),
@@ -227,9 +216,9 @@ def refit_of_reached(device: Device) -> None:
                 patch.object(long_lists_module, "LONGEST", longest),
                 patch.object(long_lists_module, "PIECE", 64),
             ):
-                options = RefitOptions(steps=1, gain=0, drop=1e-9)
-                found.append(refit_colours(device, scene, views, targets, options).sh)
-    assert np.array_equal(found[0], found[1])
+                options = RefitOptions(steps=2, gain=0, drop=1e-9, slices=slices)
+                found.append(refit_colours(device, scene, views, targets, options, colour_grid=lambda _: grid).sh)
+    assert all(np.array_equal(found[0], other) for other in found[1:])
 
 
 def packing(device: Device) -> None:
@@ -243,6 +232,7 @@ def packing(device: Device) -> None:
         x = vectors.vector()
         vectors.write(x, scene.sh.transpose(1, 2, 0).reshape(layout.columns, -1))
         packs.take_floats(x, packs.send_floats(x))
+        packs.take_vector(x, packs.send_vector(x))
         sums = memory.upload(np.ones((layout.columns, layout.stride), np.int64), "sums")
         packs.add_sums(sums, packs.send_sums(sums))
         packs.add_rows(sums, 1, packs.rows(sums, 0, 1))
@@ -299,8 +289,8 @@ def filling(device: Device) -> None:
 
 
 STEPS: tuple[Step, ...] = (
-    pictures, long_lists, all_stages, several_batches, view_by_view, part_by_part, some_of_a_scene, refit,
-    refit_of_reached, packing, marks, decoding, clusters, check_similarity, filling,
+    pictures, long_lists, all_stages, several_batches, view_by_view, part_by_part, some_of_a_scene, refits,
+    packing, marks, decoding, clusters, check_similarity, filling,
 )  # fmt: skip
 
 

@@ -144,7 +144,7 @@ export function readHeader(data, fileBytes, trust) {
   const flags = data[10], degree = data[11], count = at.getUint32(24, true), quantiser = data[28], own = data[29];
   if (![0, 1, 3].includes(flags) || quantiser > 1 || at.getUint16(30, true))
     refuse(`a file with flags ${flags} and quantiser ${quantiser} is unknown: update potr_cl`);
-  if (degree > 3 || count < 1 || own > MOST_SECTIONS) refuse(`the header makes no sense: ${count} blocks, SH degree ${degree}`);
+  if (degree > 3 || count < 1 || own > MOST_SECTIONS) refuse(`invalid header: ${count} blocks, SH degree ${degree}`);
   if (!trust) checkNumber(count, FREE_SPLATS + MOST_A_BYTE * fileBytes, `a file of ${fileBytes} bytes`);
 
   let read = FIXED_BYTES, offset = size;
@@ -162,7 +162,7 @@ export function readHeader(data, fileBytes, trust) {
     let place = 0;
     for (let k = 0; k < number; k++) {
       const from = next(16), name = String.fromCharCode(...data.subarray(from, from + 4));
-      if (!/^[A-Za-z][A-Za-z0-9]{3}$/.test(name)) refuse(`${where} has a section whose name is no name: get the file again`);
+      if (!/^[A-Za-z][A-Za-z0-9]{3}$/.test(name)) refuse(`${where} has a section with an invalid name: get the file again`);
       const title = known(name)?.[0] ?? name, what = `section '${title}'`;
       const [stored, raw, crc] = [4, 8, 12].map((k) => at.getUint32(from + k, true));
       const rank = known_.indexOf(name);
@@ -192,12 +192,12 @@ export function readHeader(data, fileBytes, trust) {
     const box = reals(8, 6), origin = reals(32, 3), error = reals(44, 1)[0], side = at.getFloat64(from + 48, true), factors = reals(56, 5);
     if (coder > 1 || (coder && !quantiser)) refuse(`${what} is of coder ${coder}, which is unknown: update potr_cl`);
     if (splats < 1 || splats > MOST_SPLATS || depth > MOST_LEVELS || some > MOST_SECTIONS)
-      refuse(`${what} makes no sense: ${splats} splats, octree of ${depth} levels, ${some} sections`);
-    if (!box.every(isFinite) || [0, 1, 2].some((k) => box[k] > box[k + 3])) refuse(`${what} makes no sense: its box is [${box.map(float).join(', ')}]`);
-    if (!origin.every(isFinite) || !(side >= 0 && side <= 2 * LARGEST)) refuse(`${what} makes no sense: its root cube is not finite`);
-    if (!factors.every((x) => x >= Math.fround(1e-3) && x <= 1e9)) refuse(`${what} makes no sense: a scale factor outside 0.001 to 1e9`);
+      refuse(`${what} is invalid: ${splats} splats, octree of ${depth} levels, ${some} sections`);
+    if (!box.every(isFinite) || [0, 1, 2].some((k) => box[k] > box[k + 3])) refuse(`${what} is invalid: its box is [${box.map(float).join(', ')}]`);
+    if (!origin.every(isFinite) || !(side >= 0 && side <= 2 * LARGEST)) refuse(`${what} is invalid: its root cube is not finite`);
+    if (!factors.every((x) => x >= Math.fround(1e-3) && x <= 1e9)) refuse(`${what} is invalid: a scale factor outside 0.001 to 1e9`);
     if (!(error >= 0 && error < Infinity) || (before && (before.level < level || before.level > level + 1)))
-      refuse(`${what} makes no sense: level ${level}, error ${float(error)}`);
+      refuse(`${what} is invalid: level ${level}, error ${float(error)}`);
     const start = offset, own = sections(some, order, what);
     /** @type {Block} */
     const block = {

@@ -159,6 +159,9 @@ int EXPORT(potr_stream)(
     for (int k = 0; k < biases; k++)
         model->biases[k] = numbers[terms + 2 + k];
     model->alphabet = alphabet;
+    model->by_vectors = 1;
+    for (int token = 0; token < alphabet; token++)
+        model->by_vectors &= sizes[token] <= LARGEST_SIZE;
     return potr_bundles_table(frequencies, (size_t)contexts, (size_t)alphabet, sizes, slots, intervals);
 }
 

@@ -9,7 +9,7 @@ import { BUILDS, DATA, PotrError, decode } from './decoders.mjs';
 
 const GOLDEN = readdirSync(DATA).filter((name) => /^golden.*\.potr$/.test(name)).sort();
 const read = (name) => new Uint8Array(readFileSync(new URL(name, DATA)));
-const ROUNDS = Number(process.env.POTR_FUZZ ?? 40);
+const ROUNDS = Number(process.env.POTR_FUZZ ?? 12);
 
 /** Numbers that are the same every time (mulberry32). */
 function numbers(seed) {

@@ -1,18 +1,74 @@
-"""Scenes from web pages that encode has made: the .potr file in them. Of the rest of a page nothing is looked at."""
+"""Scenes in web pages: a .potr file and what shows it, one file that opens without a server or a network.
+
+What pages are made of, ``page.html`` beside this module, has the viewer, its decoder and their licences in it; ``python
+-m tools.make.web`` builds it from web/. Of a page that is read, nothing but the .potr file is looked at.
+"""
 
 from __future__ import annotations
 
 import base64
 import binascii
+import html
+import json
+import re
 from pathlib import Path
+from typing import Any
 
+from potr_cl.codec.container import MAGIC
 from potr_cl.codec.decoder import decode
+from potr_cl.codec.encoder import code_scene
+from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.declaration import SceneFormat
+from potr_cl.host.atomic_write import replacing
 from potr_cl.model.scene import Scene
+from potr_cl.plain_text import plain
 
+TEMPLATE = Path(__file__).with_name("page.html")
 #: Around the scene in a page.
 BEGIN, END = b'<script id="scene" type="model/potr;base64">', b"</script>"
+_TITLE = "3D scene"
+_LONGEST = 200
+#: Of scenes that are written as they are; the same as encode's.
+_QUALITY = 0.5
+
+
+def check_viewer() -> None:
+    """Raises UsageError if this installation has no viewer to put into pages."""
+    if not TEMPLATE.exists():
+        raise UsageError("this installation cannot make pages: build their viewer by 'python -m tools.make.web'")
+
+
+def page_around(
+    potr: bytes, splats: int, title: str | None = None, author: str | None = None, view: dict[str, Any] | None = None
+) -> list[bytes]:
+    """The pieces of a page.
+
+    Args:
+        potr: the .potr file.
+        splats: in it.
+        title, author: shown on the page, as text.
+        view: where its visitor begins: position, target, up, and fov in degrees.
+    """
+    check_viewer()
+    title, author = (None if text is None else plain(text.strip(), _LONGEST) for text in (title, author))
+    words = [title, author and f"by {author}", f"{splats:,} splats, {len(potr) / 1e6:.2f} MB"]
+    about = {"words": " · ".join(filter(None, words)), "view": view}
+    content = {
+        "title": html.escape(title or _TITLE),
+        "author": html.escape(author or ""),
+        "about": json.dumps(about).replace("<", "\\u003c"),
+    }
+    # In one go: what a title says is not looked at.
+    page = re.sub("@(title|author|about)@", lambda found: content[found[1]], TEMPLATE.read_text("utf-8"))
+    before, after = page.encode().split(b"@scene@" + END)
+    return [before, base64.b64encode(potr), END + after]
+
+
+def sizes(page: bytes) -> dict[str, int]:
+    """Bytes of a page by what they are for, besides the .potr file itself."""
+    viewer = TEMPLATE.stat().st_size if TEMPLATE.exists() else 0
+    return {"viewer": viewer, "as text": len(page) - viewer - len(scene_in(page))}
 
 
 def scene_in(page: bytes) -> bytes:
@@ -41,11 +97,43 @@ def load(path: Path, trust: bool = False) -> Scene:
         raise DataError(f"'{path}': {error}") from None
 
 
+def save(
+    path: Path, scene: Scene, title: str | None = None, author: str | None = None, source: Path | None = None
+) -> None:
+    """Write a page; see :class:`potr_cl.formats.declaration.SceneSaver`.
+
+    Args:
+        path: of the page.
+        scene: to write: all of its splats, rounded as encode rounds them.
+        title, author: as of :func:`page_around`.
+        source: of the scene; the .potr file that it is, or has in it, goes into the page as it is.
+    """
+    check_viewer()
+    potr = None if source is None else _potr_of(source)
+    if potr is None:
+        clean, _ = scene.cleaned()
+        if not len(clean):
+            raise DataError("the scene has no splats")
+        potr = b"".join(code_scene(clean, HyperParameters.from_quality(_QUALITY, "best")).pieces)
+    with replacing(path) as file:
+        for piece in page_around(potr, len(scene), title, author):
+            file.write(piece)
+
+
+def _potr_of(source: Path) -> bytes | None:
+    with open(source, "rb") as file:
+        if file.read(len(MAGIC)) == MAGIC:
+            file.seek(0)
+            return file.read()
+    return scene_in(source.read_bytes()) if source.suffix.lower() in FORMAT.suffixes else None
+
+
 FORMAT = SceneFormat(
     name="web page",
     suffixes=(".html",),
-    note="a .potr file and its viewer in one page, as `encode -o scene.html` makes it",
+    note="a .potr file and its viewer in one page to send: [On the web](web.md)",
     load=load,
-    not_written="pages are made by the command encode, which reads all that convert reads",
+    save=save,
+    choices=("title", "author", "source"),
     packed=True,
 )
