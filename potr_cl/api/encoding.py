@@ -109,8 +109,9 @@ def encode_ladder(
 
 
 def _kind(path: str | os.PathLike[str] | None, choices: EncodeChoices) -> Output | None:
-    version, title, author = (choices.pop(name, None) for name in ("spz_version", "title", "author"))
-    return output_choice(path, choices.pop("to", None), version=version, title=title, author=author)
+    version, to = choices.pop("spz_version", None), choices.pop("to", None)
+    title, author = choices.pop("title", None), choices.pop("author", None)
+    return output_choice(path, to, version=version, title=title, author=author)
 
 
 def _encoder(
