@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from potr_cl.host import memory_left as module
+from potr_cl.host import mapped as module
 from potr_cl.host.mapped import memory_left
 
 
