@@ -38,7 +38,7 @@ class CommandParser(argparse.ArgumentParser):
         self._negative_number_matcher = _NEGATIVE
 
     def parse_known_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
-        """As argparse's, but an option that there is not is told before arguments that are missing.
+        """As argparse's, but an option that there is not is reported before arguments that are missing.
 
         Without its value a misspelt ``--output`` would else be told as a missing one.
         """
