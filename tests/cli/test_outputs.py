@@ -50,8 +50,8 @@ WRONG = {
     [
         ("encode a.ply -o b.gltf", "give it a name that ends in .glb"),
         ("encode a.ply -o b.splat", "encode writes .potr, .spz"),
-        ("encode a.ply -o b.spz --entropy zstd", "--entropy means nothing for .spz files"),
-        ("encode a.ply -o b.ply --sf-dc 9", "--sf-dc means nothing for .ply files"),
+        ("encode a.ply -o b.spz --entropy zstd", "--entropy does not apply to .spz files"),
+        ("encode a.ply -o b.ply --sf-dc 9", "--sf-dc does not apply to .ply files"),
         ("encode a.ply -o b.potr --spz-version 3", "potr_cl has no version to choose"),
         ("encode a.ply -o sub --to sog4", "'.sog4' is no suffix of what encode writes"),
         ("encode a.ply -o b.png", "a name that ends in .potr"),
