@@ -400,7 +400,7 @@ def test_choices_of_stages_by_name() -> None:
         ({"xyzzy": 3}, "unknown option 'xyzzy'"),
         ({"entropy": "gzip"}, "choose one of"),
         ({"one_pass": 1}, "True or False"),
-        ({"keep": "half"}, "no value"),
+        ({"keep": "half"}, "invalid value"),
         ({"keep": 1.5}, "at most 1"),
     ],
 )
