@@ -26,7 +26,7 @@ from potr_cl.pipeline.target import as_bytes
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.fixed_point import FixedPoint
 from potr_cl.stages.pruning.removal import RemovalSweep
-from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.stages.pruning.staleness import SweepOptions
 from potr_cl.stages.stage import Progress
 
 _Totals = list[NDArray[np.int64]]

@@ -109,9 +109,10 @@ def encode_ladder(
 
 
 def _kind(path: str | os.PathLike[str] | None, choices: EncodeChoices) -> Output | None:
-    version, to = choices.pop("spz_version", None), choices.pop("to", None)
-    title, author = choices.pop("title", None), choices.pop("author", None)
-    return output_choice(path, to, version=version, title=title, author=author)
+    version, title = choices.pop("spz_version", None), choices.pop("title", None)
+    return output_choice(
+        path, choices.pop("to", None), version=version, title=title, author=choices.pop("author", None)
+    )
 
 
 def _encoder(

@@ -88,7 +88,7 @@ class Device:
         self._lock = threading.RLock()  # of the two that follow
         self.allocated = 0
         self._unfinished: dict[int, list[list[cl.Buffer]]] = {}  # by thread
-        self._profiling = profiling
+        self.profiling = profiling
         self._build_options = tuple(build_options)
         self._variants = dict(variants or {})
         for path in self._variants.values():
@@ -325,21 +325,33 @@ class Device:
                 cl.enqueue_copy(self.queue, array, buffer, src_offset=start, is_blocking=True)
         return array
 
-    def launch(
-        self,
-        kernel: Kernel,
-        items: tuple[int, ...],
-        group: tuple[int, ...] | None = None,
-        queue: cl.CommandQueue | None = None,
-    ) -> None:
-        """Enqueue ``kernel`` with the arguments it has; in another queue than the device's own if one is given."""
-        try:
-            event = cl.enqueue_nd_range_kernel(queue or self.queue, kernel.handle, items, group)
-        except (cl.Error, MemoryError):
-            with self.errors(f"failed to run {kernel.name}"):
-                raise
-        if self._profiling:
-            self.timings.append((kernel.name, event))
+    def copy(self, target: Any, source: Any, nbytes: int | None = None, to: int = 0, of: int = 0) -> None:
+        """Enqueue a copy from one buffer to another; from or to an array on the host, and wait for it.
+
+        Args:
+            target, source: buffers of this device, or one of them an array.
+            nbytes: how many; None: as many as there are. to, of: where they begin, in buffers.
+
+        Raises:
+            DeviceError: the device failed.
+        """
+        with self.errors("failed while computing"):
+            if isinstance(source, np.ndarray):
+                cl.enqueue_copy(self.queue, target, source, dst_offset=to, is_blocking=True)
+            elif isinstance(target, np.ndarray):
+                cl.enqueue_copy(self.queue, target, source, src_offset=of, is_blocking=True)
+            else:
+                nbytes = min(target.size - to, source.size - of) if nbytes is None else nbytes
+                cl.enqueue_copy(self.queue, target, source, byte_count=nbytes, dst_offset=to, src_offset=of)
+
+    def finish(self) -> None:
+        """Return once all is done that was enqueued.
+
+        Raises:
+            DeviceError: the device failed.
+        """
+        with self.errors("failed while computing"):
+            self.queue.finish()
 
     def stage_times(self) -> dict[str, float]:
         """Seconds each kernel took on the device since :attr:`timings` was last cleared, summed by name.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -104,7 +105,14 @@ class Kernel:
         Raises:
             DeviceError: the device refused it.
         """
-        self._device.launch(self, items, group, queue)
+        device = self._device
+        try:
+            event = cl.enqueue_nd_range_kernel(queue or device.queue, self.handle, items, group)
+        except (cl.Error, MemoryError):
+            with device.errors(f"failed to run {self.name}"):
+                raise
+        if device.profiling:
+            device.timings.append((self.name, event))
 
     def _accepted(self, parameter: Parameter, value: Any) -> Any:
         """The value, if it is of the declared kind."""
@@ -129,14 +137,12 @@ class Kernel:
 class Launches(Protocol):
     """What a kernel needs of the device that it was built for, :class:`potr_cl.opencl.device.Device`."""
 
-    def launch(
-        self, kernel: Kernel, items: tuple[int, ...], group: tuple[int, ...] | None, queue: cl.CommandQueue | None
-    ) -> None:
-        """Enqueue the kernel with the arguments it has.
+    queue: cl.CommandQueue
+    profiling: bool
+    timings: list[tuple[str, cl.Event]]
 
-        Raises:
-            DeviceError: the device refused it.
-        """
+    def errors(self, what: str) -> AbstractContextManager[None]:
+        """Turn pyopencl's errors into a DeviceError that says ``what`` about this device."""
 
 
 @dataclass(frozen=True)

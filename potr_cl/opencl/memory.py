@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 #: Buffers that are too small are replaced by ones so many times as large as needed.
-_MARGIN = 1.25
+MARGIN = 1.25
 
 
 class Owner(ABC):
@@ -112,7 +112,7 @@ class Reused(Memory):
             self._places.append(Scratch(self._device, what))
         place = self._places[self._taken]
         if place.buffer is None or place.nbytes < nbytes:  # also for nothing: kernels want a buffer
-            place.reserve(max(nbytes, min(int(_MARGIN * nbytes), self._device.info.largest_buffer)))
+            place.reserve(max(nbytes, min(int(MARGIN * nbytes), self._device.info.largest_buffer)))
         self._taken += 1
         return place.buffer
 

@@ -1,9 +1,11 @@
-"""If a scene does not fit a device (:func:`on_device`): keep less in its memory, then let a CPU do the work."""
+"""If a scene does not fit a device (:func:`attempts`): keep less in its memory, then let a CPU do the work."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import TypeVar
 
 from potr_cl.errors import DeviceError, DeviceMemoryError
@@ -20,52 +22,83 @@ T = TypeVar("T")
 _LESS = 8
 
 
-def on_device(device: Device, memory: int | None, work: Callable[[Device, int | None], T]) -> tuple[T, Device]:
-    """Do work that may not fit a device. If it does not, repeat it with less memory, and in the end on a CPU.
+@dataclass
+class Attempt:
+    """One way to do work that may not fit a device.
 
-    A warning says so each time.
+    Attributes:
+        device: to do it on. memory: how many bytes of its memory may be filled with views; None: as by default.
+    """
+
+    device: Device
+    memory: int | None
+    _ways: Iterator[tuple[Device, int | None]]
+    next: tuple[Device, int | None] | None = None
+
+    @contextmanager
+    def made(self) -> Iterator[None]:
+        """Do it inside this block, which ends quietly if it did not fit, and there is another way."""
+        try:
+            # A failure may leave buffers behind that nobody owns any more.
+            with self.device.all_or_nothing(), self.device.errors("failed while encoding"):
+                yield
+        except DeviceMemoryError:
+            self.next = next(self._ways, None)
+            if self.next is None:
+                raise
+
+
+def attempts(device: Device, memory: int | None) -> Iterator[Attempt]:
+    """Ways to do work that may not fit a device: if it does not, with less memory, and in the end on a CPU.
+
+    A warning says so each time::
+
+        for attempt in attempts(device, memory):
+            with attempt.made():
+                result = work(attempt.device, attempt.memory)
 
     Args:
         device: the first to be tried.
         memory: how many bytes of its memory may be filled with views; None: :func:`default_memory`.
-        work: called with the device and that number of bytes, and again after a DeviceMemoryError.
-
-    Returns:
-        What ``work`` returned, and the device that it was done on.
 
     Raises:
-        DeviceMemoryError: it fits no device that there is.
+        DeviceMemoryError: the work fits no device that there is.
         DeviceError: the device failed for another reason.
     """
+    ways = _ways(device, memory)
+    way: tuple[Device, int | None] | None = next(ways)
+    while way is not None:
+        attempt = Attempt(*way, ways)
+        yield attempt
+        way = attempt.next
+
+
+def on_device(device: Device, memory: int | None, work: Callable[[Device, int | None], T]) -> tuple[T, Device]:
+    """Do work in one of these ways; returns what ``work`` returned, and the device that it was done on."""
+    for attempt in attempts(device, memory):
+        with attempt.made():
+            return work(attempt.device, attempt.memory), attempt.device
+    raise AssertionError("the last attempt returns or raises")
+
+
+def _ways(device: Device, memory: int | None) -> Iterator[tuple[Device, int | None]]:
+    yield from _with_less(device, memory)
+    if device.info.kind == "cpu":
+        return
     try:
-        return _with_less(device, memory, work), device
-    except DeviceMemoryError:
-        if device.info.kind == "cpu":
-            raise
-        try:
-            other = choose_device("cpu")
-        except DeviceError:
-            other = None
-        if other is None:
-            raise
+        other = choose_device("cpu")
+    except DeviceError:
+        return
     logger.warning("device %s has too little memory for this scene: going on with %s", device.info, other)
-    device = Device(other)
-    return _with_less(device, memory, work), device
+    yield from _with_less(Device(other), memory)
 
 
-def _with_less(device: Device, given: int | None, work: Callable[[Device, int | None], T]) -> T:
-    less = (default_memory(device) if given is None else given) // _LESS
-    for memory, smaller in ((given, less), (less, 0), (0, None)):
-        try:
-            # A failure may leave buffers behind that nobody owns any more.
-            with device.all_or_nothing(), device.errors("failed while encoding"):
-                return work(device, memory)
-        except DeviceMemoryError:
-            if smaller is None:
-                raise
-            megabytes = smaller // 1_000_000
-            logger.warning("device %s ran out of memory: again with %d MB to keep views in", device.info, megabytes)
-    raise AssertionError("the last budget returns or raises")
+def _with_less(device: Device, memory: int | None) -> Iterator[tuple[Device, int | None]]:
+    yield device, memory
+    for less in ((default_memory(device) if memory is None else memory) // _LESS, 0):
+        megabytes = less // 1_000_000
+        logger.warning("device %s ran out of memory: again with %d MB to keep views in", device.info, megabytes)
+        yield device, less
 
 
 #: Bytes of the host's memory for each splat: what is not mapped of the scene (44), and what pruning knows of the splats

@@ -13,7 +13,7 @@ from potr_cl.host.threads import in_background
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encoded import Encoded, SharedOut
-from potr_cl.pipeline.fallback import for_views, on_device
+from potr_cl.pipeline.fallback import Attempt, attempts, for_views, on_device
 from potr_cl.pipeline.fit_trial import Trial, only_if_it_pays
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.stopwatch import Stopwatch
@@ -68,11 +68,27 @@ class Run:
         """
         state = self._guarded(state)
         for stage in self._options.stages:
-            if only is None or type(stage) in only:
-                after = as_they_were(self._one(stage, state))
-                # What is before it is kept no longer than this: colours of a large scene take gigabytes.
-                state = self._fit_that_pays(state, after) if isinstance(stage, Fit) else after
+            if (only is not None and type(stage) not in only) or not self._is_wanted(stage, state):
+                continue
+            bench = self._bench(stage, state)
+            if stage.needs_views:
+                for attempt in attempts(self.device or self._given or Device(), self._options.memory):
+                    with attempt.made():
+                        after = stage.run(state, self._on(attempt, bench, state))
+                self.device = attempt.device
+            else:
+                after = stage.run(state, bench)
+            after = as_they_were(after)
+            # What is before it is kept no longer than this: colours of a large scene take gigabytes.
+            state = self._fit_that_pays(state, after) if isinstance(stage, Fit) else after
         return state
+
+    def _is_wanted(self, stage: Stage, state: State) -> bool:
+        if not stage.asked_for or not stage.needs_views:
+            return stage.asked_for
+        if not state.views or not stage.looks_at(state.scene):
+            return False
+        return not stage.serves_others or self._options.look_at_views(state.scene)
 
     def _guarded(self, state: State) -> State:
         """The state that knows what no view has resolved, where nothing may be lost of that."""
@@ -110,9 +126,9 @@ class Run:
         self._watch(Fit.name, 1.0)
         return state
 
-    def _one(self, stage: Stage, state: State) -> State:
+    def _bench(self, stage: Stage, state: State) -> Workbench:
         options = as_done(self._options, state)
-        bench = Workbench(
+        return Workbench(
             priced(options.parameters, state),
             memory=options.memory,
             background=options.background,
@@ -125,23 +141,12 @@ class Run:
             kept=self._kept,
             photographs=next((each.ground_truth for each in options.stages if isinstance(each, Refit)), None),
         )
-        if not stage.asked_for:
-            return state
-        if not stage.needs_views:
-            return stage.run(state, bench)
-        if not state.views or not stage.looks_at(state.scene):
-            return state
-        if stage.serves_others and not options.look_at_views(state.scene):
-            return state
 
-        def work(device: Device, memory: int | None) -> State:
-            pool = self._pool if self._pool is not None and device is self._pool.first else None
-            room = for_views(device, memory, len(state.source))
-            return stage.run(state, dataclasses.replace(bench, device=device, memory=room, pool=pool))
-
-        device = self.device or self._given or Device()
-        state, self.device = on_device(device, options.memory, work)
-        return state
+    def _on(self, attempt: Attempt, bench: Workbench, state: State) -> Workbench:
+        device = attempt.device
+        pool = self._pool if self._pool is not None and device is self._pool.first else None
+        room = for_views(device, attempt.memory, len(state.source))
+        return dataclasses.replace(bench, device=device, memory=room, pool=pool)
 
     def _interludes(self, stage: Stage, state: State) -> tuple[Interlude, ...]:
         """What other stages want done while this one removes splats."""

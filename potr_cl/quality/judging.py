@@ -6,18 +6,15 @@ on every device of a kind. So it makes no difference who judges which view.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import Any
 
 import pyopencl as cl
 
-from potr_cl.errors import DeviceError
 from potr_cl.formats.images import Colour
 from potr_cl.host.threads import Ahead
 from potr_cl.model.camera import Camera
@@ -37,6 +34,7 @@ from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
 from potr_cl.views.pictures import SeenRasterizer, groups_worth_it, rasterizer_of
 from potr_cl.views.targets import RenderedTargets, Room, TargetPictures
 from potr_cl.workers.dealing import shares
+from potr_cl.workers.helping import Helping
 from potr_cl.workers.parts import Each, Parts
 from potr_cl.workers.pool import Part, Pool
 
@@ -46,10 +44,6 @@ CACHED_PICTURES = 1 << 30
 _SENT_ANYWAY = 1 << 28
 #: About how often several devices meet while they judge, so that one can tell how far they are.
 _MEETINGS = 16
-
-_log = logging.getLogger("potr_cl")
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -232,9 +226,8 @@ class Judging(Owner):
         elif isinstance(here, Scene):
             self._groups = groups_worth_it(device, here, views, looks.rules.near)
         self._own = JudgingPart(device, None, here, looks, self._views, self._groups)
-        self._parts: Parts | None = None
+        self._helping, self._asked_for = Helping(device, "judge"), False
         self._part_of: dict[int, int] = {}  # who has a view; the others are this device's
-        self._left = ExitStack()
 
     def figures(
         self,
@@ -304,19 +297,19 @@ class Judging(Owner):
         with ExitStack() as stack:
             self._take(stack, candidate)
             sent = self._for_others(candidate, coded)
-            parts = None if sent is None else self._open_parts()
+            helping, parts = self._helping, None if sent is None else self._open_parts()
             if parts is not None:
-                try:
-                    _asked(partial(parts.begin, "take", sent, anew=True))
-                    for mine, theirs in self._meetings(numbers, len(parts)):
-                        pending = _asked(partial(parts.begin, command, Each(theirs), *args, logged=False))
-                        own(mine)
-                        for some, results in zip(theirs, _asked(pending.results), strict=True):
-                            found.update(zip(some, results, strict=True))
-                            told(len(some))
-                    _asked(partial(parts.begin, "forget", anew=True)).results()
-                except _NobodyElse as lost:
-                    self._lose_parts(lost.error)
+                helping.begin("take", sent, anew=True)
+                for mine, theirs in self._meetings(numbers, len(parts)):
+                    pending = helping.begin(command, Each(theirs), *args, logged=False)
+                    own(mine)
+                    results = helping.results(pending)
+                    if results is None:
+                        break
+                    for some, of_these in zip(theirs, results, strict=True):
+                        found.update(zip(some, of_these, strict=True))
+                        told(len(some))
+                helping.results(helping.begin("forget", anew=True))
             # All of them, if nobody helps; or what those who are lost have left.
             if left := [number for number in numbers if number not in found]:
                 own(left)
@@ -347,23 +340,19 @@ class Judging(Owner):
     def _open_parts(self) -> Parts | None:
         """The others' parts; None: they are not worth it, or lost."""
         pool = self._pool
-        if pool is None or self._parts is not None:
-            return self._parts
+        if pool is None or self._asked_for:
+            return self._helping.parts
+        self._asked_for = True
         shared = self._shared(pool)
-        if shared is None:
-            self._pool = None
-            return None
-        try:
+
+        def opened(stack: ExitStack) -> Parts | None:
             dealt = shares(pool, len(self._views))
-            thing = self._left.enter_context(pool.shared(shared))
+            self._part_of = {number: place for place, numbers in enumerate(dealt.others) for number in numbers}
+            thing = stack.enter_context(pool.shared(shared))
             given = [(thing, self._looks, self._views, self._groups)] * len(dealt.others)
-            if given:
-                self._parts = self._left.enter_context(Parts(pool, JudgingPart, given, names=dealt.names))
-        except DeviceError as error:
-            self._lose_parts(error)
-            return None
-        self._part_of = {number: place for place, numbers in enumerate(dealt.others) for number in numbers}
-        return self._parts
+            return stack.enter_context(Parts(pool, JudgingPart, given, names=dealt.names)) if given else None
+
+        return None if shared is None else self._helping.open(opened)
 
     def _shared(self, pool: Pool) -> Scene | KeptScene | Carried | None:
         """What other devices are given of the uncompressed scene; None: they had better do without."""
@@ -380,44 +369,12 @@ class Judging(Owner):
         there = pool.has(scene) or scene.nbytes <= _SENT_ANYWAY
         return scene if there or self._anyway else None
 
-    def _lose_parts(self, error: DeviceError) -> None:
-        # What else the line says is how to mend it, which nobody has to.
-        _log.warning("no worker can judge (%s); using %s instead", str(error).split(": ")[0], self.device.info)
-        self._parts, self._pool, self._part_of = None, None, {}
-        abandoned = _Abandoned()
-        self._left.__exit__(type(abandoned), abandoned, None)
-
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._parts = None
         self._own.close()
-        self._left.__exit__(kind, error, trace)  # after Ctrl-C nobody is waited for
+        self._helping.__exit__(kind, error, trace)
 
     def close(self) -> None:
         """Give all device memory back, here and elsewhere."""
         self.__exit__(None, None, None)
-
-
-class _Abandoned(BaseException):
-    """Has parts left without waiting for workers that may stand still."""
-
-
-class _NobodyElse(Exception):
-    """All others are lost."""
-
-    def __init__(self, error: DeviceError) -> None:
-        super().__init__(str(error))
-        self.error = error
-
-
-def _asked(call: Callable[[], T]) -> T:
-    """What the others answer.
-
-    Raises:
-        _NobodyElse: none of them can.
-    """
-    try:
-        return call()
-    except DeviceError as error:
-        raise _NobodyElse(error) from None

@@ -110,7 +110,7 @@ class ViewSet(Owner):
             Whether it has.
         """
         (view,) = self.views
-        if (view.columns, view.rows) != _tiles(camera):
+        if (view.columns, view.rows) != tile_grid(camera):
             return False
         if camera is not view.camera:
             view.camera = camera
@@ -124,7 +124,7 @@ class ViewSet(Owner):
         Returns:
             Whether all have.
         """
-        if [(view.columns, view.rows) for view in self.views] != [_tiles(camera) for camera in cameras]:
+        if [(view.columns, view.rows) for view in self.views] != [tile_grid(camera) for camera in cameras]:
             return False
         for view, camera in zip(self.views, cameras, strict=True):
             view.camera = camera
@@ -198,7 +198,7 @@ class View(Owner):
     def __init__(self, owner: ViewSet, camera: Camera) -> None:
         self.owner = owner
         self.camera = camera
-        self.columns, self.rows = _tiles(camera)
+        self.columns, self.rows = tile_grid(camera)
         if max(self.columns, self.rows) > _MOST_TILES:
             raise UsageError(
                 f"view '{camera.name}': {camera.width} x {camera.height} pixels are more than {_MOST_TILES * TILE} "
@@ -257,10 +257,10 @@ def camera_struct(camera: Camera) -> NDArray[Any]:
     struct["limit_x"] = 1.3 * camera.width / (2 * camera.fx)
     struct["limit_y"] = 1.3 * camera.height / (2 * camera.fy)
     struct["width"], struct["height"] = camera.width, camera.height
-    struct["columns"], struct["rows"] = _tiles(camera)
+    struct["columns"], struct["rows"] = tile_grid(camera)
     return struct
 
 
-def _tiles(camera: Camera) -> tuple[int, int]:
+def tile_grid(camera: Camera) -> tuple[int, int]:
     """Columns and rows of tiles that cover the image."""
     return -(-camera.width // TILE), -(-camera.height // TILE)

@@ -16,7 +16,7 @@ from potr_cl.model.virtual_cameras import standpoints
 from potr_cl.stages.compaction.ridge import ColourModel, CompactionOptions, Compactor, Weighting
 from potr_cl.stages.compaction.view_weights import ViewWeights
 from potr_cl.stages.pruning.measured import Measured, measurement
-from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.stages.pruning.staleness import SweepOptions
 from potr_cl.stages.stage import Flag, Importances, Interlude, Stage, State, Workbench, option
 
 

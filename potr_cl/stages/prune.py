@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -16,11 +15,11 @@ from potr_cl.raster.kept_scene import lying_on
 from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.raster.surely_seen import surely_seen
 from potr_cl.stages.guarded import Unresolved
-from potr_cl.stages.pruning.measured import Measured, Removal, measurement
+from potr_cl.stages.pruning.measured import Measured, measurement
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import LARGEST_LIMIT, RemovalSweep
 from potr_cl.stages.pruning.schedule import Course, Pruned, PruningOptions
-from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.stages.pruning.staleness import SweepOptions
 from potr_cl.stages.pruning.unseen import (
     CHOICES,
     Unseen,
@@ -53,7 +52,7 @@ class Prune(Stage):
             (:mod:`potr_cl.model.unseen`). With ``keep`` or ``count`` they go first in any case. "protect", and "keep"
             where views were placed: what no view has resolved stays as it is (:mod:`potr_cl.placement.guard`).
         tolerance, turns, transmittance_threshold: of the measurements
-            (:class:`potr_cl.stages.pruning.sweep_options.SweepOptions`).
+            (:class:`potr_cl.stages.pruning.staleness.SweepOptions`).
 
     Raises:
         UsageError: a value is out of range.
@@ -254,7 +253,7 @@ class Prune(Stage):
         bench.progress("prepare views", 0.0)
         with measurement(state, bench, self._sweep_options(bench.memory), sights, spared, dealt, seen) as removal:
             course = _Course(state, removal, seen)
-            ready = _views_that_stay(removal) >= (1 - _MADE_AGAIN) * len(state.views)
+            ready = removal.resident_views >= (1 - _MADE_AGAIN) * len(state.views)
 
             def after_iteration(iteration: int) -> None:
                 while waiting and iteration + 1 >= waiting[0].after:
@@ -304,10 +303,6 @@ def part_of_time(iterations: float, stays: bool) -> float:
     return _FIRST + (1 - _FIRST) * (1 - (1 - iterations) ** _FEWER) if stays else iterations
 
 
-def _views_that_stay(removal: Removal) -> float:
-    return removal.resident_views if isinstance(removal, RemovalSweep) else math.inf  # others have them
-
-
 def _dealt(state: State, seen: NDArray[np.int64] | None, pool: Pool, sights: Visibility) -> ViewShares:
     """The views for a pool's workers, and which of the source's splats each gets, for this stage and others."""
     workers = pool.workers()
@@ -329,7 +324,7 @@ class _Course:
         sh: (N, M, 3) the colours that all splats of the state's scene have by now.
     """
 
-    def __init__(self, state: State, removal: Removal, seen: NDArray[np.int64] | None = None) -> None:
+    def __init__(self, state: State, removal: RemovalSweep, seen: NDArray[np.int64] | None = None) -> None:
         self._state, self._removal, self._seen = state, removal, seen
         self.sh = state.scene.sh
 

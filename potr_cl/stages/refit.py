@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -142,34 +144,6 @@ class Refit(Stage):
         on_grid = bench.output.on_grid(bench.request(state))
         # What has been fitted to photographs already is what the colours should show again once all else is rounded.
         folder = self.ground_truth if state.truth is None else None
-        fits = 1 if folder is None else 2
-
-        def fitted(views: Sequence[Camera], targets: Targets, number: int) -> tuple[Refitted, Rounded]:
-            geometry: Rounded | None = None
-
-            def progress(done: int, steps: int) -> None:
-                bench.progress("refit", (number + done / steps) / fits)
-
-            def fix_ac(sh: FloatArray, refit: ColourRefit) -> FloatArray:
-                nonlocal geometry
-                request = replace(bench.request(state), blocks=refit.blocks)
-                geometry, fixed = bench.output.fix_ac(rounded.result(), sh, refit.worth(), request)
-                return fixed
-
-            def colour_grid(effects: FloatArray) -> ColourGrid:
-                nonlocal geometry
-                effects = as_important(effects, state)
-                geometry, grid = bench.output.colour_grid(rounded.result(), effects, bench.request(state))
-                return grid
-
-            found = refit_colours(
-                bench.opened, decoded, views, targets, options, active, bench.background, progress,
-                fix_ac=None if on_grid or not bench.output.fixes_ac else fix_ac,
-                help_from=help_from if number == 0 else None,
-                colour_grid=colour_grid if on_grid else None,
-            )  # fmt: skip
-            return found, rounded.result() if geometry is None else geometry
-
         with ExitStack() as stack:
             stack.callback(bench.progress, "refit", 1.0)
             ahead = stack.enter_context(_pictures_ahead(state, bench))
@@ -186,26 +160,61 @@ class Refit(Stage):
                 goal = bench.shared_source(state) if state.truth is None else state.truth
                 help_from = HelpFrom(bench.pool, goal if ahead is None else ahead)
             # With photographs nobody helps: these lie where the master reads them.
-            refitted, geometry = fitted(state.views, pictures, 0)
-            choice = None
+            fits: list[tuple[Sequence[Camera], Targets, HelpFrom | None]] = [(state.views, pictures, help_from)]
             if folder is not None:
                 given = state.views[: len(state.views) - state.added]
                 photographs = GroundTruth(folder, given, bench.background)
                 fit_to, judging = hold_out(photographs.of(given))
                 # Nobody photographed added views. Renders of them beside photographs would ask for colours that leap
                 # from one view to the next, and SH can do that: held-out photographs were matched 7 to 13 dB worse.
-                targets = PhotographTargets(bench.opened, photographs, fit_to)
-                to_photographs, its_geometry = fitted(fit_to, targets, 1)
+                fits.append((fit_to, PhotographTargets(bench.opened, photographs, fit_to), None))
+            found: list[tuple[Refitted, Rounded]] = []
+            for views, targets, helping in fits:
+                file = _FileToCome(state, bench, rounded)
+                refitted = refit_colours(
+                    bench.opened, decoded, views, targets, options, active, bench.background,
+                    partial(_told, bench, len(found), len(fits)),
+                    fix_ac=None if on_grid or not bench.output.fixes_ac else file.fix_ac,
+                    help_from=helping,
+                    colour_grid=file.colour_grid if on_grid else None,
+                )  # fmt: skip
+                found.append((refitted, rounded.result() if file.geometry is None else file.geometry))
+            (refitted, geometry), choice = found[0], None
+            if folder is not None:
                 psnrs = []
-                for each in (to_photographs, refitted):
+                for each, _ in reversed(found):
                     shown = replace(decoded.result(), sh=each.sh)
                     with Rasterizer(bench.opened, shown, background=bench.background) as judged:
                         psnrs.append(photographs.psnr(judged, judging))
                 choice = PhotographChoice(len(judging), *psnrs)
                 if choice.kept:
-                    refitted, geometry = to_photographs, its_geometry
+                    refitted, geometry = found[1]
         then = replace(state.recoloured(refitted.sh), geometry=geometry).having_learnt(refitted=refitted)
         return then if choice is None else then.having_learnt(photographs=choice)
+
+
+@dataclass
+class _FileToCome:
+    """What a kind of file makes of colours, with the geometry that goes with them then."""
+
+    state: State
+    bench: Workbench
+    rounded: Future[Rounded]
+    geometry: Rounded | None = None
+
+    def fix_ac(self, sh: FloatArray, refit: ColourRefit) -> FloatArray:
+        request = replace(self.bench.request(self.state), blocks=refit.blocks)
+        self.geometry, fixed = self.bench.output.fix_ac(self.rounded.result(), sh, refit.worth(), request)
+        return fixed
+
+    def colour_grid(self, effects: FloatArray) -> ColourGrid:
+        effects, request = as_important(effects, self.state), self.bench.request(self.state)
+        self.geometry, grid = self.bench.output.colour_grid(self.rounded.result(), effects, request)
+        return grid
+
+
+def _told(bench: Workbench, number: int, fits: int, done: int, steps: int) -> None:
+    bench.progress("refit", (number + done / steps) / fits)
 
 
 def _rounded(state: State, bench: Workbench) -> Rounded:

@@ -15,7 +15,7 @@ from typing import Protocol
 from potr_cl.model.camera import Camera
 from potr_cl.opencl.device import Device
 from potr_cl.raster.view_cache import ViewCache
-from potr_cl.raster.view_set import TILE
+from potr_cl.raster.view_set import tile_grid
 from potr_cl.views.groups import ViewGroup, work
 
 #: Part of the device's memory that the views may take unless the caller sets a budget. A CPU's is that of the host: the
@@ -58,7 +58,7 @@ def target_bytes(camera: Camera) -> int:
 
 def tiles_of(camera: Camera) -> int:
     """How many tiles a view has."""
-    return -(-camera.width // TILE) * -(-camera.height // TILE)
+    return math.prod(tile_grid(camera))
 
 
 def drawn_bytes(splats: int, intersections: int, camera: Camera) -> int:

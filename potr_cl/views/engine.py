@@ -24,9 +24,10 @@ import pyopencl as cl
 from potr_cl.errors import DeviceMemoryError
 from potr_cl.model.camera import Camera
 from potr_cl.opencl.device import Device
-from potr_cl.opencl.memory import Memory, Owner, Reused
+from potr_cl.opencl.memory import MARGIN, Memory, Owner, Reused
 from potr_cl.raster.view_cache import GEOMETRY, ViewCache
 from potr_cl.raster.view_set import ViewSet
+from potr_cl.views.budget import target_bytes
 from potr_cl.views.groups import ViewGroup
 from potr_cl.views.plan import ViewPlan
 from potr_cl.views.subsets import Left, SplatSource, Subset
@@ -112,6 +113,8 @@ class ViewEngine(Owner, Generic[W]):
     Attributes:
         resident, streamed: see above.
         idle: numbers of views that draw nothing.
+        passing: bytes that a set of streamed views takes while it is there, at most, where they take turns in the same
+            memory. Others may have what that leaves.
 
     Raises:
         DeviceError: a view does not fit the device.
@@ -131,6 +134,7 @@ class ViewEngine(Owner, Generic[W]):
         self.most_views = most_views
         self.resident: list[Ready[W]] = []
         self.idle = list(plan.idle)
+        self.passing = 0
         #: One streamed group after the other takes its splats and its views from these.
         self._splats, self._views = source.streams_in(), source.streams_in()
         others: list[ViewGroup] = []
@@ -156,8 +160,7 @@ class ViewEngine(Owner, Generic[W]):
                         others.append(group)
                     done += len(group.numbers)
                     said(len(group.numbers))
-                with self.device.errors("failed while computing"):
-                    self.device.queue.finish()
+                self.device.finish()
             source.forget_scratch()
             self.streamed = plan.together(others)
             self._owned = owned.pop_all()
@@ -210,12 +213,12 @@ class ViewEngine(Owner, Generic[W]):
         found: list[Ready[W]] = []
         most, first, numbers = max(group.most, 1), 0, group.numbers
         if cache is not None and not group.most:
-            largest = 12 * max(self.cameras[number].width * self.cameras[number].height for number in numbers)
+            largest = max(target_bytes(self.cameras[number]) for number in numbers)
             most = cache.most_views(self.most_views, GEOMETRY * subset.rasterizer.stride + largest)
         try:
             with subset.rasterizer.preparing_many():
                 while first < len(numbers):
-                    some = numbers[first : first + most]
+                    some, there = numbers[first : first + most], self.device.allocated
                     try:
                         work, views = self._prepare(some, subset)
                     except DeviceMemoryError:
@@ -235,6 +238,8 @@ class ViewEngine(Owner, Generic[W]):
                     if fits:
                         found.append(Ready(some, subset, views, work, cache))
                     else:
+                        named = 0 if subset.numbers is None else subset.numbers.size
+                        self.passing = max(self.passing, int(MARGIN * (self.device.allocated - there + named)))
                         work.close()
                     first += len(some)
                     said(first)

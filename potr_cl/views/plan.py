@@ -71,6 +71,11 @@ class ViewPlan:
         return sorted([*self.idle, *(number for group in self.groups for number in group.numbers)])
 
 
+def none() -> ViewPlan:
+    """No view: others look at all."""
+    return ViewPlan((), Foretold(0))
+
+
 def whole(numbers: Sequence[int], splats: int, memory: int) -> ViewPlan:
     """All views with all splats."""
     group = ViewGroup(tuple(numbers), splats)

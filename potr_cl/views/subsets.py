@@ -138,6 +138,24 @@ class SplatSource(Owner):
         """Give all device memory back that is its own."""
 
 
+class NoSplats(SplatSource):
+    """Of a device that looks at no view itself.
+
+    Args:
+        device: the device.
+        splats: N.
+    """
+
+    def __init__(self, device: Device, splats: int) -> None:
+        self.device, self.splats, self.stride = device, splats, stride_of(splats)
+
+    def open(self, stack: ExitStack, memory: Memory, group: ViewGroup, left: Left | None = None) -> None:
+        return None
+
+    def replace_sh(self, sh: FloatArray) -> None:
+        """There is nothing to colour."""
+
+
 class WholeScene(SplatSource):
     """All splats for all groups.
 
@@ -226,15 +244,14 @@ class NamedSplats(_Parted):
             self._foreseen = picks, {group: place for place, group in enumerate(groups)}
             try:
                 yield
-                with self.device.errors("failed while computing"):
-                    self.device.queue.finish()
+                self.device.finish()
             finally:
                 self._foreseen = None
 
     def replace_sh(self, sh: FloatArray) -> None:
         former, self._other_sh = self._other_sh, self._whole.other_sh(self._memory, sh)
         if former is not None:
-            self.device.queue.finish()
+            self.device.finish()
             self._memory.free(former)
 
     def close(self) -> None:
@@ -345,5 +362,5 @@ class CopiedSplats(_Parted):
 
     def rest(self, subset: Subset) -> None:
         if subset.scene is not None:
-            self.device.queue.finish()
+            self.device.finish()
             subset.scene.rest()

@@ -2,6 +2,7 @@
 
 - pool.py says what a pool of workers is: each has a device, and can be lost;
 - parts.py has a work's parts, made on the workers, told what changes, and made again elsewhere when a worker is lost;
+- helping.py goes on without them where all are lost and the master can do their work;
 - host.py is the pool of several devices of this computer, cluster.py that of a Dask cluster;
 - dealing.py shares views out.
 """

@@ -16,6 +16,7 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.coefficients import Coefficients, Vector
 from potr_cl.stages.refitting.colour_refit import ColourRefit
+from potr_cl.stages.refitting.layout import Ridge
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
 from potr_cl.views.targets import RenderedTargets, Targets
@@ -95,8 +96,7 @@ class Linearised:
         vectors = self._refit.coefficients
         x, result = vectors.vector(), vectors.vector()
         vectors.write(x, direction.transpose(1, 2, 0).reshape(-1, len(direction)))
-        vectors.zero(result)
-        self._refit.colour_map.normal(x, self._at, result, part=part)
+        self._refit.colour_map.normal(x, result, self._at, Ridge(0.0, 0.0, 0.0), part=part)
         return as_rows(vectors, result)
 
     def __enter__(self) -> Linearised:
@@ -113,8 +113,7 @@ class Pictures:
         self.device, self.pictures = device, pictures
         self.buffers = [device.upload(np.ascontiguousarray(p, np.float32), "a picture") for p in pictures]
 
-    def into(self, numbers: Sequence[int], buffer: cl.Buffer) -> None:
-        start = 0
+    def into(self, numbers: Sequence[int], buffer: cl.Buffer, start: int = 0) -> None:
         for number in numbers:
             picture = self.buffers[number]
             cl.enqueue_copy(self.device.queue, buffer, picture, byte_count=picture.size, dst_offset=start)

@@ -11,8 +11,8 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.stages.between.room import room_for
-from potr_cl.stages.pruning.planned import planned_sweep
-from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.stages.pruning.removal import planned_sweep
+from potr_cl.stages.pruning.staleness import SweepOptions
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.views import visibility
 from potr_cl.views.visibility import Visibility

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from potr_cl.stages.refitting.conjugate_gradients import ConjugateGradients
+from potr_cl.stages.refitting.solver import ConjugateGradients, System
 
 
 class ArrayVectors:
@@ -27,17 +27,16 @@ class ArrayVectors:
         return float(x @ y)
 
 
-class MatrixSystem:
+def system_of(matrix):
     """H is a matrix, preconditioned by its diagonal."""
 
-    def __init__(self, matrix):
-        self.matrix = matrix
+    def precondition(residual, result):
+        result[:] = residual / np.abs(np.diag(matrix))
 
-    def precondition(self, residual, result):
-        result[:] = residual / np.abs(np.diag(self.matrix))
+    def product(direction, result):
+        result[:] = matrix @ direction
 
-    def product(self, direction, result):
-        result[:] = self.matrix @ direction
+    return System(product, precondition)
 
 
 def least_squares(seed=0, rows=20, size=8):
@@ -51,7 +50,7 @@ def descend(matrix, b, constant, steps, gain=0.0):
     """The solution, the steps, and what was told."""
     x, told = np.zeros(len(b)), []
     gradients = ConjugateGradients(ArrayVectors(len(b)))
-    done = gradients.descend(MatrixSystem(matrix), x, b.copy(), constant, steps, gain, told.append)
+    done = gradients.descend(system_of(matrix), x, b.copy(), constant, steps, gain, told.append)
     return x, done, told
 
 

@@ -19,13 +19,12 @@ from potr_cl.raster import kept_scene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers, gathered, uploaded
 from potr_cl.stages import prune
-from potr_cl.stages.pruning import planned
+from potr_cl.stages.pruning import removal
 from potr_cl.stages.pruning.measured import measurement
 from potr_cl.stages.pruning.on_device import prune_scene
-from potr_cl.stages.pruning.planned import planned_sweep
-from potr_cl.stages.pruning.removal import RemovalSweep
+from potr_cl.stages.pruning.removal import RemovalSweep, planned_sweep
 from potr_cl.stages.pruning.schedule import PruningOptions
-from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.stages.pruning.staleness import SweepOptions
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.views import budget, visibility
 from potr_cl.views.shares import ViewShares
@@ -276,8 +275,8 @@ def test_a_whole_encode_has_the_same_bytes(kernels, grouping, monkeypatch):
     whole = encode(scene, cameras, options, device=device)
     made = []
     name = grouping.replace(" ", "_")
-    plan = getattr(planned.plans, name)
-    monkeypatch.setattr(planned.plans, name, lambda *given: made.append(plan(*given)) or made[-1])
+    plan = getattr(removal.plans, name)
+    monkeypatch.setattr(removal.plans, name, lambda *given: made.append(plan(*given)) or made[-1])
     monkeypatch.setattr(visibility, "LEAST_SPLATS", 1)
     if grouping == "by cluster":
         monkeypatch.setattr(SweepOptions, "only_by_tolerance", property(lambda options: False))

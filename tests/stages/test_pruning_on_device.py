@@ -11,8 +11,8 @@ from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
-from potr_cl.stages.pruning.schedule import PruningOptions, SmoothedEffects, choose, prune
-from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.stages.pruning.schedule import PruningOptions, Smoothed, choose, prune
+from potr_cl.stages.pruning.staleness import SweepOptions
 from tests.devices import KERNELS, open_device
 from tests.reference.scenes import ring_of_cameras, visible_scene
 
@@ -63,16 +63,17 @@ def test_each_iteration_spends_its_budget(gpu, plush_excerpt, cameras):
     """Against the rules themselves: what went scores less than what stayed, and just reaches the budget."""
     found, _ = run(gpu, plush_excerpt, cameras, OPTIONS)
     with Rasterizer(gpu, plush_excerpt) as rasterizer, RemovalSweep(rasterizer, cameras, SweepOptions()) as removal:
-        smoothed = SmoothedEffects(removal, OPTIONS.decay)
+        smoothed = Smoothed(OPTIONS.decay)
         alive = np.arange(len(plush_excerpt))
         start = 0
         for iteration in range(3):
-            delta_mse, importance = smoothed.measure()
+            newest, importance = removal.measure()
+            delta_mse = smoothed.with_(newest)
             gone = found.order[start : start + (found.iteration_of == iteration).sum()]
             expected = choose(delta_mse, importance, alive, OPTIONS.iterations - iteration, OPTIONS)
             assert abs(len(gone) - len(expected)) <= 1
             assert len(np.setxor1d(gone, expected)) <= 1
-            smoothed.remove(gone)
+            removal.remove(gone)
             alive = np.setdiff1d(alive, gone)
             start += len(gone)
 

@@ -21,7 +21,7 @@ from potr_cl.stages.refitting.layout import Layout
 from potr_cl.stages.refitting.own_views import OwnViews
 from potr_cl.stages.refitting.refit import active_coefficients, refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
-from potr_cl.stages.refitting.sweep import Sweep
+from potr_cl.stages.refitting.view_kernels import Sweep
 from tests.reference.refit import LENGTHS, selection, to_rgb, to_ycocg
 from tests.reference.refit_cases import Case, Linearised, Pictures
 from tests.reference.scenes import ring_of_cameras, tilted_camera, visible_scene

@@ -27,7 +27,7 @@ from potr_cl.workers.host import HostPool
 from tests.cases.elsewhere import ElsewherePool
 from tests.cases.streets import street
 from tests.devices import open_device
-from tests.reference.refit_cases import Case, Linearised
+from tests.reference.refit_cases import Case, Linearised, Pictures
 from tests.reference.scenes import ring_of_cameras, visible_scene
 
 #: Slices of 256 splats, the fewest that there can be.
@@ -467,3 +467,30 @@ def test_the_same_file_of_views_with_splats_of_their_own(device, picked):
     with HostPool([device, open_device(device.family)]) as pool:
         assert encode(scene, cameras, options, device=device, pool=pool).data == wanted.data
     assert len(made) == 2
+
+
+@pytest.mark.parametrize("own_splats", [False, True])
+def test_pictures_are_kept_in_what_streamed_views_leave(device, picked, own_splats, monkeypatch):
+    """Streamed views take their memory last: what is given for less than one of them is not filled with pictures."""
+    scene, cameras = crowded(800)
+    picked(own_splats)
+    peaks = []
+    with Case(device, scene, scene, cameras) as case, Pictures(device, case.pictures) as pictures:
+        with ColourRefit(device, scene, cameras, memory=10**9) as refit:
+            every = int(10**9 - refit.colour_map.own.room)
+        for memory in (0, every // 20):
+            with monkeypatch.context() as patch, ColourRefit(device, scene, cameras, memory=memory) as refit:
+                x, result = (refit.coefficients.vector() for _ in range(2))
+                for each in (x, result):
+                    refit.coefficients.zero(each)
+                taken, allocate = [], device.allocate
+
+                def noted(*given, allocate=allocate, taken=taken):
+                    buffer = allocate(*given)
+                    taken.append(device.allocated)
+                    return buffer
+
+                patch.setattr(device, "allocate", noted)
+                refit.colour_map.gradient(x, pictures, result)
+                peaks.append(max(taken))
+    assert peaks[0] == peaks[1]

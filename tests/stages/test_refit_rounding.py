@@ -80,9 +80,9 @@ class Counted:
     def __init__(self, targets) -> None:
         self.targets, self.asked = targets, 0
 
-    def into(self, numbers, buffer) -> None:
+    def into(self, numbers, buffer, start=0) -> None:
         self.asked += len(numbers)
-        self.targets.into(numbers, buffer)
+        self.targets.into(numbers, buffer, start)
 
 
 @pytest.mark.one_runtime

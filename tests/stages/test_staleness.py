@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from potr_cl.stages.pruning.staleness import TileSchedule, by_set
-from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.stages.pruning.staleness import SweepOptions, TileSchedule, by_set
 
 #: Two views of 3 and 2 tiles among others that are not cached.
 VIEWS = [(1, 3), (4, 2)]

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pyopencl as cl
 import pytest
 
+from potr_cl.errors import DeviceError
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.source import kernel_source
+from potr_cl.stages.pruning.resident import Queues
 from potr_cl.stages.pruning.survivors import SplatState, Survivors
 
 REMOVED, ALIVE, JUST_REMOVED = SplatState
@@ -99,3 +102,23 @@ def test_a_mark_after_a_removal_by_the_host(device, survivors):
     survivors.mark(np.array([0b10], np.uint8))
     survivors.marked_by_device()
     assert survivors.alive.tolist() == [False, False, True, True, True]
+
+
+def refusing(*_args, **_more):
+    raise cl.RuntimeError("clEnqueueWriteBuffer failed: INVALID_MEM_OBJECT")
+
+
+def test_what_the_driver_refuses_is_told_in_one_line(survivors, monkeypatch):
+    monkeypatch.setattr(cl, "enqueue_copy", refusing)
+    with pytest.raises(DeviceError, match="INVALID_MEM_OBJECT"):
+        survivors.remove(np.array([1]))
+    monkeypatch.undo()
+
+
+@pytest.mark.parametrize("refused", ["finish", "flush"])
+def test_so_is_what_queues_refuse(device, refused):
+    queue = SimpleNamespace(finish=lambda: None, flush=lambda: None)
+    setattr(queue, refused, refusing)
+    failing = SimpleNamespace(queue=queue, errors=device.errors, finish=lambda: Device.finish(failing))
+    with pytest.raises(DeviceError, match="INVALID_MEM_OBJECT"):
+        list(Queues(failing, 1).dealt([1, 2]))

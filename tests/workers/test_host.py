@@ -19,8 +19,8 @@ from potr_cl.opencl.memory import Memory
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.stages.pruning import removal
-from potr_cl.stages.pruning.part import RemovalPart
-from potr_cl.stages.refitting.part import ColourPart
+from potr_cl.stages.pruning.shared_removal import RemovalPart
+from potr_cl.stages.refitting.shared_map import ColourPart
 from potr_cl.views import targets, visibility
 from potr_cl.views.targets import RenderedTargets
 from potr_cl.workers.host import HostPool

@@ -16,10 +16,10 @@ from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.carried import Excerpt
 from potr_cl.raster.rules import INRIA
-from potr_cl.stages.pruning import part
-from potr_cl.stages.refitting.drawn_rows import DrawnRows
+from potr_cl.stages.pruning import shared_removal
+from potr_cl.stages.refitting.exchange import DrawnRows
 from potr_cl.stages.refitting.packed_row import PackedRow
-from potr_cl.stages.refitting.part import ColourPart
+from potr_cl.stages.refitting.shared_map import ColourPart
 from potr_cl.views import visibility
 from potr_cl.views.shares import ViewShares
 from potr_cl.views.visibility import Visibility
@@ -79,7 +79,7 @@ def test_the_same_bytes(family, options, monkeypatch):
     expected = encode(scene, cameras, options, device=open_device(family)).data
     made = []
 
-    class Noting(part.RemovalPart):
+    class Noting(shared_removal.RemovalPart):
         def __init__(self, device, memory, given, *more):
             made.append(len(given))
             super().__init__(device, memory, given, *more)
@@ -133,7 +133,7 @@ def test_who_is_told_again_is_told_the_colours_of_then(lost_at, monkeypatch, plu
     cameras = [small(camera) for camera in plush_excerpt_cameras[:5]]
     devices = [open_device("cpu") for _ in range(3)]
     expected = encode(plush_excerpt, cameras, options, device=devices[0]).data
-    measure, asked = part.RemovalPart.changes, []
+    measure, asked = shared_removal.RemovalPart.changes, []
 
     def losing(removal):
         if not asked or asked[0] is removal:
@@ -142,7 +142,7 @@ def test_who_is_told_again_is_told_the_colours_of_then(lost_at, monkeypatch, plu
                 raise DeviceMemoryError("no room")
         return measure(removal)
 
-    monkeypatch.setattr(part.RemovalPart, "changes", losing)
+    monkeypatch.setattr(shared_removal.RemovalPart, "changes", losing)
     with ElsewherePool(devices) as pool:
         assert encode(plush_excerpt, cameras, options, device=devices[0], pool=pool).data == expected
     assert asked.count(asked[0]) == lost_at
@@ -163,7 +163,7 @@ def test_a_re_fit_without_room_for_that_sends_all(monkeypatch):
             refused.append(self)
             raise DeviceMemoryError("no room")
 
-    monkeypatch.setattr("potr_cl.stages.refitting.drawn_rows.PackedRow", WithoutRoom)
+    monkeypatch.setattr("potr_cl.stages.refitting.exchange.PackedRow", WithoutRoom)
     with ElsewherePool(devices) as pool:
         assert encode(scene, cameras, options, device=devices[0], pool=pool).data == expected
     assert refused
@@ -199,7 +199,7 @@ def test_workers_with_gpus_look_at_each_view_with_what_it_may_draw(keep, monkeyp
     expected = encode(scene, cameras, options, device=open_device(family)).data
     monkeypatch.setattr("potr_cl.raster.kept_scene.fits_whole", lambda device, scene: True)
     made = []
-    for where, name in (("stages.pruning.planned", "NamedSplats"), ("views.targets", "SeenRasterizer")):
+    for where, name in (("stages.pruning.removal", "NamedSplats"), ("views.targets", "SeenRasterizer")):
         where = f"potr_cl.{where}"
         kind = importlib.import_module(where).__dict__[name]
 

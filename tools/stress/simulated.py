@@ -57,14 +57,12 @@ from potr_cl.raster.rules import GSPLAT, INRIA
 from potr_cl.raster.scene_buffers import gathered, uploaded
 from potr_cl.raster.surely_seen import surely_seen
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
-from potr_cl.stages.pruning.alive_packing import AlivePacking
-from potr_cl.stages.pruning.changed_totals import AddedChanges, ChangedTotals
 from potr_cl.stages.pruning.on_device import prune_scene
-from potr_cl.stages.pruning.planned import planned_sweep
-from potr_cl.stages.pruning.removal import RemovalSweep
+from potr_cl.stages.pruning.removal import RemovalSweep, planned_sweep
 from potr_cl.stages.pruning.schedule import PruningOptions
+from potr_cl.stages.pruning.staleness import SweepOptions
 from potr_cl.stages.pruning.survivors import Survivors
-from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.stages.pruning.travelling_totals import AddedChanges, AlivePacking, ChangedTotals
 from potr_cl.stages.refitting import coefficients, sliced_arrays
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.exchange import Exchange
@@ -322,7 +320,7 @@ def simulate(family: str, width: int, names: list[str], told: Path) -> None:
     freed: list[cl.Buffer] = []
     info = next(d for d in list_devices() if "oclgrind" in d.platform.lower())
     simulated = dataclasses.replace(info, vector_width=width)
-    make, launch = Device.kernel, Device.launch
+    make, launch = Device.kernel, Kernel.launch
     kept: list[Kernel] = []
 
     def made(device: Device, source: str, name: str, **defines: str | int | float) -> Kernel:
@@ -330,15 +328,15 @@ def simulate(family: str, width: int, names: list[str], told: Path) -> None:
         sources[id(kept[-1])] = source
         return kept[-1]
 
-    def launched(device: Device, kernel: Kernel, *given: Any, **more: Any) -> None:
+    def launched(kernel: Kernel, *given: Any, **more: Any) -> None:
         run.add(f"{sources[id(kernel)]}: {kernel.name}")
-        launch(device, kernel, *given, **more)
+        launch(kernel, *given, **more)
 
     with ExitStack() as patches:
         patches.enter_context(patch.object(cl, "enqueue_fill_buffer", fill))
         patches.enter_context(patch.object(cl, "enqueue_copy", copy))
         patches.enter_context(patch.object(Device, "kernel", made))
-        patches.enter_context(patch.object(Device, "launch", launched))
+        patches.enter_context(patch.object(Kernel, "launch", launched))
         patches.enter_context(patch.object(Device, "free", lambda _, buffer: freed.append(buffer)))
         for module in (coefficients, sliced_arrays):
             patches.enter_context(patch.object(module, "DOT_ITEMS", _DOT_ITEMS))

@@ -38,13 +38,13 @@ if (typeof WorkerGlobalScope === 'function' && /** @type {any} */ (globalThis).n
  * @property {number} [level] of detail, 0 (the finest) if not given
  * @property {boolean} [trust] whether the file may hold more splats a byte than a real scene does
  * @property {number} [workers] how many decode; 0: none but this thread. If not given, small scenes are decoded in this
- *   thread, larger ones by at most 4 workers where there are such
+ *   thread, larger ones by at most 4 workers where there are such; by 2 where each would have the whole file
  * @property {{general?: import('./engine.js').Wasm, simd?: import('./engine.js').Wasm | null}} [wasm] the two builds, if they
  *   are not beside this module
  */
 
-/** Bundles that are decoded at a time: memory beside the scene is that of so many for each worker. */
-const AT_A_TIME = 16;
+/** Bundles that are decoded until this thread does something else, and in a worker: it has memory for so many. */
+const AT_A_TIME = 16, A_JOB = 4;
 /** Splats of a scene that is worth a worker's start. */
 const SMALL = 1 << 17;
 
@@ -95,7 +95,7 @@ export async function decode(source, options = {}) {
   let whole;
   /** @type {Arrays[]} */
   const parts = [];
-  const number = options.workers ?? (typeof Worker === 'undefined' || count <= SMALL ? 0 : Math.max(1, Math.min(4, (navigator.hardwareConcurrency || 2) - 1)));
+  const number = options.workers ?? (typeof Worker === 'undefined' || count <= SMALL ? 0 : Math.max(1, Math.min(blocks.length > 2 ? 4 : 2, (navigator.hardwareConcurrency || 2) - 1)));
   const team = number ? new Pool(number, options.wasm) : new Alone(options.wasm);
   const stop = () => team.end(signal?.reason);
   signal?.addEventListener('abort', stop);
@@ -179,7 +179,7 @@ class Pool {
   constructor(number, wasm) {
     this.ahead = number + 1;
     this.members = Array.from({ length: number }, () => ({
-      worker: new Worker(new URL('./potr.js', import.meta.url), { type: 'module', name: NAME }), block: 0, fail: (/** @type {unknown} */ why) => {},
+      worker: new Worker(new URL('./potr.js', import.meta.url), { type: 'module', name: NAME }), block: 0, fail: (/** @type {unknown} */ why) => {}, spare: /** @type {any} */ (undefined),
     }));
     this.idle = [...this.members];
     /** @type {((member: Pool['members'][0]) => void)[]} */
@@ -191,32 +191,39 @@ class Pool {
 
   /** @param {Block} block @param {Uint8Array} data @param {number} degree @param {All} into */
   async decode(block, data, degree, into) {
-    const id = ++blocksOpened, bundles = Math.ceil(block.splats / BUNDLE), size = block.coder ? AT_A_TIME : bundles, jobs = [];
+    const id = ++blocksOpened, bundles = Math.ceil(block.splats / BUNDLE), size = block.coder ? A_JOB : bundles, jobs = [];
     for (let from = 0; from < bundles; from += size) {
       const to = Math.min(from + size, bundles), n = Math.min(to * BUNDLE, block.splats) - from * BUNDLE;
-      jobs.push(this.job(id, block, data, degree, { from, to, n }).then(({ values }) => {
+      jobs.push(this.job(id, block, data, degree, { from, to, n }, ({ values }, member) => {
         for (const [name, array] of Object.entries(values)) into[/** @type {'sh'} */ (name)].set(array, (array.length / n) * from * BUNDLE);
+        member.spare = values;
       }));
     }
-    jobs.push(this.job(id, block, data, degree, {}).then(({ positions }) => into.positions.set(positions)));
+    jobs.push(this.job(id, block, data, degree, {}, ({ positions }) => into.positions.set(positions)));
     await Promise.all(jobs);
   }
 
-  /** @param {number} id @param {Block} block @param {Uint8Array} data @param {number} degree @param {object} what @returns {Promise<any>} */
-  async job(id, block, data, degree, what) {
+  /**
+   * @param {number} id @param {Block} block @param {Uint8Array} data @param {number} degree @param {object} what
+   * @param {(answer: any, member: Pool['members'][0]) => void} take
+   */
+  async job(id, block, data, degree, what, take) {
     /** @type {Pool['members'][0]} */
     const member = this.idle.shift() ?? (await new Promise((resolve) => this.waiting.push(resolve)));
     if (this.ended) throw this.ended;
-    const known = member.block === id;
+    const own = member.block === id ? null : data.slice();
     member.block = id;
     try {
-      return await new Promise((resolve, reject) => {
+      const answer = await new Promise((resolve, reject) => {
         member.fail = reject;
         member.worker.onmessage = ({ data: answer }) =>
           answer.error ? reject(answer.refused ? new PotrError(answer.error) : new Error(answer.error)) : resolve(answer);
         member.worker.onerror = (/** @type {ErrorEvent} */ event) => reject(new Error(event.message || 'a worker could not be started'));
-        member.worker.postMessage({ ...what, degree, wasm: this.wasm, ...(known ? {} : { id, block, data }) });
+        const { spare } = member, sent = [...(own ? [own] : []), ...Object.values(spare ?? {})];
+        member.worker.postMessage({ ...what, degree, wasm: this.wasm, spare, ...(own && { id, block, data: own }) }, sent.map(({ buffer }) => buffer));
+        member.spare = undefined;
       });
+      take(answer, member);
     } finally {
       const next = this.waiting.shift();
       if (next) next(member);

@@ -20,7 +20,11 @@ export function serve() {
         const positions = (await decoder.positions()).slice();
         postMessage({ positions }, { transfer: [positions.buffer] });
       } else {
-        const { n, degree } = job, values = { scales: new Float32Array(3 * n), rotations: new Float32Array(4 * n), opacities: new Float32Array(n), sh: new Float32Array(3 * (degree + 1) ** 2 * n) };
+        const { n, degree, spare } = job;
+        // Memory goes back and forth: what is given up is only collected much later.
+        const array = (/** @type {string} */ name, /** @type {number} */ each) =>
+          spare?.[name].buffer.byteLength >= 4 * each * n ? new Float32Array(spare[name].buffer, 0, each * n) : new Float32Array(each * n);
+        const values = { scales: array('scales', 3), rotations: array('rotations', 4), opacities: array('opacities', 1), sh: array('sh', 3 * (degree + 1) ** 2) };
         await decoder.values(job.from, job.to, values, 0);
         postMessage({ values }, { transfer: Object.values(values).map((array) => array.buffer) });
       }

@@ -31,8 +31,7 @@ from potr_cl.raster.scene_buffers import SPLAT_GROUP
 from potr_cl.raster.view_set import ViewSet
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.fitting.fixed_point import fixed_point_scale
-from potr_cl.stages.fitting.launcher import launcher_for
-from potr_cl.stages.fitting.pixel_sums import PixelSums
+from potr_cl.stages.fitting.sweep import Sweep
 
 #: Bytes of a splat's sums in a view: nine 64-bit integers.
 _SUMS = 72
@@ -90,7 +89,7 @@ class PictureDerivatives(Owner):
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
         self._device = device
-        self._launcher = launcher_for(device, rules)
+        self._sweep = Sweep(device, rules)
         self._memory = Memory(device)
         self._totals = Scratch(device, "the derivatives' sums")
         self._factors = Scratch(device, "the views' weights")
@@ -105,7 +104,7 @@ class PictureDerivatives(Owner):
             self._chain = device.shared_kernel(
                 "fit/chain.cl",
                 "chain",
-                LANES=self._launcher.lanes,
+                LANES=self._sweep.lanes,
                 SH_COUNT=parameters.sh_count,
                 **self.rasterizer.filter_macros,
             )
@@ -133,7 +132,7 @@ class PictureDerivatives(Owner):
             DeviceError: a view does not fit the device, or the device failed.
         """
         pixels = 0
-        at_a_time = self._launcher.most_views
+        at_a_time = self._sweep.most_views
         number = 0
         while number < len(cameras):
             some = cameras[number : number + at_a_time]
@@ -165,7 +164,8 @@ class PictureDerivatives(Owner):
         """
         self._reserve(views)
         scale = _scale([view.camera for view in views.views])
-        self._sweep(views, target, first_pixel, given, unit, scale)
+        background = self.rasterizer.background
+        self._sweep.run(views, background, target, first_pixel, given, unit, scale, self._totals.buffer)
         self._follow(views, scale * (1.0 if given else unit))
 
     def sums(
@@ -188,7 +188,8 @@ class PictureDerivatives(Owner):
                 continue
             views = self._prepared([cameras[place] for place in own])
             self._reserve(views)
-            self._sweep(views, target, pixels, False, unit, _scale([cameras[place] for place in group]))
+            scale, background = _scale([cameras[place] for place in group]), self.rasterizer.background
+            self._sweep.run(views, background, target, pixels, False, unit, scale, self._totals.buffer)
             pixels += views.pixels
             count = _SUMS // 8 * views.stride
             for number, place in enumerate(own):
@@ -220,7 +221,7 @@ class PictureDerivatives(Owner):
 
     def _launches(self, cameras: Sequence[Camera]) -> list[range]:
         """Places of the views that a launch does."""
-        most = self._launcher.most_views
+        most = self._sweep.most_views
         return [range(first, min(first + most, len(cameras))) for first in range(0, len(cameras), most)]
 
     def _prepared(self, cameras: Sequence[Camera]) -> ViewSet:
@@ -237,23 +238,6 @@ class PictureDerivatives(Owner):
             self._device.fill(self._totals.buffer, np.uint32(0), self._totals.nbytes)
         if self._factors.reserve(4 * len(views.views)):
             self._written = None
-
-    def _sweep(
-        self, views: ViewSet, target: cl.Buffer, first_pixel: int, given: bool, unit: float, scale: float
-    ) -> None:
-        """From the pixels to the sums."""
-        self._launcher.sweep(
-            PixelSums(
-                views=views,
-                background=self.rasterizer.background,
-                target=target,
-                first_pixel=first_pixel,
-                given=given,
-                unit=unit,
-                scale=scale,
-                totals=self._totals.buffer,
-            )
-        )
 
     def _follow(self, views: ViewSet, scale: float) -> None:
         """From the sums, which were multiplied by this, to the gradient."""
@@ -274,7 +258,7 @@ class PictureDerivatives(Owner):
             totals=self._totals.buffer,
             gradient=self.gradient,
         )
-        lanes = self._launcher.lanes
+        lanes = self._sweep.lanes
         self._chain.launch((parameters.stride // lanes,), (SPLAT_GROUP // lanes,))
 
     def read(self) -> FloatArray:

@@ -10,14 +10,12 @@ given all of the first one's numbers then.
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
 
-from potr_cl.errors import DeviceError
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
@@ -29,6 +27,7 @@ from potr_cl.stages.fitting.adam import Adam, Limits, Rates
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from potr_cl.stages.fitting.parameters import UNROUNDED, Factors
 from potr_cl.views.targets import Room, TargetPictures, targets_of
+from potr_cl.workers.helping import Helping
 from potr_cl.workers.parts import Each, Parts
 from potr_cl.workers.pool import Part, Pool
 
@@ -37,10 +36,8 @@ _SHARE = 0.25
 #: So many steps are taken together, then alone, to see which is faster; before, so many that do not count.
 _TRIED, _FIRST = 6, 2
 
-_log = logging.getLogger("potr_cl")
-
 #: Sums of some of a batch's views, by their places.
-Sums = Sequence[tuple[int, Narrowed]]
+Sums = list[tuple[int, Narrowed]]
 
 
 @dataclass(frozen=True)
@@ -205,12 +202,12 @@ class Together:
 
     Args:
         descent: the first device's.
-        parts: the others', each a :class:`FitPart`; None: there are none.
+        helping: the others, each a :class:`FitPart`.
         takes_part: whether the first device does views too.
     """
 
-    def __init__(self, descent: Descent, parts: Parts | None, takes_part: bool) -> None:
-        self._descent, self._parts, self._takes_part = descent, parts, takes_part
+    def __init__(self, descent: Descent, helping: Helping, takes_part: bool) -> None:
+        self._descent, self._helping, self._takes_part = descent, helping, takes_part
         self._before: tuple[Batch, Sums] | None = None
         self._steps = 0
         self._since, self._seconds = 0.0, list[float]()
@@ -222,41 +219,40 @@ class Together:
             DeviceError: the first device failed.
         """
         self._look_at_the_time()
-        if self._parts is None or _FIRST + _TRIED <= self._steps < _FIRST + 2 * _TRIED:
+        if self._helping.parts is None or _FIRST + _TRIED <= self._steps < _FIRST + 2 * _TRIED:
             self._descent.step(batch)
         else:
-            self._step_together(self._parts, batch)
+            self._step_together(batch)
         self._steps += 1
 
-    def _step_together(self, parts: Parts, batch: Batch) -> None:
-        descent, count = self._descent, len(batch.numbers)
-        doing = len(parts) + self._takes_part
+    def _step_together(self, batch: Batch) -> None:
+        descent, helping, count = self._descent, self._helping, len(batch.numbers)
+        assert helping.parts is not None
+        doing = len(helping.parts) + self._takes_part
         dealt = [list(range(first, count, doing)) for first in range(doing)]
         own, others = (dealt[0], dealt[1:]) if self._takes_part else ([], dealt)
-        before = self._before if self._before is not None and descent.taken else None
-        try:
-            pending = parts.begin("sums", descent.taken, before, batch, Each(others), logged=False)
-            begun = True
-        except DeviceError as error:
-            begun = self._go_on_alone(error)
-        sums = [*descent.sums(batch, own)]
-        if begun:
-            try:
-                for place, found in enumerate(pending.results()):
-                    if found is None:
-                        parts.ask(place, "adopt", descent.taken, descent.adam.state())
-                        found = parts.ask(place, "sums", descent.taken, None, batch, others[place])
-                    sums += found
-            except DeviceError as error:
-                self._go_on_alone(error)
+        before = self._before if descent.taken else None
+
+        pending = helping.begin("sums", descent.taken, before, batch, Each(others), logged=False)
+        sums = descent.sums(batch, own)
+        for place, found in enumerate(helping.results(pending) or []):
+            if found is None:
+                found = helping.asked(partial(self._adopted, batch, place, others[place]))
+            sums += found or []
         known = {place for place, _ in sums}
         sums += descent.sums(batch, [place for place in range(count) if place not in known])
         descent.follow(batch, sums)
         self._before = batch, sums
 
+    def _adopted(self, batch: Batch, place: int, places: Sequence[int], parts: Parts) -> Sums:
+        """The sums of a part that has not been there in all steps."""
+        parts.ask(place, "adopt", self._descent.taken, self._descent.adam.state())
+        found: Sums = parts.ask(place, "sums", self._descent.taken, None, batch, places)
+        return found
+
     def _look_at_the_time(self) -> None:
         """Measure both ways once, and stay with the faster one: the bits are the same."""
-        if self._parts is None or self._steps not in (_FIRST, _FIRST + _TRIED, _FIRST + 2 * _TRIED):
+        if self._helping.parts is None or self._steps not in (_FIRST, _FIRST + _TRIED, _FIRST + 2 * _TRIED):
             return
         with self._descent.device.errors("failed while computing"):
             self._descent.device.queue.finish()
@@ -264,13 +260,7 @@ class Together:
         self._seconds.append(now - self._since)
         self._since = now
         if len(self._seconds) == 3 and self._seconds[1] > self._seconds[2]:
-            self._parts.close()
-            self._parts = None
-
-    def _go_on_alone(self, error: DeviceError) -> bool:
-        _log.warning("no worker can fit (%s); using %s instead", str(error).split(": ")[0], self._descent.device.info)
-        self._parts = None
-        return False
+            self._helping.close()
 
 
 @contextmanager
@@ -286,17 +276,20 @@ def together(
         memory: bytes of a device's memory that target pictures may take; None: a quarter of what is free.
         batch: views of a step: there is no use for more workers.
     """
-    with ExitStack() as stack:
-        parts: Parts | None = None
-        if helpers is not None and helpers.pool.first is descent.device:
-            pool = helpers.pool
-            try:
-                count = min(len(pool.workers()), batch - pool.takes_part)
-                given: list[Any] = [stack.enter_context(pool.shared(each)) for each in (ground, helpers.source)]
-                if count > 0:
-                    parts = stack.enter_context(Parts(pool, FitPart, [given] * count, memory))
-                    parts.ready()
-            except DeviceError as error:
-                parts = None
-                _log.warning("no worker can fit (%s); using %s instead", str(error).split(": ")[0], descent.device.info)
-        yield Together(descent, parts, helpers is not None and helpers.pool.takes_part)
+    pool = None if helpers is None or helpers.pool.first is not descent.device else helpers.pool
+    with Helping(descent.device, "fit") as helping:
+
+        def opened(stack: ExitStack) -> Parts | None:
+            assert pool is not None
+            assert helpers is not None
+            count = min(len(pool.workers()), batch - pool.takes_part)
+            given = [stack.enter_context(pool.shared(each)) for each in (ground, helpers.source)]
+            if count <= 0:
+                return None
+            parts = stack.enter_context(Parts(pool, FitPart, [given] * count, memory))
+            parts.ready()
+            return parts
+
+        if pool is not None:
+            helping.open(opened)
+        yield Together(descent, helping, pool is not None and pool.takes_part)

@@ -4,26 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.raster.kept_scene import lying_on, whole_on_device
 from potr_cl.raster.scene_buffers import SceneBuffers
-from potr_cl.stages.pruning.part import RemovalPart
-from potr_cl.stages.pruning.planned import planned_sweep
-from potr_cl.stages.pruning.removal import RemovalSweep
-from potr_cl.stages.pruning.shared_removal import SharedRemoval
-from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.stages.pruning.removal import RemovalSweep, planned_sweep
+from potr_cl.stages.pruning.shared_removal import OtherViews, RemovalPart
+from potr_cl.stages.pruning.staleness import SweepOptions
 from potr_cl.stages.stage import State, Workbench
+from potr_cl.views.plan import none
 from potr_cl.views.shares import ViewShares
+from potr_cl.views.subsets import NoSplats
 from potr_cl.views.visibility import Visibility
 from potr_cl.workers.dealing import Shares, shares
 from potr_cl.workers.parts import Parts
-
-#: What measures: one device, or several together.
-Removal: TypeAlias = RemovalSweep | SharedRemoval
 
 
 @contextmanager
@@ -35,7 +32,7 @@ def measurement(
     spared: NDArray[np.bool_] | None = None,
     dealt: ViewShares | None = None,
     seen: NDArray[np.int64] | None = None,
-) -> Iterator[Removal]:
+) -> Iterator[RemovalSweep]:
     """A removal sweep over the views of a state, its splats numbered as in the state's scene.
 
     Args:
@@ -76,20 +73,20 @@ def measurement(
             sent = stack.enter_context(bench.shared(pool, state, seen))
             sights = sights if pool.in_process else None
             given = [(sent, views, options, bench.background, numbers, sights) for numbers in share.others]
-        others = stack.enter_context(Parts(pool, RemovalPart, given, options.memory, share.names))
-        own: RemovalSweep | None = None
+        parts = stack.enter_context(Parts(pool, RemovalPart, given, options.memory, share.names))
+        numbers = None if dealt is None else [each.splats for each in dealt.shares]
+        others = stack.enter_context(OtherViews(device, splats, parts, pool, numbers))
         if share.own:
             drawable = stack.enter_context(lying_on(device, bench.placed(state, seen)))
             # Only what lies on the device already is looked at in parts.
             own_sights = sights if isinstance(drawable, SceneBuffers) else None
-            with_own = (device, drawable, views, options, bench.background, own_sights, share.own, progress)
-            own = stack.enter_context(planned_sweep(*with_own))
-        others.ready()
-        steers = all(others.ask(place, "can_steer") for place in range(len(others)))
-        steers = steers and (device.family == "gpu" if own is None else own.steering is not None)
-        numbers = None if dealt is None else [each.splats for each in dealt.shares]
-        shared = SharedRemoval(device, splats, views, own, others, pool, steers, numbers)
-        yield stack.enter_context(shared)
+            own = (device, drawable, views, options, bench.background, own_sights, share.own, progress)
+            sweep = stack.enter_context(planned_sweep(*own, others=others))
+        else:
+            source = NoSplats(device, splats)
+            sweep = stack.enter_context(RemovalSweep(source, views, options, plan=none(), others=others))
+        parts.ready()
+        yield sweep
 
 
 class Measured:
@@ -100,7 +97,7 @@ class Measured:
         left: (n,) the sweep's numbers of the splats that are left, ascending.
     """
 
-    def __init__(self, removal: Removal, left: NDArray[np.int64]) -> None:
+    def __init__(self, removal: RemovalSweep, left: NDArray[np.int64]) -> None:
         self._removal = removal
         self._places = np.full(removal.splats, -1, np.int64)
         self._places[left] = np.arange(len(left))

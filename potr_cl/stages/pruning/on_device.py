@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.host.threads import in_background
@@ -18,7 +17,7 @@ from potr_cl.opencl.kernel import Kernel
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.opencl.structs import bytes_before, struct_dtype
 from potr_cl.raster.macros import totals_limits
-from potr_cl.stages.pruning.measured import Removal
+from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import Course, Indices, Iteration, Pruned, PruningOptions, prune
 
 _SOURCE = "prune/choose_gpu.cl"
@@ -29,7 +28,7 @@ _REMOVED, _STATE = struct_dtype(_SOURCE, "Removed"), struct_dtype(_SOURCE, "Stat
 
 
 def prune_scene(
-    removal: Removal,
+    removal: RemovalSweep,
     options: PruningOptions,
     progress: Callable[[int, int], None] | None = None,
     after_iteration: Callable[[int], None] | None = None,
@@ -57,7 +56,7 @@ class _Controller(Owner):
         DeviceError: the device has no room for the state.
     """
 
-    def __init__(self, removal: Removal, options: PruningOptions, spared: NDArray[np.bool_] | None) -> None:
+    def __init__(self, removal: RemovalSweep, options: PruningOptions, spared: NDArray[np.bool_] | None) -> None:
         self._removal, self._options = removal, options
         self._device = device = removal.device
         self._splats = removal.splats
@@ -129,9 +128,7 @@ class _Controller(Owner):
         )
         self._launch(self._mark)
         gone = np.empty(1, np.uint32)
-        with self._device.errors("failed while computing"):
-            place = bytes_before(_STATE, "gone")
-            cl.enqueue_copy(self._device.queue, gone, self._state, src_offset=place, is_blocking=True)
+        self._device.copy(gone, self._state, of=bytes_before(_STATE, "gone"))
         return int(gone[0])
 
     def _launch(self, kernel: Kernel) -> None:

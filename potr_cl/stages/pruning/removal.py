@@ -7,16 +7,18 @@ totals a splat, in units that follow from all views. So it makes no difference t
 together, with which splats, and which of them stay on the device: that is the plan's matter
 (:mod:`potr_cl.views.plan`), and the engine's (:mod:`potr_cl.views.engine`).
 
-The parts: sweep_options.py (what may be traded for speed), resident.py and streamed.py (measuring views that stay on
-the device and views that do not), prepared_set.py (what is kept of them), ledger.py (who numbers splats how),
-launcher.py (the kernels of either family), staleness.py (which tiles the host has swept again), survivors.py (which
-splats are left) and fixed_point.py (the totals' units).
+The parts: staleness.py (what may be traded for speed, and which tiles the host has swept again), resident.py and
+streamed.py (measuring views that stay on the device and views that do not), prepared_set.py (what is kept of them, and
+who numbers splats how), launcher.py (the kernels of either family), survivors.py (which splats are left) and
+fixed_point.py (the totals' units).
 """
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
+from typing import Protocol
 
 import numpy as np
 import pyopencl as cl
@@ -24,24 +26,26 @@ from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera
-from potr_cl.model.scene import FloatArray
+from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
 from potr_cl.raster.view_set import ViewSet
 from potr_cl.stages.pruning.fixed_point import FixedPoint
 from potr_cl.stages.pruning.launcher import launchers
-from potr_cl.stages.pruning.ledger import Ledger
-from potr_cl.stages.pruning.prepared_set import PreparedSet
-from potr_cl.stages.pruning.queues import Queues
-from potr_cl.stages.pruning.resident import ResidentSweep
+from potr_cl.stages.pruning.prepared_set import Ledger, PreparedSet
+from potr_cl.stages.pruning.resident import Queues, ResidentSweep
+from potr_cl.stages.pruning.staleness import SweepOptions
 from potr_cl.stages.pruning.streamed import StreamedSweep
 from potr_cl.stages.pruning.survivors import Bits, Survivors
-from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.views import plan as plans
 from potr_cl.views.budget import default_memory, tiles_of
 from potr_cl.views.engine import ViewEngine
 from potr_cl.views.plan import ViewPlan
-from potr_cl.views.subsets import SplatSource, Subset, WholeScene
+from potr_cl.views.subsets import CopiedSplats, NamedSplats, SplatSource, Subset, WholeScene
+from potr_cl.views.visibility import Visibility
+from potr_cl.workers.parts import Pending
 
 F64 = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -51,8 +55,29 @@ _SPARED, LARGEST_LIMIT = 1 << 58, 0.1
 _GROUP = 64
 
 
+class Others(Protocol):
+    """Measure some of the views; :class:`potr_cl.stages.pruning.shared_removal.OtherViews` is one."""
+
+    @property
+    def steers(self) -> bool: ...
+
+    def begin(self) -> Pending: ...
+
+    def take(self, pending: Pending, totals: cl.Buffer) -> None: ...
+
+    def remove(self, marked: Bits) -> None: ...
+
+    def are_left(self, marks: cl.Buffer, first: bool = False) -> None: ...
+
+    def replace_sh(self, sh: FloatArray) -> Pending: ...
+
+    def sweep_changed(self) -> Pending: ...
+
+    def importances(self) -> list[Iterator[tuple[int, Indices, F64]]]: ...
+
+
 class RemovalSweep(Owner):
-    """Measures removal effects and importances while splats are taken out, on one device.
+    """Measures removal effects and importances while splats are taken out, on one device; others may help.
 
     Args:
         scene: the uncompressed scene, drawn by a rasterizer with its rules and its background, which stays the
@@ -60,10 +85,11 @@ class RemovalSweep(Owner):
         cameras: all views; the totals' units follow from them.
         options: speed/accuracy trade-offs.
         progress: called with the views prepared and their number.
-        numbers: of the views that are measured here, ascending, where others are measured elsewhere and all totals are
-            added up (:mod:`potr_cl.stages.pruning.shared_removal`); None: all.
+        numbers: of the views that are measured here, ascending, where others are measured elsewhere; None: all.
         plan: of these views; None: all of them with all splats.
         spared: (N,) splats whose effects are to be beyond :data:`LARGEST_LIMIT`, so that they are never removed.
+        others: measure the other views. All totals are integers in units that follow from all views, so it makes no
+            difference to any bit who measures which.
 
     Attributes:
         device: where the totals and the marks are. splats: N.
@@ -72,7 +98,7 @@ class RemovalSweep(Owner):
             the device marks splats as JUST_REMOVED and calls :meth:`remove_marked`; when it marks the next ones, it
             changes the earlier marks to REMOVED.
         fixed_point: the totals' units, those of all views.
-        resident_views: how many views stay on the device, or draw nothing.
+        resident_views: how many views stay on the device, or draw nothing, or are measured by others.
 
     Raises:
         UsageError: no camera.
@@ -88,6 +114,7 @@ class RemovalSweep(Owner):
         numbers: Sequence[int] | None = None,
         plan: ViewPlan | None = None,
         spared: NDArray[np.bool_] | None = None,
+        others: Others | None = None,
     ) -> None:
         source = scene if isinstance(scene, SplatSource) else WholeScene(scene)
         if not cameras:
@@ -99,11 +126,16 @@ class RemovalSweep(Owner):
         if plan is None:
             room = default_memory(self.device) if options.memory is None else options.memory
             plan = plans.whole(range(len(cameras)) if numbers is None else numbers, self.splats, room)
-        self._cameras, self._pending = cameras, list[cl.Event]()
+        self._cameras, self._pending, self._others = cameras, list[cl.Event](), others
         with ExitStack() as owned:
             owned.callback(source.close)
             self._memory = owned.enter_context(Memory(self.device))
             self.totals: cl.Buffer = self._memory.allocate(16 * source.stride, "the removal effects")
+            self._own = self.totals
+            if others is not None:
+                self.device.fill(self.totals, np.int64(0))
+                if plan.groups:
+                    self._own = self._memory.allocate(16 * source.stride, "the removal effects")
             self._begin_totals()
             self._survivors = owned.enter_context(
                 Survivors(self.device, self.splats, source.stride, lambda: self._queues.wait())
@@ -116,7 +148,7 @@ class RemovalSweep(Owner):
             self._pending.clear()
             resident = self._engine.resident
             ledgers = {
-                id(each): owned.enter_context(Ledger(self._survivors, self.totals, each))
+                id(each): owned.enter_context(Ledger(self._survivors, self._own, each))
                 for each in {id(ready.subset): ready.subset for ready in resident}.values()
             }
             self._local = [ledger for ledger in ledgers.values() if ledger.is_local]
@@ -130,9 +162,12 @@ class RemovalSweep(Owner):
             owned.enter_context(self._resident)
             self._streamed = StreamedSweep(self._engine, self._survivors, options, self.fixed_point)
             owned.enter_context(self._streamed)
+            if others is not None:
+                others.are_left(self.marks, first=True)
             self._owned = owned.pop_all()
         self._measured = self._streamed_added = False
-        self.resident_views = len(self._engine.idle) + sum(len(ready.numbers) for ready in resident)
+        elsewhere = len(cameras) - len(plan.numbers) if others else 0
+        self.resident_views = elsewhere + len(self._engine.idle) + sum(len(ready.numbers) for ready in resident)
 
     def _attach(
         self, numbers: Sequence[int], subset: Subset, views: ViewSet, memory: Memory | None, target: cl.Buffer | None
@@ -141,12 +176,11 @@ class RemovalSweep(Owner):
         return PreparedSet(subset.rasterizer, numbers, views, memory, target, None if memory else self._pending)
 
     def _begin_totals(self) -> None:
-        self.device.fill(self.totals, np.int64(0))
+        self.device.fill(self._own, np.int64(0))
         if self._spared is not None:
             first = np.zeros((self.splats, 2), np.int64)
             first[self._spared, 0] = _SPARED
-            with self.device.errors("cannot hold the removal effects to begin with"):
-                cl.enqueue_copy(self.device.queue, self.totals, first, is_blocking=True)
+            self.device.copy(self._own, first)
 
     @property
     def sweeps(self) -> float:
@@ -159,7 +193,8 @@ class RemovalSweep(Owner):
         """Itself, for a controller on the device; None if the host has to decide: where it is asked which tiles are
         swept, or where streamed views are measured so often that nothing is gained."""
         often = self._engine.streamed and not self._engine.plan.patience
-        return self if self._resident.device_lists and not often else None
+        others = self._others is None or self._others.steers
+        return self if self._resident.device_lists and not often and others else None
 
     @property
     def alive(self) -> NDArray[np.bool_]:
@@ -168,36 +203,43 @@ class RemovalSweep(Owner):
 
     # ------------------------------------------------------------------------------ for a controller on the device
 
-    def measure_on_device(self) -> None:
-        """Bring :attr:`totals` up to date."""
-        streamed, resident = self._streamed, self._resident
-        resident.sweep()
-        if self._local:
-            if streamed.are_stale():
+    def measure_on_device(self, alone: bool = False) -> None:
+        """Bring :attr:`totals` up to date; ``alone``: only what is measured here."""
+        streamed, resident, others = self._streamed, self._resident, None if alone else self._others
+        pending = None if others is None else others.begin()
+        if self._engine.plan.groups:
+            resident.list_stale()
+            resident.sweep()
+            if self._local:
+                if streamed.are_stale():
+                    streamed.measure()
+                self._begin_totals()
+                for ledger in self._local:
+                    ledger.add_to(self._own)
+                self._streamed_added = False
+            elif streamed.are_stale():
+                if self._streamed_added:
+                    add_totals(self.device, self._own, streamed.totals, self.splats, "subtract_totals")
+                self._streamed_added = False
                 streamed.measure()
-            self._begin_totals()
-            for ledger in self._local:
-                ledger.add_to(self.totals)
-            self._streamed_added = False
-        elif streamed.are_stale():
-            if self._streamed_added:
-                self._with_streamed("subtract_totals")
-            self._streamed_added = False
-            streamed.measure()
-        if self._engine.streamed and not self._streamed_added:
-            self._with_streamed("add_totals")
-            self._streamed_added = True
-        self._measured = True
-
-    def _with_streamed(self, name: str) -> None:
-        kernel = self.device.shared_kernel("prune/add_totals.cl", name)
-        kernel.bind(totals=self.totals, more=self._streamed.totals, count=2 * self.splats)
-        kernel.launch((-(-2 * self.splats // _GROUP) * _GROUP,), (_GROUP,))
+            if self._engine.streamed and not self._streamed_added:
+                add_totals(self.device, self._own, streamed.totals, self.splats)
+                self._streamed_added = True
+            self._measured = True
+        if others is not None and pending is not None:
+            others.take(pending, self.totals)
+            if self._own is not self.totals:
+                add_totals(self.device, self.totals, self._own, self.splats)
 
     def remove_marked(self) -> None:
         """Take the splats out that are marked JUST_REMOVED."""
+        if self._others is not None:
+            # They go on with it while this device does its own, and whoever tells them more waits for them.
+            self._others.remove(self._survivors.just_marked())
         self._resident.note_removal()
         self._survivors.marked_by_device()
+        if self._others is not None:
+            self._others.are_left(self.marks)
 
     def mark(self, splats: Bits) -> None:
         """Mark splats that a controller elsewhere has chosen, as its :meth:`just_marked` gives them.
@@ -205,10 +247,6 @@ class RemovalSweep(Owner):
         :meth:`remove_marked` follows.
         """
         self._survivors.mark(splats)
-
-    def just_marked(self) -> Bits:
-        """The splats that are marked JUST_REMOVED, see :meth:`Survivors.just_marked`."""
-        return self._survivors.just_marked()
 
     # ----------------------------------------------------------------------------------- for a controller on the host
 
@@ -228,21 +266,30 @@ class RemovalSweep(Owner):
 
     def remove(self, splats: Indices) -> None:
         """Take splats, (n,) by number, out of all lists; note how much each tile loses."""
+        if self._others is not None:
+            gone = np.zeros(self.splats, bool)
+            gone[splats] = True
+            self._others.remove(np.packbits(gone, bitorder="little"))
         self._see_targets()
         self._resident.prepare_removal()
         self._survivors.remove(splats)
         self._resident.note_removal()
+        if self._others is not None:
+            self._others.are_left(self.marks)
 
     def replace_sh(self, sh: FloatArray) -> None:
         """Continue with other colours, (N, M, 3) float32 of the same degree. The target pictures stay as they are."""
+        pending = None if self._others is None else self._others.replace_sh(sh)
         self._see_targets()
         self._engine.source.replace_sh(sh)
         self.project_again()
+        if pending is not None:
+            pending.results()
 
     def _see_targets(self) -> None:
         """The target pictures are stored by the first measurement, before anything changes."""
         if not self._measured:
-            self.measure_on_device()
+            self.measure_on_device(alone=True)
 
     def project_again(self) -> None:
         """Continue with the colours that the rasterizer's scene has by now; so with others, if it has got others."""
@@ -264,8 +311,13 @@ class RemovalSweep(Owner):
         Raises:
             UsageError: nothing has been measured yet.
         """
+        pending = None if self._others is None else self._others.sweep_changed()
         self.sweep_changed()
-        yield from self.known_importances()
+        others: list[Iterator[tuple[int, Indices, F64]]] = []
+        if self._others is not None and pending is not None:
+            pending.results()
+            others = self._others.importances()
+        yield from heapq.merge(self.known_importances(), *others, key=lambda found: found[0])
 
     def sweep_changed(self) -> None:
         """Measure whatever anything was removed from since it was last measured, in the resident views.
@@ -273,7 +325,7 @@ class RemovalSweep(Owner):
         Raises:
             UsageError: nothing has been measured yet.
         """
-        if not self._measured:
+        if not self._measured and self._engine.plan.groups:
             raise UsageError("importances are known after a measurement")
         self._resident.sweep_changed()
 
@@ -312,3 +364,64 @@ class RemovalSweep(Owner):
     def close(self) -> None:
         """Give all device memory back."""
         self._owned.close()
+
+
+def add_totals(device: Device, totals: cl.Buffer, more: cl.Buffer, splats: int, how: str = "add_totals") -> None:
+    """Enqueue: totals of so many splats += others, or -= with "subtract_totals"."""
+    kernel = device.shared_kernel("prune/add_totals.cl", how)
+    kernel.bind(totals=totals, more=more, count=2 * splats)
+    kernel.launch((-(-2 * splats // _GROUP) * _GROUP,), (_GROUP,))
+
+
+@contextmanager
+def planned_sweep(
+    device: Device,
+    drawable: Drawable,
+    cameras: Sequence[Camera],
+    options: SweepOptions,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    visibility: Visibility | None = None,
+    numbers: Sequence[int] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    scene: Scene | None = None,
+    spared: NDArray[np.bool_] | None = None,
+    others: Others | None = None,
+) -> Iterator[RemovalSweep]:
+    """A removal sweep over some views, as long as the context lasts.
+
+    Args:
+        device: that computes.
+        drawable: the uncompressed scene, perhaps on the device.
+        cameras, options, numbers, progress, spared, others: as of :class:`RemovalSweep`.
+        background: R, G, B behind the scene.
+        visibility: what the views may draw, where each had better be looked at with that; None: with all splats.
+        scene: the uncompressed scene on the host; None: it is there only if ``drawable`` is.
+
+    Raises:
+        DeviceError: the scene or a view does not fit the device.
+    """
+    scene = drawable if isinstance(drawable, Scene) else scene
+    memory = default_memory(device) if options.memory is None else options.memory
+    meant = range(len(cameras)) if numbers is None else numbers
+    with ExitStack() as owned:
+        source: Rasterizer | SplatSource
+        plan = None
+        if visibility is not None and isinstance(drawable, SceneBuffers) and _can_name(device, options):
+            source = owned.enter_context(NamedSplats(drawable, visibility.groups.group_of, background))
+            plan = plans.by_view(visibility, cameras, meant, memory, 16 * drawable.stride)
+        elif visibility is not None and scene is not None:
+            clusters = visibility.clusters(numbers)
+            source = owned.enter_context(CopiedSplats(device, scene, drawable, background))
+            if device.family == "cpu":
+                plan = plans.as_drawn(source, cameras, clusters, memory, progress)
+                progress = None  # that was most of it
+            else:
+                plan = plans.by_cluster(clusters, memory, scene.nbytes // max(len(scene), 1))
+        else:
+            source = owned.enter_context(Rasterizer(device, drawable, background=background))
+        yield owned.enter_context(RemovalSweep(source, cameras, options, progress, numbers, plan, spared, others))
+
+
+def _can_name(device: Device, options: SweepOptions) -> bool:
+    """Whether splats can be named by their numbers: GPU kernels can, where staleness alone chooses tiles."""
+    return device.family == "gpu" and options.only_by_tolerance

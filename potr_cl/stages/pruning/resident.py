@@ -8,24 +8,58 @@ many they are; for CPU kernels, and where views take turns, the host chooses whe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TypeVar
 
 import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
+from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.stages.pruning.fixed_point import FixedPoint
-from potr_cl.stages.pruning.launcher import SetKernels, SweepLauncher, launcher_for, launchers
-from potr_cl.stages.pruning.ledger import Ledger
-from potr_cl.stages.pruning.prepared_set import PreparedSet
-from potr_cl.stages.pruning.queues import Queues
-from potr_cl.stages.pruning.staleness import TileSchedule, by_set
+from potr_cl.stages.pruning.launcher import SetKernels, SweepBuffers, SweepLauncher, launcher_for, launchers
+from potr_cl.stages.pruning.prepared_set import Ledger, PreparedSet
+from potr_cl.stages.pruning.staleness import SweepOptions, TileSchedule, by_set
 from potr_cl.stages.pruning.survivors import Survivors
-from potr_cl.stages.pruning.sweep_buffers import SweepBuffers
-from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.views.engine import ViewEngine
+
+T = TypeVar("T")
+
+
+class Queues:
+    """The device's own queue, or several others.
+
+    Args:
+        device: that the work is for.
+        most: queues to open, where the device takes more than its own.
+    """
+
+    def __init__(self, device: Device, most: int) -> None:
+        self._device = device
+        self._queues = [device.queue]
+        if most > 1 and device.several_queues:
+            properties = device.queue.properties
+            self._queues = [cl.CommandQueue(device.context, device.info.handle, properties) for _ in range(most)]
+
+    def dealt(self, work: Iterable[T]) -> Iterator[tuple[T, cl.CommandQueue]]:
+        """Each piece of work with the queue that it goes to, after what the device's own has; :meth:`wait` for all."""
+        self._device.finish()
+        for piece, queue in zip(work, itertools.cycle(self._queues)):
+            yield piece, queue
+            with self._device.errors("failed while computing"):
+                queue.flush()
+
+    def wait(self) -> None:
+        """Return once all is done.
+
+        Raises:
+            DeviceError: the device failed.
+        """
+        with self._device.errors("failed while computing"):
+            for queue in self._queues:
+                queue.finish()
 
 
 class ResidentSweep(Owner):
@@ -85,106 +119,16 @@ class ResidentSweep(Owner):
                     self._kernels.append(bound)
             self.list_everything()
 
-    def sweep(self) -> None:
-        """Measure the tiles that are listed."""
+    def list_stale(self) -> None:
+        """List the tiles that the next measurement sweeps, unless the device has."""
         if self._counts is None:
             self._survivors.settle()
             self._take_marks()
             self._choose(self._schedule.choose(self._measurements, self._staleness()))
         self._measurements += 1
-        self._sweep_listed()
 
-    def sweep_changed(self) -> None:
-        """Measure every tile that has lost anything since its last sweep."""
-        if self.device_lists:
-            self.note_removal(0.0)
-        else:
-            self._settle()
-            self._choose(self._schedule.changed(self._staleness()))
-        self._sweep_listed()
-
-    def prepare_removal(self) -> None:
-        """To be called before splats are marked as removed by the host."""
-        if not self.device_lists:
-            self._settle()
-
-    def note_removal(self, tolerance: float | None = None) -> None:
-        """Find out how much each tile has lost of what was marked as JUST_REMOVED.
-
-        Args:
-            tolerance: list the tiles that are staler than this; None: as the options say.
-        """
-        if not self._sets:
-            return
-        if not self.device_lists:
-            self._take_marks()
-            for kernels, queue in self._queues.dealt(self._kernels):
-                kernels.note_removal(queue)
-            self._counts = None
-            return
-        self._sweep_listed()
-        above = self._options.tolerance if tolerance is None else tolerance
-        self._device.fill(self._listed, np.uint32(0))
-        for kernels, queue in self._queues.dealt(self._kernels):
-            kernels.note_removal(queue, list_above=above)
-        self._queues.wait()
-        self._counts = self._device.download(self._listed, (len(self._sets),), np.uint32).tolist()
-
-    def list_everything(self) -> None:
-        """Have the next measurement sweep every tile."""
-        if not self._sets:
-            return
-        self._settle()
-        counts = [ready.views.tiles for ready in self._sets]
-        if self.device_lists:
-            self._write(self._tiles, np.concatenate([np.arange(count, dtype=np.uint32) for count in counts]))
-            self._counts = counts
-        self._device.fill(self._stale, np.float32(0 if self.device_lists else np.inf))
-
-    def project_again(self) -> None:
-        """Have all sets show the colours that the source has by now."""
-        self._settle()
-        for ready in self._sets:
-            source = self._engine.source
-            source.recolour(ready.subset)
-            if not ready.shares:
-                source.project(ready.subset, ready.views)
-                if self._engine.plan.copies_rest:
-                    source.rest(ready.subset)
-        self._engine.source.forget_scratch()
-
-    # ---------------------------------------------------------------------------------------------------------------
-
-    def _settle(self) -> None:
-        """Sweep what the device has listed, and have host and device agree on the splats that are left."""
-        if self._counts is not None and self._targets_known:
-            self._sweep_listed()
-        self._survivors.settle()
-        self._take_marks()
-
-    def _take_marks(self) -> None:
-        for ledger in self._ledgers:
-            ledger.take_marks()
-
-    def _staleness(self) -> NDArray[np.float32]:
-        if not self._sets:
-            return np.zeros(0, np.float32)
-        return self._device.download(self._stale, (self._firsts[-1],), np.float32)
-
-    def _choose(self, tiles: NDArray[np.int64]) -> None:
-        """List tiles of all sets, numbered through, ascending."""
-        listed, self._counts = by_set(tiles, self._firsts)
-        if len(tiles):
-            self._write(self._tiles, listed)
-            stale = self._staleness()
-            self._schedule.note_swept(stale, tiles)
-            self._write(self._stale, stale)
-
-    def _write(self, buffer: cl.Buffer, values: NDArray[Any]) -> None:
-        with self._device.errors("failed while computing"):
-            cl.enqueue_copy(self._device.queue, buffer, values, is_blocking=True)
-
-    def _sweep_listed(self) -> None:
+    def sweep(self) -> None:
+        """Measure the tiles that are listed."""
         counts, self._counts = self._counts or [], [0] * len(self._sets) if self.device_lists else None
         work = [(count, place) for place, count in enumerate(counts) if count]
         if self._engine.plan.copies_rest:  # there is room for one copy at a time
@@ -208,6 +152,92 @@ class ResidentSweep(Owner):
             for kernels in self._kernels:
                 kernels.target_is_known()
             self._targets_known = True
+
+    def sweep_changed(self) -> None:
+        """Measure every tile that has lost anything since its last sweep."""
+        if self.device_lists:
+            self.note_removal(0.0)
+        else:
+            self._settle()
+            self._choose(self._schedule.changed(self._staleness()))
+        self.sweep()
+
+    def prepare_removal(self) -> None:
+        """To be called before splats are marked as removed by the host."""
+        if not self.device_lists:
+            self._settle()
+
+    def note_removal(self, tolerance: float | None = None) -> None:
+        """Find out how much each tile has lost of what was marked as JUST_REMOVED.
+
+        Args:
+            tolerance: list the tiles that are staler than this; None: as the options say.
+        """
+        if not self._sets:
+            return
+        if not self.device_lists:
+            self._take_marks()
+            for kernels, queue in self._queues.dealt(self._kernels):
+                kernels.note_removal(queue)
+            self._counts = None
+            return
+        self.sweep()
+        above = self._options.tolerance if tolerance is None else tolerance
+        self._device.fill(self._listed, np.uint32(0))
+        for kernels, queue in self._queues.dealt(self._kernels):
+            kernels.note_removal(queue, list_above=above)
+        self._queues.wait()
+        self._counts = self._device.download(self._listed, (len(self._sets),), np.uint32).tolist()
+
+    def list_everything(self) -> None:
+        """Have the next measurement sweep every tile."""
+        if not self._sets:
+            return
+        self._settle()
+        counts = [ready.views.tiles for ready in self._sets]
+        if self.device_lists:
+            self._device.copy(self._tiles, np.concatenate([np.arange(count, dtype=np.uint32) for count in counts]))
+            self._counts = counts
+        self._device.fill(self._stale, np.float32(0 if self.device_lists else np.inf))
+
+    def project_again(self) -> None:
+        """Have all sets show the colours that the source has by now."""
+        self._settle()
+        for ready in self._sets:
+            source = self._engine.source
+            source.recolour(ready.subset)
+            if not ready.shares:
+                source.project(ready.subset, ready.views)
+                if self._engine.plan.copies_rest:
+                    source.rest(ready.subset)
+        self._engine.source.forget_scratch()
+
+    # ---------------------------------------------------------------------------------------------------------------
+
+    def _settle(self) -> None:
+        """Sweep what the device has listed, and have host and device agree on the splats that are left."""
+        if self._counts is not None and self._targets_known:
+            self.sweep()
+        self._survivors.settle()
+        self._take_marks()
+
+    def _take_marks(self) -> None:
+        for ledger in self._ledgers:
+            ledger.take_marks()
+
+    def _staleness(self) -> NDArray[np.float32]:
+        if not self._sets:
+            return np.zeros(0, np.float32)
+        return self._device.download(self._stale, (self._firsts[-1],), np.float32)
+
+    def _choose(self, tiles: NDArray[np.int64]) -> None:
+        """List tiles of all sets, numbered through, ascending."""
+        listed, self._counts = by_set(tiles, self._firsts)
+        if len(tiles):
+            self._device.copy(self._tiles, listed)
+            stale = self._staleness()
+            self._schedule.note_swept(stale, tiles)
+            self._device.copy(self._stale, stale)
 
     def close(self) -> None:
         self._memory.close()

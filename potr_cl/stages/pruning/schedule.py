@@ -127,39 +127,28 @@ class Pruned:
         return np.flatnonzero(self.iteration_of < 0)
 
 
-class SmoothedEffects:
+class Smoothed:
     """Effects of which each splat's is the weighted mean of all its measurements.
 
     Args:
-        effects: measures and removes.
         decay: how much a measurement counts against the next one, see :class:`PruningOptions`.
-
-    Attributes:
-        newest: (N,) ΔMSE_k as last measured.
     """
 
-    def __init__(self, effects: EffectsMeasurer, decay: float) -> None:
-        self._effects, self._decay = effects, decay
-        self._weight = 0.0
+    def __init__(self, decay: float) -> None:
+        self._decay, self._weight = decay, 0.0
         self._mean: F64 = np.zeros(0)
-        self.newest = self._mean
 
-    def measure(self) -> tuple[F64, F64]:
-        """The weighted mean ΔMSE_k, and the newest I_k."""
-        self.newest, importance = self._effects.measure()
+    def with_(self, newest: F64) -> F64:
+        """The mean with one measurement more, (N,)."""
         self._weight = self._decay * self._weight + 1
         if len(self._mean):
-            change = self.newest - self._mean
+            change = newest - self._mean
             change /= self._weight
             change += self._mean
             self._mean = change
         else:
-            self._mean = self.newest
-        return self._mean, importance
-
-    def remove(self, splats: Indices) -> None:
-        """Take splats out for good."""
-        self._effects.remove(splats)
+            self._mean = newest
+        return self._mean
 
 
 def mapping(x: F64, a: float) -> F64:
@@ -250,9 +239,10 @@ def prune(
     history: list[Iteration] = []
     done = 0
     delta_mse = np.zeros(splats)
-    smoothed = SmoothedEffects(effects, options.decay)
+    smoothed = Smoothed(options.decay)
     for iteration in range(options.iterations):
-        delta_mse, importance = smoothed.measure()
+        newest, importance = effects.measure()
+        delta_mse = smoothed.with_(newest)
         if spared is not None:
             delta_mse = np.where(spared, _BEYOND, delta_mse)
         gone = choose(delta_mse, importance, alive, options.iterations - iteration, options)
@@ -263,9 +253,9 @@ def prune(
             break  # no candidate is left, and measuring again would find the same
         iteration_of[gone] = iteration
         removed.append(gone)
-        smoothed.remove(gone)  # first: the device is busy with it during the rest
+        effects.remove(gone)  # first: the device is busy with it during the rest
         alive = alive[iteration_of[alive] < 0]
-        effect = smoothed.newest[gone]
+        effect = newest[gone]
         history.append(Iteration(len(alive), float(importance[gone].sum()), float(effect.sum()), float(effect.max())))
         if progress is not None:
             progress(done, len(alive))

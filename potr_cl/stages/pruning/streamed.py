@@ -15,12 +15,10 @@ from potr_cl.host import mapped
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.memory import Memory, Owner, Scratch
 from potr_cl.stages.pruning.fixed_point import FixedPoint
-from potr_cl.stages.pruning.launcher import SetKernels, SweepLauncher, launcher_for
-from potr_cl.stages.pruning.ledger import Ledger, shared_kernel
-from potr_cl.stages.pruning.prepared_set import PreparedSet
+from potr_cl.stages.pruning.launcher import SetKernels, SweepBuffers, launcher_for
+from potr_cl.stages.pruning.prepared_set import Ledger, PreparedSet, shared_kernel
+from potr_cl.stages.pruning.staleness import SweepOptions
 from potr_cl.stages.pruning.survivors import SplatState, Survivors
-from potr_cl.stages.pruning.sweep_buffers import SweepBuffers
-from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.views.budget import target_bytes
 from potr_cl.views.engine import Ready, ViewEngine
 from potr_cl.views.groups import ViewGroup
@@ -104,59 +102,43 @@ class StreamedSweep(Owner):
 
     def measure(self) -> None:
         """Bring their totals up to date."""
-        engine = self._engine
-        self._device.fill(self.totals, np.uint32(0))
+        engine, device = self._engine, self._device
+        device.fill(self.totals, np.uint32(0))
         for group in engine.streamed:
-            sets = engine.sets(group)
             with engine.stream(group, self._left) as subset:
                 if subset is None:
                     continue
                 with Ledger(self._survivors, self.totals, subset) as ledger:
-                    for numbers in sets:
+                    for numbers in engine.sets(group):
                         with engine.prepared(numbers, subset, self._on_device.get(numbers)) as ready:
-                            self._measure(ready, ledger)
-                            self.tiles_swept += ready.views.tiles
+                            target, tiles = ready.work.target, ready.views.tiles
+                            if numbers in self._on_host:
+                                device.copy(target, self._on_host[numbers])
+                            kernels = self._bound(ready, self._buffers(ready, ledger), not self._measured)
+                            kernels.sweep(0, tiles)
+                            device.finish()
+                            if not self._measured and numbers not in self._on_device:
+                                kept = mapped.array((ready.views.pixels, 3), np.float32, "target pictures")
+                                device.copy(kept, target)
+                                self._on_host[numbers] = kept
+                            self.tiles_swept += tiles
                     ledger.add_to(self.totals)
-                    self._finish()
+                    device.finish()
         engine.source.forget_scratch()
         self._known = self._measured = True
-
-    def _measure(self, ready: Ready[PreparedSet], ledger: Ledger) -> None:
-        numbers, target = tuple(ready.numbers), ready.work.target
-        if numbers in self._on_host:
-            with self._device.errors("cannot hold the target images"):
-                cl.enqueue_copy(self._device.queue, target, self._on_host[numbers], is_blocking=True)
-        buffers = self._buffers(ready, ledger)
-        kernels = self._launcher(ready).bind(ready.work, ready.geometry, buffers, first_time=not self._measured)
-        self._sweep(kernels, ready)
-        if not self._measured and numbers not in self._on_device:
-            kept = mapped.array((ready.views.pixels, 3), np.float32, "target pictures")
-            with self._device.errors("failed while computing"):
-                cl.enqueue_copy(self._device.queue, kept, target, is_blocking=True)
-            self._on_host[numbers] = kept
-
-    def _sweep(self, kernels: SetKernels, ready: Ready[PreparedSet]) -> None:
-        if self._engine.source.selects:
-            kernels.sweep(0, ready.views.tiles)
-        else:
-            kernels.sweep_all()
-        self._finish()
 
     @contextmanager
     def swept(self, number: int) -> Iterator[tuple[Subset, PreparedSet] | None]:
         """One view and its sums, with the splats that are left, inside the block; None: it shows none of them."""
-        group = replace(self._single[number], numbers=(number,))
-        with self._engine.stream(group, self._left) as subset:
+        engine = self._engine
+        with engine.stream(replace(self._single[number], numbers=(number,)), self._left) as subset:
             if subset is None:
                 yield None
                 return
-            with (
-                Ledger(self._survivors, self.totals, subset) as ledger,
-                self._engine.prepared((number,), subset) as ready,
-            ):
+            with Ledger(self._survivors, self.totals, subset) as ledger, engine.prepared((number,), subset) as ready:
                 buffers = self._buffers(ready, ledger, wanted=False)
-                kernels = self._launcher(ready).bind(ready.work, ready.geometry, buffers, first_time=True)
-                self._sweep(kernels, ready)
+                self._bound(ready, buffers, first_time=True).sweep(0, ready.views.tiles)
+                self._device.finish()
                 yield subset, ready.work
 
     @property
@@ -164,8 +146,13 @@ class StreamedSweep(Owner):
         mask = self._survivors.alive if self._engine.source.copies else None
         return Left(self._survivors.buffer, SplatState.ALIVE, mask)
 
-    def _launcher(self, ready: Ready[PreparedSet]) -> SweepLauncher:
-        return launcher_for(ready.subset.rasterizer, self._options, self._fixed_point)
+    def _bound(self, ready: Ready[PreparedSet], buffers: SweepBuffers, first_time: bool) -> SetKernels:
+        """A set's kernels, which find no removed splats in its lists."""
+        launcher = launcher_for(ready.subset.rasterizer, self._options, self._fixed_point)
+        kernels = launcher.bind(ready.work, ready.geometry, buffers, first_time=first_time)
+        if not self._engine.source.selects:
+            kernels.take_out()
+        return kernels
 
     def _buffers(self, ready: Ready[PreparedSet], ledger: Ledger, wanted: bool = True) -> SweepBuffers:
         """What the kernels of a set work on; not ``wanted``: its effects go nowhere."""
@@ -173,9 +160,7 @@ class StreamedSweep(Owner):
         self._stale.reserve(4 * tiles)
         self._listed.reserve(4)
         if self._tiles.reserve(4 * tiles):  # all of them: nobody writes to it
-            with self._device.errors("failed while computing"):
-                everything = np.arange(tiles, dtype=np.uint32)
-                cl.enqueue_copy(self._device.queue, self._tiles.buffer, everything, is_blocking=True)
+            self._device.copy(self._tiles.buffer, np.arange(tiles, dtype=np.uint32))
         totals, numbers = ledger.totals, ledger.numbers
         if not wanted:
             self._unwanted.reserve(16 * ready.subset.rasterizer.stride)
@@ -184,10 +169,6 @@ class StreamedSweep(Owner):
                 numbers = None
         shared = (self._tiles.buffer, self._stale.buffer, self._listed.buffer)
         return SweepBuffers(ledger.marks, *shared, totals, numbers)
-
-    def _finish(self) -> None:
-        with self._device.errors("failed while computing"):
-            self._device.queue.finish()
 
     def close(self) -> None:
         for owner in (*self._scratch, self._memory):

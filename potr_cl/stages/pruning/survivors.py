@@ -68,7 +68,7 @@ class Survivors(Owner):
         """Remove splats. On the device they are JUST_REMOVED until the next :meth:`settle`."""
         self.settle()
         self._states[splats] = SplatState.JUST_REMOVED
-        self._write(self._states)
+        self.device.copy(self.buffer, self._states)
         self._states[splats] = SplatState.REMOVED
         self._host_is_ahead = True
 
@@ -83,7 +83,7 @@ class Survivors(Owner):
         with Memory(self.device) as memory:
             bits = memory.upload(splats, "the splats that go")
             self._launch("mark_bits", bits)
-            self.device.queue.finish()  # before the memory is given back
+            self.device.finish()  # before the memory is given back
 
     def just_marked(self) -> Bits:
         """(N / 8, rounded up) uint8: the splats that are JUST_REMOVED on the device, a bit each, the lowest first."""
@@ -113,10 +113,7 @@ class Survivors(Owner):
             self._states[self._states == SplatState.JUST_REMOVED] = SplatState.REMOVED
         else:
             return
-        self._write(self._states)
-
-    def _write(self, states: NDArray[np.uint8]) -> None:
-        cl.enqueue_copy(self.device.queue, self.buffer, states, is_blocking=True)
+        self.device.copy(self.buffer, self._states)
 
     def close(self) -> None:
         """Give the device's copy back."""

@@ -2,8 +2,8 @@
 
 - refit.py solves for the colours of a scene, as refit_options.py says. The other files are its parts:
 - colour_refit.py puts the problem of one scene and its views together, for any number of solutions;
-- colour_map.py is the linear map from colours to pictures, whose sweeps are those of sweep.py;
-- solver.py minimises the error, by conjugate_gradients.py on the vectors of coefficients.py, with blocks.py as
+- colour_map.py is the linear map from colours to pictures, whose kernels are launched in view_kernels.py;
+- solver.py minimises the error, by conjugate gradients on the vectors of coefficients.py, with blocks.py as
   preconditioner;
 - own_views.py walks the views that one worker does.
 """

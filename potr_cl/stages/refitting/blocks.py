@@ -77,7 +77,7 @@ class SplatBlocks:
         row: FloatArray = self._coefficients.read(self.array, range(number, number + 1))[0]
         return row
 
-    def precondition(self, residual: Vector, ridge: Ridge, result: Vector) -> None:
+    def precondition(self, residual: Vector, result: Vector, ridge: Ridge) -> None:
         """result = (block + ridge)⁻¹ residual on each splat's active coefficients, 0 on the others."""
         active = self._coefficients.active
         for part in self._coefficients.slices((residual, active, self.array), (result,)):

@@ -100,10 +100,6 @@ class Coefficients(SlicedArrays):
         with np.errstate(invalid="ignore"):  # infinities of both signs: the callers look at the result
             return float(parts[0].sum(dtype=np.float64)), float(parts[1].max())
 
-    def add_fixed(self, x: Vector, sums: cl.Buffer, unit: float, constant: bool = False) -> None:
-        """As :meth:`add_sums`; with ``constant``, only the constant coefficients' columns, which come first."""
-        self.add_sums(x, sums, unit, 3 * self.layout.stride if constant else None)
-
     def add_ridge(self, sums: Vector, x: Vector, ridge: Ridge) -> None:
         """sums += (lam on AC + prior) x on the active coefficients; the others' sums become 0."""
         for part in self.slices((sums, x, self.active), (sums,)):
@@ -161,8 +157,7 @@ class Coefficients(SlicedArrays):
             some = memory.allocate(4 * width * min(len(sh), _TURNED), "the SH coefficients")
             for first in range(0, len(sh), _TURNED):
                 rows = np.ascontiguousarray(sh[first : first + _TURNED], np.float32).reshape(-1, width)
-                with device.errors("cannot hold the SH coefficients"):
-                    cl.enqueue_copy(device.queue, some, rows, is_blocking=True)
+                device.copy(some, rows)
                 turn.bind(rows=some, first=first, width=width, stride=stride, result=columns).launch((len(rows),))
 
     def read_sh(self, x: Vector) -> FloatArray:
@@ -231,8 +226,7 @@ class Coefficients(SlicedArrays):
 
     def restore_flags(self, words: NDArray[np.uint32]) -> None:
         """Set the flags to what they were."""
-        with self.device.errors("failed while computing"):
-            cl.enqueue_copy(self.device.queue, self.active, words, is_blocking=True)
+        self.device.copy(self.active, words)
 
     def close(self) -> None:
         """Give all device memory back, that of the vectors included."""

@@ -19,7 +19,8 @@ from potr_cl.opencl.memory import Memory
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.coefficients import Coefficients, Vector
-from potr_cl.stages.refitting.own_views import OwnViews
+from potr_cl.stages.refitting.layout import Ridge
+from potr_cl.stages.refitting.own_views import Look, OwnViews
 from potr_cl.views.targets import Targets
 
 
@@ -91,32 +92,39 @@ class ColourMap:
             if self._helpers is not None:
                 own.prepare(targets)  # it waits for this device, from which the others then read x
                 self._helpers.begin_gradient(on_device, blocks is not None, constant)
-            own.gradient(on_device, targets, sums, constant)
+            own.add_up(Look(on_device, targets, constant=constant, blocks=sums))
             errors = {} if self._helpers is None else self._helpers.add(own.sums, sums)
             errors |= own.found_errors()
-            coefficients.add_fixed(result, own.sums, unit, constant)
+            coefficients.add_sums(result, own.sums, unit, constant)
             if blocks is not None:
                 blocks.set_fixed(ranges[0], sums, unit)
-                coefficients.device.queue.finish()  # before their memory is given back
+                coefficients.device.finish()  # before their memory is given back
         for splats in ranges[1:]:
             with Memory(coefficients.device) as memory:
                 sums = self._block_sums(memory, splats)
-                own.blocks(sums, splats.start)
+                own.add_up(Look(blocks=sums, first_block=splats.start))
                 assert blocks is not None
                 blocks.set_fixed(splats, sums, unit)
-                coefficients.device.queue.finish()
+                coefficients.device.finish()
         return math.fsum(errors[number] for number in sorted(errors))
 
     def normal(
-        self, direction: Vector, at: Vector, result: Vector, constant: bool = False, part: int | None = None
+        self,
+        direction: Vector,
+        result: Vector,
+        at: Vector,
+        ridge: Ridge,
+        constant: bool = False,
+        part: int | None = None,
     ) -> None:
-        """result += Aᵀ W A direction, nothing if the direction is 0 or not finite.
+        """result = (Aᵀ W A + ridge) direction, but 0 for the pictures' part if the direction is 0 or not finite.
 
         Args:
             direction: a vector. It may be of any length: it is scaled so that the fixed point of the sums fits.
-            at: the vector that :meth:`gradient` was given last, with the same content.
             result: another vector.
-            constant: the direction's AC coefficients are all 0, and those of the result are left alone.
+            at: the vector that :meth:`gradient` was given last, with the same content.
+            ridge: of the coefficients that may change; the result's others become 0.
+            constant: the direction's AC coefficients are all 0, and the pictures' part of the result's is left out.
             part: number of the part of the views that stands for all of them, modulo their number. None: all.
 
         Raises:
@@ -124,19 +132,20 @@ class ColourMap:
         """
         own, coefficients = self.own, self._coefficients
         part = None if part is None else part % own.parts
+        coefficients.zero(result)
         largest = coefficients.largest(direction)
-        if not 0 < largest < math.inf:
-            return
-        unit = 1 / largest
-        on_device = coefficients.on_device(direction)
-        if self._helpers is not None:
-            assert isinstance(at, cl.Buffer), "several devices have their vectors on the master's device"
-            self._helpers.begin_normal(on_device, at, unit, constant, part)
-        own.normal(on_device, at, unit, constant, part)
-        if self._helpers is not None:
-            self._helpers.add(own.sums, None)
-        share = 1.0 if part is None else len(range(part, own.count, own.parts)) / own.count
-        coefficients.add_fixed(result, own.sums, 1 / (own.one * unit * share), constant)
+        if 0 < largest < math.inf:
+            unit = 1 / largest
+            on_device = coefficients.on_device(direction)
+            if self._helpers is not None:
+                assert isinstance(at, cl.Buffer), "several devices have their vectors on the master's device"
+                self._helpers.begin_normal(on_device, at, unit, constant, part)
+            own.add_up(Look(on_device, None, at, unit, constant, part))
+            if self._helpers is not None:
+                self._helpers.add(own.sums, None)
+            share = 1.0 if part is None else len(range(part, own.count, own.parts)) / own.count
+            coefficients.add_sums(result, own.sums, 1 / (own.one * unit * share), constant)
+        coefficients.add_ridge(result, direction, ridge)
 
     def _block_sums(self, memory: Memory, splats: range) -> cl.Buffer:
         """Integers for the blocks of some splats, 0."""

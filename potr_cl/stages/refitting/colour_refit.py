@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,32 +18,26 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
-from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.raster.scene_buffers import stride_of
 from potr_cl.stages.refitting.blocks import SplatBlocks
-from potr_cl.stages.refitting.coefficients import Coefficients, Vector
+from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.coming_scene import AnyScene, ComingScene, arrived, colourless
-from potr_cl.stages.refitting.layout import Layout, Ridge
+from potr_cl.stages.refitting.layout import Layout
 from potr_cl.stages.refitting.own_views import OwnViews
 from potr_cl.stages.refitting.placement import Place, placed
 from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
-from potr_cl.stages.refitting.rounding import ROUNDS, Rounding, Steps
 from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts, colour_shares
-from potr_cl.stages.refitting.solver import ColourSolver, Descent, Selection, Solved
-from potr_cl.stages.refitting.sweep import Sweep
+from potr_cl.stages.refitting.solver import ColourSolver, Solved
+from potr_cl.stages.refitting.view_kernels import Sweep
 from potr_cl.views.reached import Reach, reached_splats
 from potr_cl.views.shares import ViewShares
 from potr_cl.views.targets import PicturesAhead, Targets
 from potr_cl.workers.dealing import Shares
 from potr_cl.workers.pool import Pool
-
-#: What a coefficient that becomes 0 as it is rounded is worth, as a part of what one is worth that is given up before.
-#: What the others of the splat are counted on to make up for is more than they can.
-_WORTH = 0.4
 
 
 @dataclass(frozen=True)
@@ -86,7 +80,7 @@ class ColourRefit(Owner):
         slices: as of :class:`RefitOptions`.
 
     Attributes:
-        coefficients, colour_map: the vectors and the map, for callers that want products rather than solutions.
+        coefficients, colour_map, solver: the vectors, the map, and who solves for them.
 
     Raises:
         UsageError: no camera.
@@ -133,10 +127,10 @@ class ColourRefit(Owner):
                     place = placed(device, *size, memory, slices, looked[1])
             self.coefficients = owned.enter_context(Coefficients(device, layout, place.slice, place.resident))
             blocks = SplatBlocks(self.coefficients, place.blocks)
-            self._solver = ColourSolver(self.coefficients, blocks)
+            self.solver = ColourSolver(self.coefficients, blocks)
             self._written: FloatArray | None = None  # colours that the start of the next solution has already
             if isinstance(scene, ComingScene):
-                self.coefficients.write_sh(self._solver.x, scene.sh)
+                self.coefficients.write_sh(self.solver.x, scene.sh)
                 self._written = scene.sh
             helpers = None
             if others is not None:
@@ -148,7 +142,6 @@ class ColourRefit(Owner):
             self.colour_map = ColourMap(self.coefficients, views, helpers)
             if others is not None:
                 owned.callback(others.begin_to_close)
-            self._unrounded: Vector | None = None
             self._owned = owned.pop_all()
 
     def solve(
@@ -173,32 +166,18 @@ class ColourRefit(Owner):
         Raises:
             DeviceError: the device failed.
         """
-        solved = self.solve_on_device(sh, targets, options, active, hold, progress)
+        self.start_from(sh, active, hold)
+
+        def after_step(steps: int) -> None:
+            if progress is not None:
+                progress(steps, options.most_steps)
+
+        solved = self.solver.solve(self.colour_map, targets, options.descent, options.selection, after_step)
         return Refitted(self.colours(), solved.errors, solved.steps)
 
-    def solve_on_device(
-        self,
-        sh: FloatArray,
-        targets: Targets,
-        options: RefitOptions,
-        active: NDArray[np.bool_] | None = None,
-        hold: bool = False,
-        progress: Callable[[int, int], None] | None = None,
-        check: bool = True,
-        after_start: Callable[[], None] = lambda: None,
-    ) -> Solved:
-        """The same, with the solution left where :meth:`colours`, :meth:`round_to` and :meth:`solve_constant` find it.
-
-        Args:
-            sh, targets, options, active, hold, progress: as :meth:`solve` takes them.
-            check: measure the error of the solution, and keep the start if that was better; if not, that error is not a
-                number.
-            after_start: called when :meth:`worth` and its likes are known.
-
-        Raises:
-            DeviceError: the device failed.
-        """
-        coefficients, solver = self.coefficients, self._solver
+    def start_from(self, sh: FloatArray, active: NDArray[np.bool_] | None = None, hold: bool = False) -> None:
+        """Have the solver begin with these colours; as :meth:`solve` takes them."""
+        coefficients, solver = self.coefficients, self.solver
         if self._written is not sh:
             coefficients.write_sh(solver.x, sh)
         self._written = None  # it changes
@@ -206,20 +185,6 @@ class ColourRefit(Owner):
         coefficients.activate(active)
         if active is not None and not hold:
             coefficients.keep_active(solver.x)
-        descent = Descent(options.steps, options.gain, Ridge(options.lam, options.chroma_factor, options.prior))
-        selection, total = None, options.steps
-        if options.drop:
-            ridge = replace(descent.ridge, lam=options.selection_lam)
-            selection = Selection(Descent(options.selection_steps, options.gain, ridge, part=0), options.drop)
-            total += options.selection_steps
-
-        def after_step(steps: int) -> None:
-            if progress is not None:
-                progress(steps, total)
-
-        return solver.solve(
-            self.colour_map, targets, descent, selection, after_step, check=check, after_start=after_start
-        )
 
     def solve_constant(self, targets: Targets, options: RefitOptions, sh: FloatArray | None = None) -> Solved:
         """Re-fit the constant coefficients alone, after a solution for nearly the same colours.
@@ -231,92 +196,30 @@ class ColourRefit(Owner):
         Raises:
             DeviceError: the device failed.
         """
-        coefficients, solver = self.coefficients, self._solver
+        coefficients, solver = self.coefficients, self.solver
         if sh is not None:
             coefficients.write_sh(solver.x, sh)
         coefficients.activate_constant()
-        descent = Descent(options.steps, options.gain, Ridge(options.lam, options.chroma_factor, options.prior))
-        return solver.solve(self.colour_map, targets, descent, constant=True)
+        return solver.solve(self.colour_map, targets, options.descent, constant=True)
 
     def colours(self) -> FloatArray:
         """(N, M, 3) float32 R, G, B, the solution."""
-        return self.coefficients.read_sh(self._solver.x)
-
-    def steps_of(self, grid: ColourGrid) -> Steps:
-        """A grid as :meth:`round_to` takes it. Another thread may ask for it."""
-        return Steps.of(grid, self.coefficients.layout.stride)
-
-    def round_to(
-        self,
-        steps_of_splats: Steps,
-        targets: Targets,
-        options: RefitOptions,
-        after_first: Callable[[], None] = lambda: None,
-    ) -> Solved:
-        """Make of the solution what a file can hold, but for the last constant coefficients.
-
-        :meth:`error` still knows what it was.
-
-        Args:
-            steps_of_splats: what the file can hold.
-            targets, options: that the solution was found with.
-            after_first: called when all rounds but the last are done.
-
-        Returns:
-            The errors after the first round of rounding, and in the end.
-
-        Raises:
-            DeviceError: the device failed.
-        """
-        solver, steps, errors = self._solver, 0, []
-        if self._unrounded is None:
-            self._unrounded = self.coefficients.vector()
-        self.coefficients.copy(self._unrounded, solver.x)
-        ridge = Ridge(options.lam, options.chroma_factor, options.prior)
-        worth = _WORTH * options.drop * self.colour_map.total_weight
-        with Rounding(self.coefficients, steps_of_splats) as rounding:
-            *first, last = ROUNDS
-            for each in first:
-                rounding.round(solver.x, solver.blocks, each, worth)
-                gone_on = solver.go_on(self.colour_map, targets, Descent(each.steps, 0.0, ridge, part=0))
-                steps += gone_on.steps
-                errors.append(gone_on.start)
-            after_first()
-            rounding.round(solver.x, solver.blocks, last, worth)
-            solved = solver.solve(self.colour_map, targets, Descent(last.steps, 0.0, ridge, part=1), constant=True)
-        return Solved((errors[0], solved.errors[1]), steps + solved.steps, solved.start)
-
-    def error(self, targets: Targets, sh: FloatArray | None = None) -> float:
-        """Mean squared error of the pictures. The solution is lost.
-
-        Args:
-            targets: the pictures.
-            sh: (N, M, 3) R, G, B, the colours; None: the solution as it was before :meth:`round_to`.
-
-        Raises:
-            DeviceError: the device failed.
-        """
-        if sh is not None:
-            self.coefficients.write_sh(self._solver.x, sh)
-        else:
-            assert self._unrounded is not None
-            self.coefficients.copy(self._solver.x, self._unrounded)
-        return self._solver.error(self.colour_map, targets)
+        return self.coefficients.read_sh(self.solver.x)
 
     def worth_of_constants(self) -> FloatArray:
         """(N,) float32: :meth:`worth` of the constant coefficients."""
-        return self._solver.blocks.constants() / np.float32(self.colour_map.total_weight)
+        return self.solver.blocks.constants() / np.float32(self.colour_map.total_weight)
 
     def worth(self) -> FloatArray:
         """(N, M) float32: by how much the mean squared error grows for an error of 1 in a coefficient of one channel.
 
         As the last solution has found it at its start; errors of different coefficients are taken as independent.
         """
-        return self._solver.blocks.diagonals() / np.float32(self.colour_map.total_weight)
+        return self.solver.blocks.diagonals() / np.float32(self.colour_map.total_weight)
 
     def blocks(self) -> FloatArray:
         """(M (M + 1) / 2, N) float32: the same for errors of a splat's coefficients together, upper triangles."""
-        return self._solver.blocks.packed() / np.float32(self.colour_map.total_weight)
+        return self.solver.blocks.packed() / np.float32(self.colour_map.total_weight)
 
     def active(self) -> NDArray[np.bool_]:
         """(N, M, 3) in Y, Co, Cg: the coefficients that the last solution left active."""

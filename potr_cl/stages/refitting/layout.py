@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from potr_cl.opencl.kernel import Kernel
-
 #: Y, Co and Cg.
 CHANNELS = 3
 #: Splats of a work-group.
@@ -48,10 +46,9 @@ class Layout:
         """The same for kernels that look at all coefficients, or at the constant ones, whose columns come first."""
         return {**self.macros, "SH_COUNT": 1} if constant else self.macros
 
-    def over_splats(self, kernel: Kernel, *others: int, stride: int | None = None, group: int = _GROUP) -> None:
-        """Launch a bound kernel over all splats, or so many, and in the second dimension over ``others``."""
-        group = max(group // self.lanes, 1)
-        kernel.launch(((stride or self.stride) // self.lanes, *others), (group, *(1 for _ in others)))
+    def items(self, stride: int, *others: int, group: int = _GROUP) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Work-items, and those of a group, for so many splats, and in the second dimension for ``others``."""
+        return (stride // self.lanes, *others), (max(group // self.lanes, 1), *(1 for _ in others))
 
 
 @dataclass(frozen=True)

@@ -8,35 +8,108 @@ coefficients (cl/refit/gather.cl). W weighs pixels so that all views count the s
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pyopencl as cl
 
 from potr_cl.model.camera import Camera
+from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.view_cache import ViewCache
 from potr_cl.raster.view_set import TABLE_ENTRY, ViewSet
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.refitting.coefficients import Coefficients, Vector
-from potr_cl.stages.refitting.fixed_point import gathered_scale
-from potr_cl.stages.refitting.sweep import Sweep
-from potr_cl.stages.refitting.view_errors import ViewErrors
-from potr_cl.stages.refitting.view_kernels import Picks, SweptSums, ViewKernels
+from potr_cl.stages.refitting.view_kernels import Picks, Sweep, SweptSums, ViewKernels, gathered_scale
 from potr_cl.views import plan as plans
-from potr_cl.views.budget import free_memory, target_bytes
+from potr_cl.views.budget import free_memory, target_bytes, tiles_of
 from potr_cl.views.engine import Launch, Ready, ViewEngine
 from potr_cl.views.reached import Reach
 from potr_cl.views.subsets import ListedSplats, Subset, WholeScene
 from potr_cl.views.targets import TargetPictures, Targets
+
+
+class ViewErrors(Owner):
+    """Each tile's error, of all launches of a gradient.
+
+    They are asked for once, when all is enqueued: while one thread waits for what it downloads, some drivers let no
+    other one use that device, and others may want to read from it what they need to begin with their views.
+
+    Args:
+        device: that computes.
+        cameras: all views. weights: what a pixel of each counts.
+        launches: numbers of the views that each launch does.
+
+    Attributes:
+        latest: (tiles,) float32 on the device, where a sweep writes what it finds.
+
+    Raises:
+        DeviceError: the device has no room.
+    """
+
+    def __init__(
+        self, device: Device, cameras: Sequence[Camera], weights: Sequence[float], launches: Sequence[Sequence[int]]
+    ) -> None:
+        self._device, self._weights = device, list(weights)
+        self._numbers = [number for each in launches for number in each]
+        self._ends = [0, *itertools.accumulate(tiles_of(cameras[number]) for number in self._numbers)]
+        most = max((sum(tiles_of(cameras[number]) for number in each) for each in launches), default=0)
+        self._memory = Memory(device)
+        with device.all_or_nothing():
+            self.latest = self._memory.allocate(4 * most, "the tiles' errors")
+            self._all = self._memory.allocate(4 * self._ends[-1], "the tiles' errors")
+
+    def keep(self, views: range) -> None:
+        """Enqueue that what the last sweep has found is kept until :meth:`found`; views by their place in launches."""
+        first, end = self._ends[views.start], self._ends[views.stop]
+        self._device.copy(self._all, self.latest, 4 * (end - first), to=4 * first)
+
+    def found(self) -> dict[int, float]:
+        """The squared error by W of each view, by its number among all; waits for the device."""
+        tiles = self._device.download(self._all, (self._ends[-1],), np.float32)
+        return {
+            number: self._weights[number] * float(tiles[first:end].sum(dtype=np.float64))
+            for number, (first, end) in zip(self._numbers, itertools.pairwise(self._ends), strict=True)
+        }
+
+    def close(self) -> None:
+        """Give the device's memory back."""
+        self._memory.close()
+
 
 #: Bytes a splat and view of a sweep's own buffers: the colours' change and the sums.
 _CHANGE, _TOTALS = 16, 32
 #: Views are divided into so many parts, every second one in each, where each has as many as are enough: with 62 in
 #: each, steps by one part lost 0.01 dB on a captured scene, and 0.03 on its pictures a third as wide.
 _PARTS, ENOUGH = 2, 80
+
+
+@dataclass(frozen=True)
+class Look:
+    """What views are looked at with, and what is added up.
+
+    Attributes:
+        x: (3 M, stride) float32 on the device, coefficients or a direction; None: black, for blocks alone.
+        targets: what pictures of coefficients should show; None: x is a direction.
+        at: the coefficients, where x is a direction. unit: it is multiplied by this.
+        constant: only constant coefficients: leave the sums of others alone; a direction's others are all 0.
+        part: of the views; None: all.
+        blocks: (M (M + 1) / 2, n) int64, to which n splats' own blocks are added. first_block: the first of these.
+        drawn: (stride,) uint8, becomes 1 for each splat that any of the views draws; not where each view has splats of
+            its own. None: it is not wanted.
+    """
+
+    x: cl.Buffer | None = None
+    targets: Targets | None = None
+    at: Vector | None = None
+    unit: float | None = None
+    constant: bool = False
+    part: int | None = None
+    blocks: cl.Buffer | None = None
+    first_block: int = 0
+    drawn: cl.Buffer | None = None
 
 
 class OwnViews(Owner):
@@ -98,6 +171,8 @@ class OwnViews(Owner):
             plan = plans.in_launches(parts, rooms, self._cache, sweep.most_views, _CHANGE + _TOTALS)
             self._engine: ViewEngine[_Attached] = ViewEngine(source, cameras, plan, _Attached, sweep.most_views)
             self._owned.append(self._engine)
+            if memory is not None:  # pictures are kept in what streamed views leave
+                self._cache.room = max(self._cache.room - self._engine.passing, 0)
             rasterizer.rest()
             launches = sorted(self._engine.walk(), key=lambda each: each.numbers[0] % self.parts)
             ends = [0, *itertools.accumulate(len(each.numbers) for each in launches)]
@@ -148,107 +223,47 @@ class OwnViews(Owner):
         """
         self._targets.fill([each.launch.numbers for each in self._launches], targets)
 
-    def gradient(
-        self,
-        x: cl.Buffer,
-        targets: Targets,
-        blocks: cl.Buffer | None,
-        constant: bool = False,
-        drawn: cl.Buffer | None = None,
-    ) -> None:
-        """Enqueue :meth:`potr_cl.stages.refitting.colour_map.ColourMap.gradient` of these views.
-
-        Args:
-            x, targets, constant: as there.
-            blocks: (M (M + 1) / 2, n) int64, the same of the first n splats' own blocks; None: they are not wanted.
-            drawn: (stride,) uint8, becomes 1 for each splat that any of these views draws; not where each view has
-                splats of its own. None: it is not wanted.
-        """
-
-        def sweep(own: _Own, ready: Ready[_Attached], slot: _Slot) -> None:
-            views, (_, colours) = ready.views, ready.geometry
-            self._kernels.colour(views, own.picks(ready), x, colours, colours)
-            pictures = self._targets.of(own.launch.numbers, targets)
-            self._enqueue_sweep(ready, colours, pictures, blocks is not None, slot)
-            if drawn is not None:
-                self._kernels.mark_drawn(views, drawn)
-            # Which of them are cut, the gathering asks.
-            nbytes = _CHANGE * views.stride * len(own.views)
-            cl.enqueue_copy(self._device.queue, slot.change, colours, byte_count=nbytes)
-            self._errors.keep(own.views)
-
-        self._add_up(sweep, constant=constant, blocks=blocks)
+    def add_up(self, look: Look) -> None:
+        """Enqueue what adds to :attr:`sums`, and to blocks, what views give."""
+        kernels, targets = self._kernels, look.targets
+        background = (0.0, 0.0, 0.0) if targets is None else self._background
+        if look.x is None:
+            self._coefficients.zero(self._change)  # black, and no channel is free
+        for gathered in itertools.chain(*(self._gathered if look.part is None else [self._gathered[look.part]])):
+            every = range(gathered[0].views.start, gathered[-1].views.stop)
+            for slot, own in zip(self._slots, gathered, strict=False):
+                with self._engine.ready(own.launch) as ready:
+                    views, picks, (shapes, colours) = ready.views, own.picks(ready), ready.geometry
+                    swept, target = slot.change, None
+                    if targets is not None:
+                        kernels.colour(views, picks, look.x, colours, colours)
+                        swept, target = colours, self._targets.of(own.launch.numbers, targets)
+                    elif look.x is not None:
+                        assert look.at is not None
+                        anew = ready.shares or own.launch.resident is None
+                        if anew and picks is None:  # which colours are cut is not known any more
+                            at = self._coefficients.on_device(look.at, 1)
+                            kernels.colour(views, picks, at, colours, colours)
+                        kernels.colour(views, picks, look.x, slot.change, colours, look.unit, look.constant)
+                    scale, errors = self._fixed_points[ready.numbers[0]], self._errors.latest
+                    weights = look.blocks is not None
+                    self._sweep.run(views, shapes, swept, background, target, scale, errors, slot.totals, weights)
+                    if targets is not None:
+                        if look.drawn is not None:
+                            kernels.mark_drawn(views, look.drawn)
+                        # Which of them are cut, the gathering asks.
+                        self._device.copy(slot.change, colours, _CHANGE * views.stride * len(own.views))
+                        self._errors.keep(own.views)
+                    place = TABLE_ENTRY * (own.views.start - every.start)
+                    self._device.copy(self._tables, views.table, TABLE_ENTRY * len(own.views), place)
+            found = SweptSums(
+                self._totals, self._change, ready.views.stride, ready.subset.numbers, self._tables, every
+            )  # fmt: skip
+            kernels.gather(found, self.sums, look.constant, look.blocks, look.first_block)
 
     def found_errors(self) -> dict[int, float]:
-        """The squared error by W of each of these views after :meth:`gradient`, by number."""
+        """The squared error by W of each of these views after a look at coefficients, by number."""
         return self._errors.found()
-
-    def blocks(self, blocks: cl.Buffer, first: int) -> None:
-        """Enqueue the blocks' part of :meth:`gradient` alone, of the splats from one on."""
-        self._coefficients.zero(self._change)  # black, and no channel is free
-
-        def sweep(own: _Own, ready: Ready[_Attached], slot: _Slot) -> None:
-            self._enqueue_sweep(ready, slot.change, None, True, slot)
-
-        self._add_up(sweep, blocks=blocks, first_block=first)
-
-    def normal(
-        self, direction: cl.Buffer, at: Vector, unit: float, constant: bool = False, part: int | None = None
-    ) -> None:
-        """Enqueue :meth:`potr_cl.stages.refitting.colour_map.ColourMap.normal` of these views.
-
-        Args:
-            direction, at, constant, part: as there; the direction on the device.
-            unit: the direction is multiplied by this.
-        """
-
-        def sweep(own: _Own, ready: Ready[_Attached], slot: _Slot) -> None:
-            views, picks, (_, colours) = ready.views, own.picks(ready), ready.geometry
-            anew = ready.shares or own.launch.resident is None
-            if anew and picks is None:  # which colours are cut is not known any more
-                self._kernels.colour(views, picks, self._coefficients.on_device(at, 1), colours, colours)
-            self._kernels.colour(views, picks, direction, slot.change, colours, unit, constant)
-            self._enqueue_sweep(ready, slot.change, None, False, slot)
-
-        self._add_up(sweep, part, constant)
-
-    def _add_up(
-        self,
-        sweep: Callable[[_Own, Ready[_Attached], _Slot], None],
-        part: int | None = None,
-        constant: bool = False,
-        blocks: cl.Buffer | None = None,
-        first_block: int = 0,
-    ) -> None:
-        """Enqueue what adds the sums of views to :attr:`sums`, and to blocks.
-
-        Args:
-            sweep: enqueues a group's sweep, given where its sums go.
-            part: of the views; None: all.
-            constant, blocks, first_block: as of :meth:`ViewKernels.gather`.
-        """
-        for of_part in self._gathered if part is None else [self._gathered[part]]:
-            for gathered in of_part:
-                views = range(gathered[0].views.start, gathered[-1].views.stop)
-                for slot, own in zip(self._slots, gathered, strict=False):
-                    with self._engine.ready(own.launch) as ready:
-                        sweep(own, ready, slot)
-                        start, size = TABLE_ENTRY * (own.views.start - views.start), TABLE_ENTRY * len(own.views)
-                        cl.enqueue_copy(
-                            self._device.queue, self._tables, ready.views.table, byte_count=size, dst_offset=start
-                        )
-                picks, stride = ready.subset.numbers, ready.views.stride
-                found = SweptSums(self._totals, self._change, stride, picks, self._tables, views)
-                self._kernels.gather(found, self.sums, constant, blocks, first_block)
-
-    def _enqueue_sweep(
-        self, ready: Ready[_Attached], colours: cl.Buffer, target: cl.Buffer | None, weights: bool,
-        slot: _Slot,
-    ) -> None:  # fmt: skip
-        """Enqueue a group's sweep; without a target colours are a change, and black is behind them."""
-        background = (0.0, 0.0, 0.0) if target is None else self._background
-        views, (shapes, _), scale = ready.views, ready.geometry, self._fixed_points[ready.numbers[0]]
-        self._sweep.run(views, shapes, colours, background, target, scale, self._errors.latest, slot.totals, weights)
 
     def close(self) -> None:
         """Give all device memory back."""

@@ -57,14 +57,12 @@ class PackedRow(Owner):
         counts = self._device.download(self._starts.buffer, (runs,), np.uint64)
         ends = np.cumsum(counts, dtype=np.uint64)
         self.count = int(ends[-1])
-        with self._device.errors("failed while computing"):
-            cl.enqueue_copy(self._device.queue, self._starts.buffer, ends - counts, is_blocking=True)
+        self._device.copy(self._starts.buffer, ends - counts)
         self._launch_runs("place_active", starts=self._starts.buffer, places=self._places.buffer)
 
     def set_flags(self, flags: NDArray[np.uint32]) -> None:
         """Pack by these, (2, N), from now on."""
-        with self._device.errors("failed while computing"):
-            cl.enqueue_copy(self._device.queue, self.flags, self.padded(flags), is_blocking=True)
+        self._device.copy(self.flags, self.padded(flags))
         self.settle()
 
     def padded(self, flags: NDArray[np.uint32]) -> NDArray[np.uint32]:

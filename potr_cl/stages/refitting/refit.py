@@ -25,10 +25,11 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.colour_grid import ColourGrid
+from potr_cl.stages.refitting.coefficients import Vector
 from potr_cl.stages.refitting.colour_refit import ColourRefit, HelpFrom
 from potr_cl.stages.refitting.coming_scene import AnyScene
-from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
-from potr_cl.stages.refitting.rounding import Steps
+from potr_cl.stages.refitting.refit_options import Descent, RefitOptions, Refitted
+from potr_cl.stages.refitting.rounding import ROUNDS, Rounding, Steps
 from potr_cl.stages.refitting.solver import Solved
 from potr_cl.views.targets import Targets
 
@@ -37,6 +38,9 @@ _CONSTANT_STEPS = 3
 #: Of the time of a re-fit, in that of a step, as measured with four scenes on a CPU: until its first step; and, where
 #: colours are rounded, after its last one, of which a part until all but the last ones are.
 _BEGINNING, _ROUNDING, _OF_FIRST_ROUNDS = 5, 7, 4
+#: What a coefficient that becomes 0 as it is rounded is worth, as a part of what one is worth that is given up before.
+#: What the others of the splat are counted on to make up for is more than they can.
+_WORTH = 0.4
 #: What is nearer to 0 than this was 0 before it was made R, G and B.
 _ZERO = 1e-6
 
@@ -80,7 +84,7 @@ def refit_colours(
     """
     options = options or RefitOptions()
     more = 0 if fix_ac is None and colour_grid is None else _ROUNDING
-    steps = options.steps + (options.selection_steps if options.drop else 0)
+    steps = options.most_steps
 
     def report(done: int, _: int = steps) -> None:
         if progress is not None:
@@ -107,15 +111,16 @@ def refit_colours(
             way.begin()
             report(0)
 
-        solved = refit.solve_on_device(
-            scene.sh, targets, options, active, progress=report, check=False, after_start=begin
-        )
+        how = (refit.colour_map, targets, options.descent, options.selection, report)
+        refit.start_from(scene.sh, active)
+        solved = refit.solver.solve(*how, check=False, after_start=begin)
         result, at_start = way.finish(solved)
         # How good the solution was, the next one has measured at its start: that saves a sweep. Only if it looks bad is
         # it measured by itself, because the rounding may be what was bad. Where many colours were cut at 0 on the way,
         # it is the solution.
         if not at_start <= solved.worst and not way.error() <= solved.worst:
-            solved = refit.solve_on_device(scene.sh, targets, options, active, progress=report, after_start=begin)
+            refit.start_from(scene.sh, active)
+            solved = refit.solver.solve(*how, after_start=begin)
             result, _ = way.finish(solved)
         return result
 
@@ -146,21 +151,41 @@ class _OnGrid:
     colour_grid: Callable[[FloatArray], ColourGrid]
     after_first: Callable[[], None]
     _steps: Future[Steps] | None = None
+    _unrounded: Vector | None = None
 
     def begin(self) -> None:
+        stride = self.refit.coefficients.layout.stride
+
         def find(effects: FloatArray) -> Steps:
-            return self.refit.steps_of(self.colour_grid(effects))
+            return Steps.of(self.colour_grid(effects), stride)
 
         self._steps = in_background(find, self.refit.worth_of_constants())
 
     def finish(self, solved: Solved) -> tuple[Refitted, float]:
         assert self._steps is not None
-        rounded = self.refit.round_to(self._steps.result(), self.targets, self.options, self.after_first)
-        result = Refitted(self.refit.colours(), (solved.errors[0], rounded.errors[1]), solved.steps + rounded.steps)
-        return result, rounded.errors[0]
+        coefficients, colour_map, solver = self.refit.coefficients, self.refit.colour_map, self.refit.solver
+        steps_of_splats, steps, errors, ridge = self._steps.result(), solved.steps, list[float](), self.options.ridge
+        if self._unrounded is None:
+            self._unrounded = coefficients.vector()
+        coefficients.copy(self._unrounded, solver.x)
+        worth = _WORTH * self.options.drop * colour_map.total_weight
+        with Rounding(coefficients, steps_of_splats) as rounding:
+            *first, last = ROUNDS
+            for each in first:
+                rounding.round(solver.x, solver.blocks, each, worth)
+                gone_on = solver.go_on(colour_map, self.targets, Descent(each.steps, 0.0, ridge, part=0))
+                steps += gone_on.steps
+                errors.append(gone_on.start)
+            self.after_first()
+            rounding.round(solver.x, solver.blocks, last, worth)
+            again = solver.solve(colour_map, self.targets, Descent(last.steps, 0.0, ridge, part=1), constant=True)
+        # But for the last constant coefficients, which are rounded as the file is made.
+        return Refitted(self.refit.colours(), (solved.errors[0], again.errors[1]), steps + again.steps), errors[0]
 
     def error(self) -> float:
-        return self.refit.error(self.targets)
+        assert self._unrounded is not None
+        self.refit.coefficients.copy(self.refit.solver.x, self._unrounded)
+        return self.refit.solver.error(self.refit.colour_map, self.targets)
 
 
 @dataclass
@@ -188,7 +213,9 @@ class _AsTheFileDoes:
         return Refitted(sh, (solved.errors[0], again.errors[1]), solved.steps + again.steps), again.errors[0]
 
     def error(self) -> float:
-        return self.refit.error(self.targets, self._found)
+        assert self._found is not None
+        self.refit.coefficients.write_sh(self.refit.solver.x, self._found)
+        return self.refit.solver.error(self.refit.colour_map, self.targets)
 
 
 def chosen_coefficients(sh: FloatArray) -> NDArray[np.bool_]:

@@ -2,10 +2,42 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from potr_cl.errors import UsageError
 from potr_cl.model.scene import FloatArray
+from potr_cl.stages.refitting.layout import Ridge
+
+
+@dataclass(frozen=True)
+class Descent:
+    """How to find a solution.
+
+    Attributes:
+        steps: the most conjugate-gradient steps.
+        gain: stop when a step takes less than this part off the objective.
+        ridge: what holds the coefficients down or near their start.
+        part: of the views (:attr:`OwnViews.parts`) by which the normal equations are made, for a way that need not be
+            exact because another one follows, or leads less far; None: of all.
+    """
+
+    steps: int
+    gain: float
+    ridge: Ridge
+    part: int | None = None
+
+
+@dataclass(frozen=True)
+class Selection:
+    """How to choose the AC coefficients that are given up.
+
+    Attributes:
+        descent: how to come near to the solution before the choice.
+        least: coefficients that cost less mean squared error than this are given up.
+    """
+
+    descent: Descent
+    least: float
 
 
 @dataclass(frozen=True)
@@ -53,6 +85,29 @@ class RefitOptions:
         for name in ("lam", "chroma_factor", "prior", "drop", "selection_lam"):
             if not 0 <= getattr(self, name) <= 1e12:
                 raise UsageError(f"the re-fit's {name} is {getattr(self, name):g}, it must lie between 0 and 1e12")
+
+    @property
+    def ridge(self) -> Ridge:
+        """What holds the coefficients down or near their start."""
+        return Ridge(self.lam, self.chroma_factor, self.prior)
+
+    @property
+    def descent(self) -> Descent:
+        """The way to the solution."""
+        return Descent(self.steps, self.gain, self.ridge)
+
+    @property
+    def selection(self) -> Selection | None:
+        """What comes before it; None: no coefficient is given up."""
+        if not self.drop:
+            return None
+        ridge = replace(self.ridge, lam=self.selection_lam)
+        return Selection(Descent(self.selection_steps, self.gain, ridge, part=0), self.drop)
+
+    @property
+    def most_steps(self) -> int:
+        """Steps of both together, at the most."""
+        return self.steps + (self.selection_steps if self.drop else 0)
 
 
 @dataclass(frozen=True)

@@ -77,8 +77,8 @@ class Slice:
         return self.buffers[array]
 
     def run(self, kernel: Kernel, *others: int, **group: int) -> None:
-        """Launch a bound kernel over the splats, as :meth:`.layout.Layout.over_splats` does it."""
-        self.layout.over_splats(kernel, *others, stride=len(self.splats), **group)
+        """Launch a bound kernel over the splats, with work-items as :meth:`.layout.Layout.items` has them."""
+        kernel.launch(*self.layout.items(len(self.splats), *others, **group))
 
 
 class SlicedArrays(Owner):
@@ -145,8 +145,7 @@ class SlicedArrays(Owner):
         elif isinstance(x, HostArray):
             self._to_device(x, y)
         else:
-            with self.device.errors("failed while computing"):
-                cl.enqueue_copy(self.device.queue, y, x, byte_count=min(x.size, y.size))
+            self.device.copy(y, x)
 
     def _to_device(self, x: HostArray, buffer: cl.Buffer, first: int = 0, count: int | None = None) -> None:
         if x.zero:
@@ -229,7 +228,7 @@ class SlicedArrays(Owner):
             if written and isinstance(arrays[0], HostArray):
                 self._ferry.to_host([Cargo(arrays[0].values.reshape(-1)[first : first + some])], buffers[0])
             elif written:
-                self._copy(arrays[0], buffers[0], some, to=first)
+                self.device.copy(arrays[0], buffers[0], 4 * some, to=4 * first)
         if written:
             _changed(arrays[0])
 
@@ -244,14 +243,8 @@ class SlicedArrays(Owner):
             self._to_device(x, buffer, first, count)
         else:
             # Not a part of the buffer: NVIDIA's driver carries these to the host and back.
-            self._copy(buffer, x, count, of=first)
+            self.device.copy(buffer, x, 4 * count, of=4 * first)
         return buffer
-
-    def _copy(self, target: cl.Buffer, source: cl.Buffer, count: int, to: int = 0, of: int = 0) -> None:
-        with self.device.errors("failed while computing"):
-            cl.enqueue_copy(
-                self.device.queue, target, source, byte_count=4 * count, dst_offset=4 * to, src_offset=4 * of
-            )
 
     def _place(self, columns: int, number: int) -> cl.Buffer:
         if (columns, number) not in self._places:
@@ -293,17 +286,17 @@ class SlicedArrays(Owner):
 
     # ------------------------------------------------------------------------------------------ sums
 
-    def add_sums(self, x: Array, sums: cl.Buffer, unit: float, count: int | None = None) -> None:
+    def add_sums(self, x: Array, sums: cl.Buffer, unit: float, constant: bool = False) -> None:
         """x += unit times integers, which become 0.
 
         Args:
             x: with as many columns as vectors have.
             sums: (columns, stride) int64 in the device's memory.
             unit: in single precision.
-            count: of the values, the first ones, where all others are 0; None: all.
+            constant: only the constant coefficients' columns, which come first; all other sums are 0.
         """
         # Of zeros all are written: they only stand for them.
-        count = None if isinstance(x, HostArray) and x.zero else count
+        count = 3 * self.layout.stride if constant and not (isinstance(x, HostArray) and x.zero) else None
         for first, some, (piece,) in self.pieces(x, count=count, written=True):
             self._add_fixed(piece, sums, first, some, unit)
 

@@ -16,49 +16,126 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.coefficients import Coefficients, Vector
 from potr_cl.stages.refitting.colour_map import ColourMap
-from potr_cl.stages.refitting.conjugate_gradients import ConjugateGradients
 from potr_cl.stages.refitting.layout import Ridge
+from potr_cl.stages.refitting.refit_options import Descent, Selection
 from potr_cl.views.targets import Targets
+
+#: Steps end where the residual's square, as the preconditioner measures it, has shrunk by this: single precision has no
+#: more digits, and what is left of them leads astray.
+_CONVERGED = 1e-14
+
+
+class Vectors(Protocol):
+    """Arithmetic of vectors; :class:`potr_cl.stages.refitting.coefficients.Coefficients` is one."""
+
+    def vector(self, rank: int) -> Vector:
+        """A new vector; the lower the rank, the more often it is used."""
+        ...
+
+    def zero(self, x: Vector) -> None:
+        """x = 0."""
+        ...
+
+    def combine(self, a: float, y: Vector, b: float, x: Vector) -> None:
+        """y = a y + b x."""
+        ...
+
+    def dot(self, x: Vector, y: Vector) -> float:
+        """x · y."""
+        ...
+
+
+@dataclass(frozen=True)
+class System:
+    """Linear equations with a symmetric positive matrix H.
+
+    Attributes:
+        product: of a direction and a result: result = H direction.
+        precondition: of a residual and a result: result = about H⁻¹ residual, by a symmetric positive matrix.
+    """
+
+    product: Callable[[Vector, Vector], None]
+    precondition: Callable[[Vector, Vector], None]
+
+
+class ConjugateGradients:
+    """Minimises x · H x / 2 - b · x, whose residual is b - H x.
+
+    Args:
+        vectors: makes the vectors that the steps need, and computes with them.
+
+    Attributes:
+        direction, product, preconditioned: the vectors; free for other use between solutions.
+    """
+
+    def __init__(self, vectors: Vectors) -> None:
+        self._vectors = vectors
+        self.direction, self.product, self.preconditioned = (vectors.vector(rank) for rank in (0, 1, 4))
+
+    def descend(
+        self,
+        system: System,
+        x: Vector,
+        residual: Vector,
+        objective: float,
+        steps: int,
+        gain: float,
+        after_step: Callable[[int], None],
+    ) -> int:
+        """Steps from x.
+
+        Args:
+            system: the equations.
+            x: where to start; is moved.
+            residual: at x; is moved along.
+            objective: of least squares at x, x · H x - 2 b · x and a constant that makes it 0 or more.
+            steps: at the most.
+            gain: stop after a step that takes less than this part off the objective that is left.
+            after_step: called with the number of steps done.
+
+        Returns:
+            The number of steps done.
+
+        Raises:
+            DeviceError: the device failed.
+        """
+        vectors, direction, product, preconditioned = self._vectors, self.direction, self.product, self.preconditioned
+        vectors.zero(direction)
+        slope, least = 0.0, 0.0
+        for step in range(steps):
+            system.precondition(residual, preconditioned)
+            new_slope = vectors.dot(preconditioned, residual)
+            least = _CONVERGED * new_slope if step == 0 else least
+            if not (new_slope > least and math.isfinite(new_slope)):
+                return step
+            vectors.combine(new_slope / slope if step else 0.0, direction, 1.0, preconditioned)
+            slope = new_slope
+            system.product(direction, product)
+            curvature = vectors.dot(direction, product)
+            if not (curvature > 0 and math.isfinite(curvature)):
+                return step
+            length = slope / curvature
+            vectors.combine(1.0, x, length, direction)
+            vectors.combine(1.0, residual, -length, product)
+            gained = length * slope
+            objective -= gained
+            after_step(step + 1)
+            if gained < gain * objective:
+                return step + 1
+        return steps
+
 
 #: Half steps tried when a solution is worse than its start because colours were cut at 0 on the way.
 _HALVINGS = 4
-
-
-@dataclass(frozen=True)
-class Descent:
-    """How to find a solution.
-
-    Attributes:
-        steps: the most conjugate-gradient steps.
-        gain: stop when a step takes less than this part off the objective.
-        ridge: what holds the coefficients down or near their start.
-        part: of the views (:attr:`OwnViews.parts`) by which the normal equations are made, for a way that need not be
-            exact because another one follows, or leads less far; None: of all.
-    """
-
-    steps: int
-    gain: float
-    ridge: Ridge
-    part: int | None = None
-
-
-@dataclass(frozen=True)
-class Selection:
-    """How to choose the AC coefficients that are given up.
-
-    Attributes:
-        descent: how to come near to the solution before the choice.
-        least: coefficients that cost less mean squared error than this are given up.
-    """
-
-    descent: Descent
-    least: float
 
 
 @dataclass(frozen=True)
@@ -88,30 +165,6 @@ class _Problem:
     colour_map: ColourMap
     targets: Targets
     constant: bool
-
-
-@dataclass(frozen=True)
-class _NormalEquations:
-    """The matrix Aᵀ W A + ridge of the conjugate gradients; colours are cut at 0 as they are ``at`` a vector.
-
-    With ``constant``, only DC may change.
-    """
-
-    colour_map: ColourMap
-    coefficients: Coefficients
-    blocks: SplatBlocks
-    ridge: Ridge
-    at: Vector
-    constant: bool
-    part: int | None
-
-    def precondition(self, residual: Vector, result: Vector) -> None:
-        self.blocks.precondition(residual, self.ridge, result)
-
-    def product(self, direction: Vector, result: Vector) -> None:
-        self.coefficients.zero(result)
-        self.colour_map.normal(direction, self.at, result, self.constant, self.part)
-        self.coefficients.add_ridge(result, direction, self.ridge)
 
 
 @dataclass(frozen=True)
@@ -173,20 +226,38 @@ class ColourSolver:
             DeviceError: the device failed.
         """
         problem = _Problem(colour_map, targets, constant)
-        self._coefficients.copy(self._start, self.x)
-        ridge = (selection.descent if selection else descent).ridge
-        first = self._linearise(problem, ridge, None if constant else self.blocks)
+        vectors, gradients, ridge, whole = self._coefficients, self._gradients, descent.ridge, colour_map.total_weight
+        vectors.copy(self._start, self.x)
+        first_ridge = selection.descent.ridge if selection else ridge
+        state = first = self._linearise(problem, first_ridge, None if constant else self.blocks)
         after_start()
-        state, steps = first, 0
+        steps, residual = 0, self._residual
         if selection is not None:
-            state, steps = self._choose(problem, first, selection, descent.ridge, after_step)
-        more = self._descend(problem, state, descent, lambda done: after_step(steps + done))
-        whole = colour_map.total_weight
+            how, chosen_from = selection.descent, vectors.save_flags()
+            system = self._system(problem, how)
+            steps = gradients.descend(system, self.x, residual, first.objective, how.steps, how.gain, after_step)
+            state, steps = self._choose(problem, first, chosen_from, steps, selection.least * whole, ridge)
+        more = gradients.descend(
+            self._system(problem, descent),
+            self.x,
+            residual,
+            state.objective,
+            descent.steps,
+            descent.gain,
+            lambda done: after_step(steps + done),
+        )
         start = state.error / whole
         if not check:
             return Solved((first.error / whole, math.nan), steps + more, start)
-        last = self._halve_until_better(problem, state, descent.ridge)
-        if last is None:
+        # Go half the way back to the start, again and again, until x is better than the start.
+        last = self._linearise(problem, ridge)
+        for _ in range(_HALVINGS):
+            if last.objective <= state.objective:
+                break
+            vectors.combine(0.5, self.x, 0.5, self._start)
+            last = self._linearise(problem, ridge)
+        if not last.objective <= state.objective:
+            vectors.copy(self.x, self._start)
             last, more = state, 0
         return Solved((first.error / whole, last.error / whole), steps + more, start)
 
@@ -209,8 +280,17 @@ class ColourSolver:
             DeviceError: the device failed.
         """
         problem = _Problem(colour_map, targets, constant=False)
-        state = self._start_here(problem, descent.ridge)
-        steps = self._descend(problem, state, descent, lambda done: None)
+        self._coefficients.copy(self._start, self.x)
+        state = self._linearise(problem, descent.ridge)
+        steps = self._gradients.descend(
+            self._system(problem, descent),
+            self.x,
+            self._residual,
+            state.objective,
+            descent.steps,
+            descent.gain,
+            lambda done: None,
+        )
         start = state.error / colour_map.total_weight
         return Solved((start, math.nan), steps, start)
 
@@ -231,60 +311,38 @@ class ColourSolver:
         vectors.combine(-1.0, residual, -ridge.prior, change)
         return _State(error, error + penalty)
 
-    def _descend(self, problem: _Problem, state: _State, how: Descent, after_step: Callable[[int], None]) -> int:
-        """Take conjugate-gradient steps from where x was linearised; returns their number."""
-        equations = _NormalEquations(
-            problem.colour_map, self._coefficients, self.blocks, how.ridge, self._start, problem.constant, how.part
-        )
-        return self._gradients.descend(
-            equations, self.x, self._residual, state.objective, how.steps, how.gain, after_step
-        )
-
-    def _halve_until_better(self, problem: _Problem, state: _State, ridge: Ridge) -> _State | None:
-        """Go half the way back to the start, again and again, until x is better than the start.
-
-        Returns:
-            The state at x; None if nothing helps, with x back at the start.
-        """
-        last = self._linearise(problem, ridge)
-        for _ in range(_HALVINGS):
-            if last.objective <= state.objective:
-                break
-            self._coefficients.combine(0.5, self.x, 0.5, self._start)
-            last = self._linearise(problem, ridge)
-        if not last.objective <= state.objective:
-            self._coefficients.copy(self.x, self._start)
-            return None
-        return last
+    def _system(self, problem: _Problem, how: Descent) -> System:
+        """Aᵀ W A + ridge; colours are cut at 0 as they are at the start."""
+        normal = problem.colour_map.normal
+        product = partial(normal, at=self._start, ridge=how.ridge, constant=problem.constant, part=how.part)
+        return System(product, partial(self.blocks.precondition, ridge=how.ridge))
 
     def _choose(
-        self, problem: _Problem, first: _State, how: Selection, ridge: Ridge, after_step: Callable[[int], None]
+        self,
+        problem: _Problem,
+        first: _State,
+        chosen_from: NDArray[np.uint32],
+        steps: int,
+        least: float,
+        ridge: Ridge,
     ) -> tuple[_State, int]:
-        """Come near to the solution, give up what costs little there, and start anew from what is left.
+        """Give up what costs little where x has come to, and start anew from what is left.
 
         Returns:
             The new start's state, and the steps that led to it.
         """
-        vectors = self._coefficients
-        chosen_from = vectors.save_flags()
-        steps = self._descend(problem, first, how.descent, after_step)
-        least = how.least * problem.colour_map.total_weight
-        self._give_up(least, ridge)
+        vectors, blocks = self._coefficients, self.blocks
+        blocks.give_up(self.x, ridge.prior, least)
         former_start = self._gradients.preconditioned
         vectors.copy(former_start, self._start)
-        state = self._start_here(problem, ridge)
+        vectors.copy(self._start, self.x)
+        state = self._linearise(problem, ridge)
         given_up = least * int(np.bitwise_count(chosen_from ^ vectors.save_flags()).sum())
         if not state.error <= first.error + given_up:
             # Colours were cut at 0 on the way: choose among the coefficients as they were.
             vectors.copy(self.x, former_start)
             vectors.restore_flags(chosen_from)
-            self._give_up(least, ridge)
-            state, steps = self._start_here(problem, ridge), 0
+            blocks.give_up(self.x, ridge.prior, least)
+            vectors.copy(self._start, self.x)
+            state, steps = self._linearise(problem, ridge), 0
         return state, steps
-
-    def _give_up(self, least: float, ridge: Ridge) -> None:
-        self.blocks.give_up(self.x, ridge.prior, least)
-
-    def _start_here(self, problem: _Problem, ridge: Ridge) -> _State:
-        self._coefficients.copy(self._start, self.x)
-        return self._linearise(problem, ridge)

@@ -1,17 +1,164 @@
-"""From coefficients to the splats' colours in views, and from what a sweep leaves there back: :class:`ViewKernels`."""
+"""What kernels do with views in a re-fit: from coefficients to splats' colours (:class:`ViewKernels`), from these to
+the pixels' values and to sums for each splat (:class:`Sweep`), and from the sums to coefficients.
+
+The sums over a view's pixels are integers, so that the bits are the same on every run.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pyopencl as cl
 
+from potr_cl.model.camera import Camera
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.kernel import Kernel
-from potr_cl.raster.view_set import ViewSet
+from potr_cl.raster.macros import gpu_limits, totals_limits
+from potr_cl.raster.rules import RasterRules
+from potr_cl.raster.view_set import TILE, ViewSet, camera_struct
 from potr_cl.stages.refitting.layout import Layout
+
+#: Pixel values beyond this are cut in the kernels (macro LARGEST_VALUE of cl/refit/refit.clh): no sum can overflow.
+LARGEST_VALUE = 64.0
+
+
+def fixed_point_scale(width: int, height: int) -> float:
+    """What sums over a view's pixels are multiplied by: the largest power of two with which 62 bits suffice.
+
+    Args:
+        width, height: of the view in pixels.
+    """
+    area = (width + TILE - 1) * (height + TILE - 1)
+    return float(2.0 ** np.floor(62 - np.log2(LARGEST_VALUE * area)))
+
+
+def gathered_scale(cameras: Sequence[Camera], weights: Sequence[float]) -> float:
+    """What the sums over all views are multiplied by: the largest power of two with which 62 bits suffice.
+
+    A view adds to a coefficient at most three channels' sums, as no SH basis function is above 1.
+
+    Args:
+        cameras: all views.
+        weights: what a pixel of each counts.
+    """
+    areas = [(camera.width + TILE - 1) * (camera.height + TILE - 1) for camera in cameras]
+    bound = 3 * LARGEST_VALUE * math.fsum(weight * area for weight, area in zip(weights, areas, strict=True))
+    return float(2.0 ** math.floor(62 - math.log2(bound)))
+
+
+#: Work-items of a tile's work-group on a GPU, and views of a launch there. A CPU does one view at a time, a work-item a
+#: tile.
+_TILE_GROUP, _MOST_VIEWS = 128, 32
+#: On CPUs, launches whose sums are gathered together: the coefficients' sums, which take much more than a view's, go
+#: through the memory once for so many views.
+_GATHERED = 4
+
+
+class Sweep:
+    """The kernels of one device.
+
+    Args:
+        device: to run on.
+        rules: of the rasterizer.
+
+    Attributes:
+        lanes: splats a work-item, in kernels that go over splats.
+        most_views: that a launch can do.
+        gathered: launches whose sums are gathered together, where each does one view.
+
+    Raises:
+        DeviceError: the kernels cannot be built.
+    """
+
+    def __init__(self, device: Device, rules: RasterRules) -> None:
+        self._gpu = device.family == "gpu"
+        self.lanes = 1 if self._gpu else device.vector_width
+        self.most_views, self.gathered = (_MOST_VIEWS, 1) if self._gpu else (1, _GATHERED)
+        of_family: dict[str, Any] = {"LANES": max(device.vector_width, 8), **totals_limits(device)}
+        if self._gpu:
+            of_family = gpu_limits(device)
+        self._kernels = [
+            device.shared_kernel(
+                "refit/refit_gpu.cl" if self._gpu else "refit/refit_cpu.cl",
+                "refit_sweep",
+                ALPHA_CAP=float(rules.alpha_cap),
+                TRANSMITTANCE_THRESHOLD=rules.transmittance_threshold,
+                LARGEST_VALUE=LARGEST_VALUE,
+                WEIGHTS=weights,
+                **of_family,
+            )
+            for weights in (0, 1)
+        ]
+
+    def fixed_point_scales(self, cameras: Sequence[Camera]) -> list[float]:
+        """What the sums of each view are multiplied by, see :func:`.fixed_point.fixed_point_scale`.
+
+        Args:
+            cameras: all views; those that a launch does have one scale.
+        """
+        if not self._gpu:
+            return [fixed_point_scale(camera.width, camera.height) for camera in cameras]
+        # With it no view can overflow, whichever a launch does together.
+        scale = fixed_point_scale(max(c.width for c in cameras), max(c.height for c in cameras))
+        return [scale] * len(cameras)
+
+    def run(
+        self,
+        views: ViewSet,
+        shapes: cl.Buffer,
+        colours: cl.Buffer,
+        background: tuple[float, float, float],
+        target: cl.Buffer | None,
+        scale: float,
+        errors: cl.Buffer,
+        totals: cl.Buffer,
+        weights: bool,
+    ) -> None:
+        """Enqueue a sweep: from the splats' colours to the pixels' values, and from those to sums for each splat.
+
+        Args:
+            views: prepared.
+            shapes: (views, stride, 8) float32, theirs.
+            colours: (views, stride, 4) float32, R, G, B of each splat in each view.
+            background: R, G, B behind the splats.
+            target: (pixels, 3) float32, view after view: subtracted from the pixels; None: nothing is.
+            scale: the views' fixed point.
+            errors: (tiles,) float32, becomes each tile's sum of squared pixel values.
+            totals: (views, stride, 4) int64: weight times value, three channels, and the squared weights are added.
+            weights: sum up the squared weights too.
+
+        Raises:
+            DeviceError: the device refused it.
+        """
+        of_family: dict[str, Any] = {"views": views.table, "stride": views.stride}
+        if not self._gpu:
+            of_family = {"view": camera_struct(views.views[0].camera)}
+        kernel = self._kernels[weights].bind(
+            **of_family,
+            shapes=shapes,
+            colours=colours,
+            offsets=views.offsets,
+            intersections=views.intersections,
+            subtiles=views.subtiles,
+            red=background[0],
+            green=background[1],
+            blue=background[2],
+            target=colours if target is None else target,
+            has_target=target is not None,
+            scale=scale,
+            errors=errors,
+            totals=totals,
+        )
+        if self._gpu:
+            most = max(view.tiles for view in views.views)
+            kernel.launch((most * _TILE_GROUP, len(views.views)), (_TILE_GROUP, 1))
+        else:
+            kernel.launch((views.tiles,), (1,))
+
 
 #: Work-items of a work-group.
 _GROUP = 64
@@ -108,7 +255,7 @@ class ViewKernels:
             colours=result,
         )
         together = _TOGETHER if picks is None else 1
-        self._layout.over_splats(kernel, -(-len(views.views) // together), stride=views.stride)
+        kernel.launch(*self._layout.items(views.stride, -(-len(views.views) // together)))
 
     def mark_drawn(self, views: ViewSet, drawn: cl.Buffer) -> None:
         """Enqueue: (stride,) uint8 become 1 for each splat that any of some views draws, which have all splats."""
@@ -141,29 +288,28 @@ class ViewKernels:
             first_block: number of the first of them.
         """
         layout = self._layout
-        if blocks is None:
-            self._gather(found, sums, constant)
-            return
-        own = {"first_block": first_block, "block_stride": blocks.size // (8 * layout.triangle), "blocks": blocks}
-        if layout.lanes > 1:
-            self._gather(found, sums, False, own)
-            return
-        # A work-item of a GPU would write a whole block for each view: its blocks have a kernel of their own.
-        kernel = self._kernel("gather_blocks", found, WEIGHTS=0, SOME_BLOCKS=0, **layout.macros)
-        items = own["block_stride"] if found.picks is None else found.stride
-        for arguments in self._arguments(found):
-            kernel.bind(**arguments, **own)
-            kernel.launch((-(-items // _GROUP) * _GROUP, (layout.sh_count + 1) // 2), (_GROUP, 1))
-        self._gather(found, sums, False)
-
-    def _gather(self, found: SweptSums, sums: cl.Buffer, constant: bool, blocks: dict[str, Any] | None = None) -> None:
-        layout = self._layout
-        own = blocks or {"first_block": 0, "block_stride": layout.stride, "blocks": sums}
-        weights, some = int(blocks is not None), int(own["block_stride"] < layout.stride)
+        own = {"first_block": 0, "block_stride": layout.stride, "blocks": sums}
+        weights = some = 0
+        if blocks is not None:
+            of_blocks = {
+                "first_block": first_block, "block_stride": blocks.size // (8 * layout.triangle), "blocks": blocks,
+            }  # fmt: skip
+            if layout.lanes > 1:
+                own, weights, some = of_blocks, 1, int(of_blocks["block_stride"] < layout.stride)
+            else:
+                # A work-item of a GPU would write a whole block for each view: its blocks have a kernel of their own.
+                self._gather_blocks(found, of_blocks)
         kernel = self._kernel("gather", found, WEIGHTS=weights, SOME_BLOCKS=some, **layout.some(constant))
+        items = layout.items(found.stride)
         for arguments in self._arguments(found):
-            kernel.bind(**arguments, **own, free=found.free, result=sums)
-            layout.over_splats(kernel, stride=found.stride)
+            kernel.bind(**arguments, **own, free=found.free, result=sums).launch(*items)
+
+    def _gather_blocks(self, found: SweptSums, blocks: dict[str, Any]) -> None:
+        kernel = self._kernel("gather_blocks", found, WEIGHTS=0, SOME_BLOCKS=0, **self._layout.macros)
+        splats = blocks["block_stride"] if found.picks is None else found.stride
+        items = -(-splats // _GROUP) * _GROUP, (self._layout.sh_count + 1) // 2
+        for arguments in self._arguments(found):
+            kernel.bind(**arguments, **blocks).launch(items, (_GROUP, 1))
 
     def _kernel(self, name: str, found: SweptSums, **macros: int) -> Kernel:
         return self._device.shared_kernel("refit/gather.cl", name, PICKED=int(found.picks is not None), **macros)

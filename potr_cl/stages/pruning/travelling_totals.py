@@ -1,4 +1,5 @@
-"""By how much totals have changed, as that travels between computers: :class:`ChangedTotals`, :class:`AddedChanges`.
+"""Totals of splats as they travel from one device to another: :class:`AlivePacking` of those that are left, where
+devices share a process; :class:`ChangedTotals` and :class:`AddedChanges` by how much they have changed, where not.
 
 A bit for each splat says whether its totals have changed, and a row has the changes of those whose bit is set. Of large
 scenes the host would take longer to compare than a device takes to measure.
@@ -13,19 +14,84 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.opencl.device import Device
+from potr_cl.opencl.kernel import Kernel
 from potr_cl.opencl.memory import Memory, Owner, Scratch, Staging
 from potr_cl.opencl.narrow import Narrowed, Narrowing
+from potr_cl.opencl.relay import Lent
 
 #: (N / 64, rounded up) uint64, a bit for each splat, the lowest first; and (n, 2) int64, the changes of those whose bit
 #: is set.
 Changes: TypeAlias = "tuple[NDArray[np.uint64], Narrowed | NDArray[np.int64]]"
 
-_SOURCE = "prune/changes.cl"
+_SOURCE, _CHANGES_SOURCE = "prune/alive.cl", "prune/changes.cl"
 #: Splats of a run (RUN of the kernels), and work-items of a work-group.
 _RUN, _GROUP = 64, 64
 #: Bytes of a splat's totals.
 _TOTALS = 16
 _WHAT = "the removal effects"
+
+
+class AlivePacking(Owner):
+    """Packs and unpacks; devices that have removed the same splats agree on where each of the others is.
+
+    Args:
+        device: that has the totals.
+        splats: N.
+        states: (N,) uint8 in its memory, :class:`potr_cl.stages.pruning.survivors.SplatState`.
+
+    Raises:
+        DeviceError: the device has no room.
+    """
+
+    def __init__(self, device: Device, splats: int, states: cl.Buffer) -> None:
+        self._device, self._splats, self._states = device, splats, states
+        self._left = splats
+        runs = -(-splats // _RUN)
+        self._runs = runs
+        self._alive, self._pack, self._unpack = (
+            device.kernel(_SOURCE, name) for name in ("alive_runs", "pack_alive", "unpack_alive")
+        )
+        self._packed = Scratch(device, "the removal effects")
+        self._memory = Memory(device)
+        with device.all_or_nothing():
+            self._masks = self._memory.allocate(8 * runs, "the splats that are left")
+            self._starts = self._memory.allocate(4 * runs, "the splats that are left")
+
+    def note(self) -> None:
+        """Pack by the states as they are on the device from now on; before the first call all splats are packed."""
+        self._alive.bind(states=self._states, splats=self._splats, masks=self._masks, counts=self._starts)
+        self._alive.launch((-(-self._runs // _GROUP) * _GROUP,), (_GROUP,))
+        counts = self._device.download(self._starts, (self._runs,), np.uint32)
+        ends = np.cumsum(counts, dtype=np.uint32)
+        self._left = int(ends[-1])
+        self._device.copy(self._starts, ends - counts)
+
+    def lend(self, totals: cl.Buffer) -> Lent:
+        """What others need of (N, 2) int64 totals, until the next call; all of them where all splats are left."""
+        if self._left == self._splats:
+            return Lent(self._device, totals, _TOTALS * self._splats)
+        self._packed.reserve(_TOTALS * self._left)
+        self._launch(self._pack, totals, self._packed.buffer)
+        return Lent(self._device, self._packed.buffer, _TOTALS * self._left)
+
+    def unpack(self, packed: cl.Buffer, totals: cl.Buffer, add: bool) -> None:
+        """Enqueue: totals = or += what was lent by a device that has removed the same splats, and copied here."""
+        self._launch(self._unpack, totals, packed, add=add)
+
+    def are_packed(self, lent: Lent) -> bool:
+        """Whether these are not the totals of all splats."""
+        return lent.nbytes < _TOTALS * self._splats
+
+    def _launch(self, kernel: Kernel, totals: cl.Buffer, packed: cl.Buffer, **more: bool) -> None:
+        kernel.bind(
+            totals=totals, splats=self._splats, masks=self._masks, starts=self._starts, packed=packed, **more
+        )  # fmt: skip
+        kernel.launch((-(-self._splats // _GROUP) * _GROUP,), (_GROUP,))
+
+    def close(self) -> None:
+        """Give the device's memory back."""
+        self._packed.close()
+        self._memory.close()
 
 
 class ChangedTotals(Owner):
@@ -43,7 +109,9 @@ class ChangedTotals(Owner):
 
     def __init__(self, device: Device, splats: int, states: cl.Buffer) -> None:
         self._device, self._splats, self._states = device, splats, states
-        self._find, self._take = (device.kernel(_SOURCE, name, NUMBERED=0) for name in ("changed_runs", "take_changes"))
+        self._find, self._take = (
+            device.kernel(_CHANGES_SOURCE, name, NUMBERED=0) for name in ("changed_runs", "take_changes")
+        )
         self._changes = Scratch(device, _WHAT)
         self._masks, self._narrowing = Staging(device), Narrowing(device)
         self._memory = Memory(device)
@@ -86,8 +154,10 @@ class AddedChanges(Owner):
 
     def __init__(self, device: Device) -> None:
         self._device = device
-        self._add = {numbered: device.kernel(_SOURCE, "add_changes", NUMBERED=int(numbered)) for numbered in (0, 1)}
-        self._count = device.kernel(_SOURCE, "count_runs", NUMBERED=0)
+        self._add = {
+            numbered: device.kernel(_CHANGES_SOURCE, "add_changes", NUMBERED=int(numbered)) for numbered in (0, 1)
+        }
+        self._count = device.kernel(_CHANGES_SOURCE, "count_runs", NUMBERED=0)
         self._runs: dict[int, _Runs] = {}
         self._changes, self._narrowing = Scratch(device, _WHAT), Narrowing(device)
 
@@ -115,12 +185,11 @@ class AddedChanges(Owner):
         if len(masks) != runs.count:
             raise ValueError(f"{len(masks)} words of bits are not those of {splats} splats")
         self._changes.reserve(_TOTALS * changed)
-        with device.errors("failed while computing"):
-            cl.enqueue_copy(device.queue, runs.masks, masks, is_blocking=True)
-            if isinstance(found, Narrowed):
-                self._narrowing.upload(self._changes.buffer, found)
-            else:
-                cl.enqueue_copy(device.queue, self._changes.buffer, found, is_blocking=True)
+        device.copy(runs.masks, masks)
+        if isinstance(found, Narrowed):
+            self._narrowing.upload(self._changes.buffer, found)
+        else:
+            device.copy(self._changes.buffer, found)
         self._count.bind(masks=runs.masks, runs=runs.count, counts=runs.starts)
         self._count.launch((-(-runs.count // _GROUP) * _GROUP,), (_GROUP,))
         if runs.begin() != changed:
@@ -135,7 +204,7 @@ class AddedChanges(Owner):
             changes=self._changes.buffer,
         )
         add.launch((-(-splats // _GROUP) * _GROUP,), (_GROUP,))
-        device.queue.finish()  # before the next ones are written over these
+        device.finish()  # before the next ones are written over these
 
     def close(self) -> None:
         """Give the device's memory back."""
@@ -160,8 +229,7 @@ class _Runs(Owner):
         """From how many have changed in each run make where each begins; how many have changed in all."""
         counts = self._device.download(self.starts, (self.count,), np.uint32)
         ends = np.cumsum(counts, dtype=np.uint32)
-        with self._device.errors("failed while computing"):
-            cl.enqueue_copy(self._device.queue, self.starts, ends - counts, is_blocking=True)
+        self._device.copy(self.starts, ends - counts)
         return int(ends[-1])
 
     def close(self) -> None:
