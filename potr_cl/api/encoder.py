@@ -29,11 +29,10 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import cameras_or_virtual
 from potr_cl.pipeline.encode import encode as run_stages
-from potr_cl.pipeline.encoded import Encoded, SharedOut
+from potr_cl.pipeline.encoded import Encoded, Proved, SharedOut, proved
 from potr_cl.pipeline.forecast import log_forecast
 from potr_cl.pipeline.frame import frame_checked_beside
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.pipeline.proof import Proved, proved
 from potr_cl.pipeline.search import encode_to_target
 from potr_cl.pipeline.stopwatch import Stopwatch, added_up
 from potr_cl.pipeline.target import Target
