@@ -1,6 +1,6 @@
 """What a user may choose of an encode, as keywords: their types (:class:`EncodeChoices`), and the options they ask for.
 
-At run time :mod:`potr_cl.pipeline.keywords` says what the keywords of stages mean; tests/api/test_choices.py compares
+At run time :mod:`potr_cl.pipeline.options` says what the keywords of stages mean; tests/api/test_choices.py compares
 both.
 """
 
@@ -16,14 +16,12 @@ from potr_cl.codec.quantize import Preset
 from potr_cl.errors import UsageError
 from potr_cl.outputs.output import Output
 from potr_cl.outputs.registry import OUTPUTS, output_of, output_of_suffix
-from potr_cl.pipeline.amounts import as_bytes, size_in_bytes
-from potr_cl.pipeline.keywords import keyword_of, stage_changes
-from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.pipeline.options import EncodeOptions, keyword_of, stage_changes
 from potr_cl.pipeline.presets import DEFAULT as DEFAULT
 from potr_cl.pipeline.presets import PRESETS as PRESETS
 from potr_cl.pipeline.presets import PURPOSE as PURPOSE
 from potr_cl.pipeline.presets import stages_of
-from potr_cl.pipeline.target import Target
+from potr_cl.pipeline.target import Target, as_bytes, size_in_bytes
 from potr_cl.stages.code import Code
 from potr_cl.stages.stage import Flag as Flag
 from potr_cl.stages.stage import Stage as Stage
@@ -147,7 +145,7 @@ def encode_options(
 
     Args:
         options: to be changed by the others; None: those of the preset.
-        choices: of stages, see :func:`potr_cl.pipeline.keywords.stage_changes`.
+        choices: of stages, see :func:`potr_cl.pipeline.options.stage_changes`.
         stages: of which choices are allowed; None: of all.
         memory: in GiB.
         output: the kind of file.
@@ -266,7 +264,9 @@ def _listed() -> str:
     lines = []
     for kind in STAGES:
         lines.append(f'\n    Options of the stage "{kind.name}":')
-        lines += [f"        {keyword_of(flag.flag)}: {flag.help}" for flag in flags(kind).values()]
+        for flag in flags(kind).values():
+            switched_off = "False: " if flag.flag.startswith("--no-") else ""
+            lines.append(f"        {keyword_of(flag.flag)}: {switched_off}{flag.help}")
     return "\n".join(lines)
 
 

@@ -25,7 +25,7 @@ from potr_cl.api.inputs import (
     scene_of,
 )
 from potr_cl.api.pictures import png_bytes
-from potr_cl.api.views import Viewpoints, told, warn_of_frame
+from potr_cl.api.views import Viewpoints, describe_views, warn_of_frame
 from potr_cl.errors import UsageError
 from potr_cl.formats.images import Colour, write_png
 from potr_cl.host.atomic_write import replacing
@@ -242,7 +242,7 @@ def compare(
             progress=progress,
             notes=[]
             if given
-            else [f"no --cameras given: {told(there)}; files encoded with cameras look best from those"],
+            else [f"no --cameras given: {describe_views(there)}; files encoded with cameras look best from those"],
             coded=coded,
         )
     if output is not None:
@@ -302,7 +302,7 @@ def compare_scenes(
     Raises:
         As :func:`compare`.
     """
-    metric = Lpips() if lpips else None  # what is missing is told before the work
+    metric = Lpips() if lpips else None  # what is missing is reported before the work
     views = within_photographs(views) if truth is not None else views
     ground_truth = find_ground_truth(truth, views) if truth is not None else None
     told_of = list(notes)

@@ -42,13 +42,13 @@ from potr_cl.model.scene import Scene
 from potr_cl.model.views_between import views_between as place_between
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.amounts import as_bytes
 from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.forecast import log_forecast
 from potr_cl.pipeline.frame import check_frame
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.run import Run
 from potr_cl.pipeline.stopwatch import Stopwatch
+from potr_cl.pipeline.target import as_bytes
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
@@ -125,20 +125,20 @@ class Edited:
     device: Device
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.said}, on {self.device.info.name})"
+        return f"{type(self).__name__}({self.summary}, on {self.device.info.name})"
 
     def __str__(self) -> str:
         return "\n".join(self.lines)
 
     @property
-    def said(self) -> str:
+    def summary(self) -> str:
         """What was done, in a line."""
         return f"{len(self.scene):,} of {self.source_splats:,} splats"
 
     @property
     def lines(self) -> list[str]:
         """All that the command prints."""
-        return [f"{self.said}, on {self.device.info}"]
+        return [f"{self.summary}, on {self.device.info}"]
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the scene; see :func:`potr_cl.save`."""
@@ -161,7 +161,7 @@ class PrunedScene(Edited):
     unseen: Unseen | Unresolved
 
     @property
-    def said(self) -> str:
+    def summary(self) -> str:
         part = 100 * self.pruned.kept / self.source_splats
         splats = f"kept {self.pruned.kept:,} of {self.source_splats:,} splats ({part:.1f} %)"
         return f"{splats} in {self.pruned.iterations} iterations"
@@ -182,7 +182,7 @@ class CompactedScene(Edited):
     sparsity: tuple[float, float]
 
     @property
-    def said(self) -> str:
+    def summary(self) -> str:
         before, after = (100 * part for part in self.sparsity)
         return f"{len(self.scene):,} splats, {after:.1f} % of the AC coefficients quantise to 0, {before:.1f} % before"
 
@@ -225,7 +225,7 @@ class RefittedScene(Matched):
     refitted: Refitted
 
     @property
-    def said(self) -> str:
+    def summary(self) -> str:
         before, after = (_decibels(error) for error in self.refitted.errors)
         views = f"PSNR {after} of {self.views} training views, {before} before"
         return f"{len(self.scene):,} splats re-fitted in {self.refitted.steps} steps, {views}"
@@ -244,7 +244,7 @@ class FittedScene(Matched):
     added: int
 
     @property
-    def said(self) -> str:
+    def summary(self) -> str:
         between = f" and {self.added} between them" if self.added else ""
         return f"{len(self.scene)} splats, {self.fitted} of {self.views} training views{between}"
 

@@ -51,7 +51,7 @@ def save(scene: SceneSource, path: str | os.PathLike[str]) -> None:
         with replacing(path) as file:
             file.write(encoded[1])
         return
-    write = scene_writer(path)  # a wrong name is told before anything is read
+    write = scene_writer(path)  # a wrong name is reported before anything is read
     write(scene_of(scene))
 
 
@@ -71,7 +71,7 @@ def result_writer(output: str | os.PathLike[str] | None) -> Callable[[Scene], No
         return None
     from potr_cl.formats import scene_writer
 
-    write = scene_writer(output)  # a wrong name is told before anything is made
+    write = scene_writer(output)  # a wrong name is reported before anything is made
     check_place(output)
     return write
 

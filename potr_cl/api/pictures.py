@@ -30,7 +30,7 @@ from potr_cl.api.inputs import (
     rules_of,
     scene_of,
 )
-from potr_cl.api.views import Viewpoints, told, warn_of_frame
+from potr_cl.api.views import Viewpoints, describe_views, warn_of_frame
 from potr_cl.errors import DataError, DeviceError, UsageError
 from potr_cl.formats.images import Colour, to_8_bits, write_png
 from potr_cl.host.atomic_write import replacing
@@ -308,7 +308,7 @@ class _Views:
         # Views are placed in a scene that the host has.
         self._source = scene if given is not None else scene_of(scene, trust, antialiased)
         self.there = given or points.placed(scene_of(self._source), device)
-        self.note = "" if given else told(self.there)
+        self.note = "" if given else describe_views(self.there)
         self.chosen = chosen_views(self.there, views, split or (None if views is not None else "all"))
 
     @contextmanager

@@ -145,7 +145,7 @@ def warn_of_frame(source: SceneSource, scene: Scene, views: Sequence[Camera]) ->
         _log.warning("%s: %s", name_of(source), finding)
 
 
-def told(cameras: Sequence[Camera]) -> str:
+def describe_views(cameras: Sequence[Camera]) -> str:
     """One line about views that were placed: what they are, where, and which way is up in them."""
     centres, middle = camera_centres(cameras), focus(cameras)
     distance = float(np.median(np.linalg.norm(centres - middle, axis=1)))

@@ -12,8 +12,7 @@ from importlib import import_module
 
 from potr_cl import __version__
 from potr_cl.cli import guard, outputs
-from potr_cl.cli.completion import SHELLS, PrintCompletion
-from potr_cl.cli.parser import CommandParser
+from potr_cl.cli.parser import SHELLS, CommandParser, PrintCompletion
 from potr_cl.cli.terminal import note, speak
 from potr_cl.errors import PotrError
 from potr_cl.host.signals import unwinding

@@ -37,7 +37,7 @@ def _arrange(args: argparse.Namespace) -> None:
 
 def _convert(args: argparse.Namespace) -> None:
     works = jobs(args, WrittenScene, None)
-    for work in works:  # a choice that the format has not is told before anything is read
+    for work in works:  # a choice that the format has not is reported before anything is read
         name = f"scene{work.to}" if isinstance(work.output, StandardOutput) else work.output
         scene_writer(name, **format_choices(args))
     for_each_scene(works, _convert_one)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 from potr_cl.api.comparing import compare, compare_sizes
@@ -25,6 +26,7 @@ from potr_cl.cli.scenes import ANTIALIASED, add_antialiased_option, add_trust_op
 from potr_cl.cli.terminal import note, say, say_document, say_done
 from potr_cl.cli.views import read_cameras
 from potr_cl.formats.registry import suffixes_read
+from potr_cl.host.atomic_write import replacing
 from potr_cl.model.camera import Camera
 
 
@@ -102,18 +104,25 @@ def _compare(args: argparse.Namespace) -> None:
             _tell(args, *sizes)
             note("warning: sizes only: there is no OpenCL device to compare pictures on", "warning")
             return
-    with Progress() as progress:
-        comparison = compare(
-            args.a, args.b, cameras, truth=args.truth, lpips=args.lpips, views=args.views, split=args.split,
-            virtual_views=args.virtual_views, turntable=args.turntable, up=args.up, size=args.size, device=args.device,
-            cluster=args.cluster, rules=args.rules, background=args.background, progress=progress, **read,
-        )  # fmt: skip
+    comparison = None
     try:
-        if args.output is not None:
-            comparison.save(args.output)
+        with ExitStack() as stack:
+            # A folder that takes no file is reported before the work.
+            picture = None if args.output is None else stack.enter_context(replacing(args.output))
+            progress = stack.enter_context(Progress())
+            comparison = compare(
+                args.a, args.b, cameras, truth=args.truth, lpips=args.lpips, views=args.views, split=args.split,
+                virtual_views=args.virtual_views, turntable=args.turntable, up=args.up, size=args.size,
+                device=args.device, cluster=args.cluster, rules=args.rules, background=args.background,
+                progress=progress, **read,
+            )  # fmt: skip
+            if picture is not None:
+                comparison.write_picture(picture)
+        if picture is not None:
             comparison.notes.append(f"{args.output}: {comparison.caption}")
     finally:
-        _tell(args, comparison.report(), str(comparison))  # the figures are not lost with the picture
+        if comparison is not None:
+            _tell(args, comparison.report(), str(comparison))  # the figures are not lost with the picture
 
 
 def _tell(args: argparse.Namespace, report: dict[str, object], text: str) -> None:

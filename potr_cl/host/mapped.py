@@ -13,15 +13,15 @@ import mmap
 import os
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from potr_cl.errors import PotrError
 from potr_cl.host.leftovers import place_for_temporary_files
-from potr_cl.host.memory_left import memory_left
 
 _log = logging.getLogger("potr_cl")
 
@@ -147,3 +147,26 @@ def _take_room(descriptor: int, nbytes: int) -> None:
     except OSError as error:
         if error.errno not in _NO_PROMISE:
             raise
+
+
+_SYSTEM = Path("/proc/meminfo")
+#: Of a container: what it may take and what it has taken, by version 2 and version 1 of Linux' control groups.
+_GROUPS = (
+    (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory.current")),
+    (Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"), Path("/sys/fs/cgroup/memory/memory.usage_in_bytes")),
+)
+
+
+def memory_left() -> int:
+    """Bytes of memory that are free, or that the system would free at once; 0 where it does not say (not Linux)."""
+    left: int | None = None
+    with suppress(OSError, ValueError, IndexError):
+        for line in _SYSTEM.read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                left = int(line.split()[1]) << 10
+    if left is None:
+        return 0
+    for most, taken in _GROUPS:
+        with suppress(OSError, ValueError):  # "max" is no number: there is no limit
+            left = min(left, int(most.read_text()) - int(taken.read_text()))
+    return max(left, 0)

@@ -31,7 +31,7 @@ from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera
 from potr_cl.model.motions import LIKELY_MOTIONS, LOOKING_BACK, WRONG_WAY_ROUND, Motion
 from potr_cl.model.scene import Scene
-from potr_cl.model.sightings import Poses, Sample, Sights, look, poses, sample, show_nothing
+from potr_cl.model.sightings import Poses, Sample, ViewStatistics, look, poses, sample, show_nothing
 
 _log = logging.getLogger("potr_cl")
 
@@ -60,14 +60,15 @@ _EMPTY = 1e-4
 _WHOLE, _WELL_KNOWN, _SMALL_PART = 0.95, 0.9, 0.05
 #: The least that a view can count for: it sees nothing.
 _NOTHING = 1e-3
-#: From which :attr:`~potr_cl.model.sightings.Sights.remembered` on the colours know a view, and how much that counts.
+#: From which :attr:`~potr_cl.model.sightings.ViewStatistics.remembered` on the colours know a view, and how much that
+#: counts.
 _KNOWN, _MEMORY = 0.6, 4.0
 #: A typical splat's size, as a part of the picture's, and the factor that is a standard deviation from it.
 _USUAL_SIZE, _SIZE_SPREAD = 0.005, 4.0
 
 
 @dataclass(frozen=True)
-class Fit:
+class CameraFit:
     """How well cameras suit a scene.
 
     Attributes:
@@ -116,9 +117,9 @@ class Judgement:
     """
 
     views: int
-    fit: Fit
+    fit: CameraFit
     motion: Motion | None = None
-    moved: Fit | None = None
+    moved: CameraFit | None = None
     needed: float = math.inf
     empty: tuple[str, ...] = ()
     evidence: Evidence | None = None
@@ -218,7 +219,7 @@ def judge_cameras(scene: Scene, cameras: Sequence[Camera], evidence: Evidence | 
     if fit.seen < _LEAST_SEEN and len(cameras) > len(some.centres):
         # Few of many views may be those that see it: all are asked before it is said that none does.
         more = look(at, world.some(_spread(len(cameras), 6 * _VIEWS)))
-        fit = Fit(fit.total, float(more.seen.any(axis=0).mean()), fit.covered, fit.known, fit.size)
+        fit = CameraFit(fit.total, float(more.seen.any(axis=0).mean()), fit.covered, fit.known, fit.size)
     views = len(some.centres)
     blank = _empty(scene, some, sights)
     empty = tuple(cameras[number].name for number in numbers[blank])
@@ -261,7 +262,7 @@ def require_agreement(scene: Scene, cameras: Sequence[Camera], evidence: Evidenc
         )
 
 
-def _fit(sights: Sights) -> Fit:
+def _fit(sights: ViewStatistics) -> CameraFit:
     share = np.sqrt(sights.seen.mean(axis=1) * sights.covered)
     tells = np.isfinite(sights.remembered)
     memory = np.log(np.clip(np.where(tells, sights.remembered, 1) / _KNOWN, 0.05, 1))
@@ -269,7 +270,7 @@ def _fit(sights: Sights) -> Fit:
     size = float(np.median(sizes)) if len(sizes) else None
     odd = 3.0 if size is None else 0.5 * (math.log(max(size, 1e-30) / _USUAL_SIZE) / math.log(_SIZE_SPREAD)) ** 2
     known = float(np.mean(sights.remembered[tells] >= _KNOWN)) if tells.any() else None
-    return Fit(
+    return CameraFit(
         total=float(np.log(np.maximum(share, _NOTHING)).mean() + _MEMORY * memory.mean() - odd),
         seen=float(sights.seen.any(axis=0).mean()),
         covered=float(sights.covered.mean()),
@@ -278,13 +279,13 @@ def _fit(sights: Sights) -> Fit:
     )
 
 
-def _empty(scene: Scene, cameras: Poses, sights: Sights) -> NDArray[np.int64]:
+def _empty(scene: Scene, cameras: Poses, sights: ViewStatistics) -> NDArray[np.int64]:
     """Numbers of the views that show nothing of the scene."""
     empty = np.flatnonzero(~sights.seen.any(axis=1) & (sights.covered < _EMPTY))
     return empty[show_nothing(scene, cameras.some(empty))] if len(empty) else empty
 
 
-def _looked_at(fit: Fit) -> bool:
+def _looked_at(fit: CameraFit) -> bool:
     """Whether the cameras see the whole scene and nothing speaks against them: other axes prove nothing then.
 
     So it is with a part that was cut out of a scene: seen from the middle it would fill more of the pictures.
@@ -293,7 +294,7 @@ def _looked_at(fit: Fit) -> bool:
     return fit.seen >= _WHOLE and (known or fit.covered < _SMALL_PART)
 
 
-def _best_motion(at: Sample, cameras: Poses, fit: Fit) -> tuple[Motion, Fit] | None:
+def _best_motion(at: Sample, cameras: Poses, fit: CameraFit) -> tuple[Motion, CameraFit] | None:
     """The motion after which the cameras fit best, and how well; None if it is not plausible."""
     views = len(cameras.centres)
     motions = [*LIKELY_MOTIONS, *WRONG_WAY_ROUND]

@@ -136,7 +136,7 @@ class Poses:
 
 
 @dataclass(frozen=True)
-class Sights:
+class ViewStatistics:
     """What each of V views sees.
 
     Attributes:
@@ -152,9 +152,9 @@ class Sights:
     sizes: F64
     remembered: F64
 
-    def some(self, views: NDArray[np.int64]) -> Sights:
+    def some(self, views: NDArray[np.int64]) -> ViewStatistics:
         """What some of the views see, by their numbers."""
-        return Sights(self.seen[views], self.covered[views], self.sizes[views], self.remembered[views])
+        return ViewStatistics(self.seen[views], self.covered[views], self.sizes[views], self.remembered[views])
 
 
 def sample(scene: Scene) -> Sample:
@@ -219,7 +219,7 @@ def poses(cameras: Sequence[Camera]) -> Poses:
     return Poses(camera_centres(cameras), rotations, np.array(windows), NEAR)
 
 
-def look(at: Sample, world: Poses) -> Sights:
+def look(at: Sample, world: Poses) -> ViewStatistics:
     """What views see of a scene.
 
     Args:
@@ -247,7 +247,7 @@ def look(at: Sample, world: Poses) -> Sights:
             # Without BLAS, whose threads would go on waiting for more at full speed.
             best = float(np.quantile(np.einsum("dk,k->d", at.overall, known) / len(now), 0.95))
             remembered[view] = float(own.mean()) / max(best, 1e-12)
-    return Sights(seen, covered, sizes, remembered)
+    return ViewStatistics(seen, covered, sizes, remembered)
 
 
 def show_nothing(scene: Scene, world: Poses) -> Mask:

@@ -120,4 +120,4 @@ def describe(cameras: Sequence[Camera]) -> str:
     at = ", ".join(f"{x:.3g}" for x in focus)
     train, test = (sum(c.split == split for c in cameras) for split in ("train", "test"))
     judges = f" and {test} to judge by" if test else ""
-    return f"{train} virtual views{judges} placed {distance.min():.3g} to {distance.max():.3g} units from ({at})"
+    return f"{train} virtual views{judges}, {distance.min():.3g} to {distance.max():.3g} units from ({at})"

@@ -21,10 +21,9 @@ from potr_cl.host.silence import whatever_warns
 from potr_cl.host.threads import in_background, thread_pool
 from potr_cl.opencl import compiler, program_cache, quirks
 from potr_cl.opencl.ahead import context_of, leave
-from potr_cl.opencl.building import building
 from potr_cl.opencl.discovery import DeviceInfo, Family, choose_device, compiler_fault, not_to_be_taken
-from potr_cl.opencl.foresight import Foresight, Wanted
 from potr_cl.opencl.kernel import Kernel, declared_parameters
+from potr_cl.opencl.program_cache import Foresight, Wanted, building
 from potr_cl.opencl.source import kernel_source
 
 logger = logging.getLogger("potr_cl")

@@ -10,10 +10,14 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import json
 import os
 import platform
-from collections.abc import Sequence
-from contextlib import suppress
+import re
+import threading
+from collections import defaultdict
+from collections.abc import Hashable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pyopencl as cl
@@ -21,6 +25,7 @@ from pyopencl.characterize import has_src_build_cache
 
 from potr_cl.errors import PotrError
 from potr_cl.host.atomic_write import replacing
+from potr_cl.host.silence import without_warnings
 from potr_cl.opencl.cache_folder import cache_folder
 
 cl._PYOPENCL_NO_CACHE = True
@@ -97,3 +102,64 @@ def _processor() -> str:
     with suppress(OSError), open("/proc/cpuinfo", encoding="utf-8", errors="replace") as file:
         return next((line for line in file if line.startswith(("flags", "Features"))), "")
     return platform.processor()
+
+
+_turns = threading.Lock()
+#: Held by who builds or loads a program, by the program; of all programs of CPUs there is one.
+_locks: defaultdict[Hashable, threading.Lock] = defaultdict(threading.Lock)
+#: NVIDIA's compiler takes no longer for two programs at a time than for one after the other, but several times as long
+#: for six.
+_at_a_time = threading.BoundedSemaphore(2)
+
+
+@contextmanager
+def building(program: Hashable, alone: bool) -> Iterator[None]:
+    """Build or load a program, while nobody else does the same one; another one is built at the same time.
+
+    Of several devices of a kind the second one then finds what the first one has built. Warnings are not shown
+    meanwhile: some drivers chat unasked, and a full disk stops no build.
+
+    Args:
+        program: what names it.
+        alone: whether no other program may be built at a time: the compilers of CPUs have threads of their own, and
+            not all of them may be called by several.
+    """
+    with _turns:
+        lock = _locks[None if alone else program]
+    with lock, _at_a_time, without_warnings():
+        yield
+
+
+#: A program: the file of its source, and its macros.
+Wanted = tuple[str, tuple[tuple[str, str], ...]]
+
+#: More are not noted: those of the latest encodes are among the first.
+_MOST = 64
+
+
+class Foresight:
+    """The programs that were needed for a purpose.
+
+    Args:
+        folder: of the notes.
+        purpose: what for, on which device and with which driver.
+
+    Attributes:
+        programs: in the order in which they were asked for.
+    """
+
+    def __init__(self, folder: Path, purpose: str) -> None:
+        self._path = folder / f"needed-{hashlib.sha256(purpose.encode()).hexdigest()[:24]}.json"
+        self.programs: list[Wanted] = []
+        with suppress(OSError, ValueError, TypeError, KeyError):
+            for source, macros in json.loads(self._path.read_text("utf-8"))[:_MOST]:
+                if re.fullmatch(r"\w+/\w+\.cl", source):
+                    self.programs.append((source, tuple((str(name), str(value)) for name, value in macros)))
+
+    def note(self, program: Wanted) -> None:
+        """Note that a program was needed."""
+        if program in self.programs or len(self.programs) >= _MOST:
+            return
+        self.programs.append(program)
+        with suppress(OSError, PotrError), replacing(self._path) as file:
+            file.write(json.dumps(self.programs).encode())

@@ -32,7 +32,7 @@ _NAMES = {
     Property.SCALE: "scale",
     Property.ROTATION: "rotation",
     Property.OPACITY: "opacity",
-    Property.STEPS: "colour: steps",
+    Property.STEPS: "colour: precision",
     Property.SH0: "colour: DC",
     **dict.fromkeys(SH[1:], "colour: AC"),
 }
@@ -103,7 +103,7 @@ class Potr(Output):
 
     def properties(self, data: bytes) -> dict[str, int]:
         """Bytes by attribute; the header and the metadata are "other"."""
-        names = ("position", "scale", "rotation", "opacity", "colour: DC", "colour: AC", "colour: steps", "other")
+        names = ("position", "scale", "rotation", "opacity", "colour: DC", "colour: AC", "colour: precision", "other")
         sums = dict.fromkeys(names, 0)
         for section in (section for block in open_file(data, trust=True).blocks for section in block.sections):
             sums[_NAMES.get(section.kind, "other") if section.kind else "other"] += section.stored_bytes

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,12 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.quantize import HyperParameters
-from potr_cl.errors import UsageError
+from potr_cl.errors import DataError, PotrError, UsageError
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
+from potr_cl.outputs.coded_scene import CodedScene
 from potr_cl.outputs.registry import OUTPUTS
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.stages.fit import LeftOut
 from potr_cl.stages.fitting.fit import Fitted
 from potr_cl.stages.guarded import Unresolved
@@ -126,3 +130,46 @@ class SharedOut:
     def __str__(self) -> str:
         megabytes = f"{self.sent / 1e6:,.0f} MB sent, {self.received / 1e6:,.0f} MB received"
         return f"views shared out to {len(self.workers)} worker{'s' if len(self.workers) != 1 else ''}: {megabytes}"
+
+
+@dataclass(frozen=True)
+class Proved:
+    """A file that its readers take.
+
+    Attributes:
+        data: the whole file.
+        scene: what readers see; in a device's memory, where it will be looked at there.
+        coded: the file, for other computers' devices to make the scene of.
+    """
+
+    data: bytes
+    scene: Drawable
+    coded: CodedScene
+
+
+@contextmanager
+def proved(encoded: Encoded, trust: bool = False, device: Device | None = None) -> Iterator[Proved]:
+    """The file that was made and the scene that a reader makes of it.
+
+    Args:
+        encoded: that made it.
+        trust: whether it may hold more splats a byte than a real scene has.
+        device: on which the scene will be looked at, as long as the context lasts; None: it is an ordinary one.
+
+    Raises:
+        PotrError: no reader takes it.
+    """
+    data, output = encoded.data, encoded.options.output
+    with ExitStack() as stack:
+        try:
+            scene: Drawable
+            if device is None:
+                scene = output.read(data, trust)
+            else:
+                scene = stack.enter_context(output.seen(data, device, trust, encoded.options.memory))
+        except DataError as error:
+            raise PotrError(
+                f"the encoded file cannot be decoded ({error}): nothing was written. If the scene has splats that are "
+                "very far away or very large, leave them out"
+            ) from error
+        yield Proved(data, scene, CodedScene(output, data, trust))

@@ -12,6 +12,7 @@ from potr_cl.errors import DeviceError, DeviceMemoryError
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import choose_device
 from potr_cl.views.budget import default_memory
+from potr_cl.views.visibility import LEAST_SPLATS
 
 logger = logging.getLogger("potr_cl")
 
@@ -98,3 +99,24 @@ def _with_less(device: Device, memory: int | None) -> Iterator[tuple[Device, int
         megabytes = less // 1_000_000
         logger.warning("device %s ran out of memory: again with %d MB to keep views in", device.info, megabytes)
         yield device, less
+
+
+#: Bytes of the host's memory for each splat: what is not mapped of the scene (44), and what pruning knows of the splats
+#: while it chooses among them, as measured with 2.5 and 10 million. And what the interpreter and compilers take.
+_SPLAT, _PROCESS = 220, 1 << 28
+#: Views get this part of the memory in any case.
+_LEAST = 1 / 4
+
+
+def for_views(device: Device, memory: int | None, splats: int) -> int | None:
+    """How many bytes of a device's memory views may fill, of those that a whole encode may take.
+
+    Args:
+        device: where its memory is the host's, a large scene's arrays share it. A GPU's memory is its own.
+        memory: bytes that are allowed; None: nothing was said.
+        splats: of the scene. Of small ones the views take nearly all.
+    """
+    of_host = device.info.shares_host_memory
+    if memory is None or not of_host or splats < LEAST_SPLATS:
+        return memory
+    return max(memory - _PROCESS - _SPLAT * splats, int(_LEAST * memory))

@@ -13,9 +13,8 @@ from potr_cl.host.threads import in_background
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encoded import Encoded, SharedOut
-from potr_cl.pipeline.fallback import Attempt, attempts, on_device
+from potr_cl.pipeline.fallback import Attempt, attempts, for_views, on_device
 from potr_cl.pipeline.fit_trial import Trial, only_if_it_pays
-from potr_cl.pipeline.host_memory import for_views
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.stopwatch import Stopwatch
 from potr_cl.placement.guard import unresolved

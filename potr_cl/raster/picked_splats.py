@@ -1,4 +1,4 @@
-"""Some splats of a scene on a device, which are drawn from there without a copy: :class:`PickedSplats`."""
+"""Some splats of a scene on a device, which are drawn from there without a copy: :class:`IndexSubset`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _GROUP, _CHUNK = 256, 4096
 NO_SPLAT = 0xFFFFFFFF
 
 
-class PickedSplats(SceneBuffers):
+class IndexSubset(SceneBuffers):
     """Some splats of a scene that lies on a device, in an order of their own, for GPU kernels.
 
     They have no parameters of their own: the projection reads those of the whole scene. What it finds lies in the order
@@ -99,7 +99,7 @@ class Picker(Owner):
             DeviceError: the device has no room.
         """
         with Memory(self.device) as own:
-            picks = Picks(own, self, wanted[None], states, state)
+            picks = IndexSubsets(own, self, wanted[None], states, state)
             numbers = picks.numbers(memory, 0)
             with self.device.errors("failed while computing"):
                 self.device.queue.finish()
@@ -109,7 +109,7 @@ class Picker(Owner):
         self._memory.close()
 
 
-class Picks:
+class IndexSubsets:
     """The numbers of the splats of several choices of groups, which are found without waiting for the device.
 
     Args:

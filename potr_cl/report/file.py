@@ -23,7 +23,7 @@ _GROUPS = {
     Property.SCALE: "scale",
     Property.ROTATION: "rotation",
     Property.OPACITY: "opacity",
-    Property.STEPS: "colour: steps",
+    Property.STEPS: "colour: precision",
 }
 
 #: A line of the table of sections.

@@ -209,7 +209,7 @@ def format_encode_report(report: dict[str, Any]) -> str:
     if source["antialiased"]:
         lines.append("rendered   as an antialiased scene")
     for place, (name, nbytes) in enumerate(report["properties"].items()):
-        lines.append(f"{'' if place else 'bytes':<11}{name:<12}{nbytes:>13,}{100 * nbytes / report['bytes']:>7.1f} %")
+        lines.append(f"{'' if place else 'bytes':<11}{name:<18}{nbytes:>13,}{100 * nbytes / report['bytes']:>7.1f} %")
     quality = report["quality"]
     if isinstance(quality, str):
         lines.append(f"quality    {quality}")

@@ -17,7 +17,7 @@ from potr_cl.model.splat_groups import SplatGroups
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner, Reused
 from potr_cl.raster.kept_scene import fits_whole, whole_on_device
-from potr_cl.raster.picked_splats import NO_SPLAT, PickedSplats, Picker, Picks
+from potr_cl.raster.picked_splats import NO_SPLAT, IndexSubset, IndexSubsets, Picker
 from potr_cl.raster.preparing_memory import PreparingMemory
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA, RasterRules
@@ -76,18 +76,18 @@ class SeenRasterizer(Owner):
                 self._any = owned.enter_context(Memory(device)).upload(np.zeros(1, np.uint32), "the number of a splat")
             self._owned = owned.pop_all()
 
-    def picks(self, memory: Memory, seen: NDArray[np.bool_]) -> Picks:
+    def picks(self, memory: Memory, seen: NDArray[np.bool_]) -> IndexSubsets:
         """The splats of several views on a device that has the scene, for :meth:`draw`.
 
         Args:
-            memory: as of :class:`~potr_cl.raster.picked_splats.Picks`.
+            memory: as of :class:`~potr_cl.raster.picked_splats.IndexSubsets`.
             seen: (views, G) the groups that each may show.
         """
         assert self._picker is not None, "only of scenes that lie on a GPU"
-        return Picks(memory, self._picker, seen)
+        return IndexSubsets(memory, self._picker, seen)
 
     def draw(
-        self, picks: Picks, numbers: Sequence[int], cameras: Sequence[Camera], target: cl.Buffer, start: int = 0
+        self, picks: IndexSubsets, numbers: Sequence[int], cameras: Sequence[Camera], target: cl.Buffer, start: int = 0
     ) -> None:
         """Render some of these views into a buffer, some at a time, without waiting for the last ones.
 
@@ -120,7 +120,7 @@ class SeenRasterizer(Owner):
         return max(n for n in range(1, len(counts) + 1) if n == 1 or n * max(counts[:n]) <= _PROJECTED)
 
     def _draw_together(
-        self, picks: Picks, numbers: Sequence[int], cameras: Sequence[Camera], target: cl.Buffer, start: int
+        self, picks: IndexSubsets, numbers: Sequence[int], cameras: Sequence[Camera], target: cl.Buffer, start: int
     ) -> int:
         """Render views with one launch of each kernel; returns the byte where they end."""
         assert isinstance(self._scene, SceneBuffers)
@@ -131,7 +131,7 @@ class SeenRasterizer(Owner):
             for place, number in enumerate(numbers):
                 if picks.counts[number]:
                     picks.numbers_into(picked, place * stride, number)
-            with self._rasterizer(PickedSplats(self._scene, picked, stride, apart=stride)) as rasterizer:
+            with self._rasterizer(IndexSubset(self._scene, picked, stride, apart=stride)) as rasterizer:
                 views = rasterizer.prepare_set(cameras, self._passing)
                 rasterizer.pictures_into(views, target, start)
                 return start + 12 * views.pixels
@@ -139,12 +139,12 @@ class SeenRasterizer(Owner):
             self._passing.close()
 
     @contextmanager
-    def _picked(self, picks: Picks, number: int) -> Iterator[Rasterizer]:
+    def _picked(self, picks: IndexSubsets, number: int) -> Iterator[Rasterizer]:
         assert isinstance(self._scene, SceneBuffers)
         try:
             splats = picks.counts[number]
             numbers = picks.numbers(self._passing, number) if splats else self._any
-            with self._rasterizer(PickedSplats(self._scene, numbers, max(splats, 1))) as rasterizer:
+            with self._rasterizer(IndexSubset(self._scene, numbers, max(splats, 1))) as rasterizer:
                 yield rasterizer
         finally:
             self._passing.close()

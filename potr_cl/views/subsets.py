@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner, Reused
-from potr_cl.raster.picked_splats import NO_SPLAT, PickedSplats, Picker, Picks
+from potr_cl.raster.picked_splats import NO_SPLAT, IndexSubset, IndexSubsets, Picker
 from potr_cl.raster.preparing_memory import PreparingMemory
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA, RasterRules
@@ -216,7 +216,7 @@ class NamedSplats(_Parted):
         super().__init__(whole.device, whole, whole.stride, background)
         self._whole, self._memory = whole, Memory(whole.device)
         self._picker = Picker(whole.device, group_of)
-        self._foreseen: tuple[Picks, dict[ViewGroup, int]] | None = None
+        self._foreseen: tuple[IndexSubsets, dict[ViewGroup, int]] | None = None
 
     def streams_in(self) -> Memory:
         return Reused(self.device)
@@ -231,7 +231,7 @@ class NamedSplats(_Parted):
             numbers, count = self._picker.pick(memory, group.cells, *given)
         if not count:
             return None
-        picked = PickedSplats(self._whole, numbers, count)
+        picked = IndexSubset(self._whole, numbers, count)
         if self._other_sh is not None:
             picked.sh = self._other_sh
         return Subset(stack.enter_context(self._rasterizer(picked)), count, numbers)
@@ -240,7 +240,7 @@ class NamedSplats(_Parted):
     def foreseen(self, groups: Sequence[ViewGroup]) -> Iterator[None]:
         with Memory(self.device) as memory:
             wanted = np.stack([group.cells for group in groups if group.cells is not None])
-            picks = Picks(memory, self._picker, wanted)
+            picks = IndexSubsets(memory, self._picker, wanted)
             self._foreseen = picks, {group: place for place, group in enumerate(groups)}
             try:
                 yield
@@ -286,7 +286,7 @@ class ListedSplats(_Parted):
         for row, number in zip(padded, group.numbers, strict=True):
             row[: len(self._listed[number])] = self._listed[number]
         numbers = memory.upload(padded, "the numbers of views' splats")
-        rasterizer = stack.enter_context(self._rasterizer(PickedSplats(self._whole, numbers, stride, apart=stride)))
+        rasterizer = stack.enter_context(self._rasterizer(IndexSubset(self._whole, numbers, stride, apart=stride)))
         return Subset(rasterizer, stride, numbers)
 
     def replace_sh(self, sh: FloatArray) -> None:

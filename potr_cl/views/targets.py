@@ -31,7 +31,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.opencl.ferry import Cargo, Ferry
 from potr_cl.opencl.memory import Memory, Owner, Scratch
 from potr_cl.raster.kept_scene import KeptScene
-from potr_cl.raster.picked_splats import Picks
+from potr_cl.raster.picked_splats import IndexSubsets
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
 from potr_cl.raster.view_cache import ViewCache
@@ -76,7 +76,7 @@ class RenderedTargets:
 
     rasterizer: Rasterizer | SeenRasterizer
     cameras: Sequence[Camera]
-    picks: Picks | None = None
+    picks: IndexSubsets | None = None
 
     def into(self, numbers: Sequence[int], buffer: cl.Buffer, start: int = 0) -> None:
         """See :meth:`Targets.into`."""

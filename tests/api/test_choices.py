@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from potr_cl.api.choices import CompactChoices, PruneChoices, StageChoices
-from potr_cl.pipeline.keywords import stage_keywords
+from potr_cl.pipeline.options import stage_keywords
 from potr_cl.pipeline.presets import DEFAULT, stages_of
 from potr_cl.stages.compact import Compact
 from potr_cl.stages.prune import Prune

@@ -42,7 +42,7 @@ def test_gzipped_scenes(tmp_path: Path) -> None:
 
 def test_errors_name_what_was_given(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
-    with pytest.raises(UsageError, match=r"the folder '.*empty' holds no scene"):
+    with pytest.raises(UsageError, match=r"the folder '.*empty' has no scene"):
         potr_cl.info(tmp_path / "empty")
     (tmp_path / "a.ply.gz").write_bytes(gzip.compress(b"ply\nformat"))
     with pytest.raises(DataError, match=r"'.*/a\.ply\.gz'"):

@@ -16,7 +16,7 @@ from potr_cl.errors import DeviceError, UsageError
 from potr_cl.formats import load_scene
 from potr_cl.formats.scenes import ply
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.amounts import size_in_bytes
+from potr_cl.pipeline.target import size_in_bytes
 from tests.cli.calls import KEEP, cameras_json, fails, run
 from tests.reference.scenes import random_scene, ring_of_cameras
 
@@ -52,7 +52,7 @@ def test_encode_tells_what_it_did(tmp_path, scene_path, capsys):
     assert (report["splats"], report["source"]["splats"]) == (90, 200)
     assert sum(report["properties"].values()) == report["bytes"]
     assert report["pruning"]["history"][-1]["left"] == 90
-    stages = ["prepare views", "prune", "compact", "octree", "quantise and code", "evaluate", "total"]
+    stages = ["prepare views", "prune", "compact", "octree", "write file", "evaluate", "total"]
     assert list(report["seconds"]) == stages
     assert sum(report["seconds"][stage] for stage in stages[:-1]) <= report["seconds"]["total"]
     assert report["device"]["name"] == Device().info.name
@@ -207,7 +207,7 @@ def test_without_cameras_virtual_ones_are_placed(tmp_path, scene_path, capsys):
     few = ["--iterations", "2", "--virtual-views", "8", "--count", "90"]
     assert cli.main(["encode", str(scene_path), "-o", str(potr), *few]) == 0
     said = capsys.readouterr()
-    assert "no --cameras given: 8 virtual views and 1 to judge by placed" in said.err
+    assert "no --cameras given: 8 virtual views and 1 to judge by, " in said.err
     assert "1 held-out virtual view" in said.out
     assert "place cameras" in said.out
     assert json.loads(run(capsys, "info", potr, "--json"))["cameras"] == "virtual"

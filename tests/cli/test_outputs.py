@@ -50,8 +50,8 @@ WRONG = {
     [
         ("encode a.ply -o b.gltf", "give it a name that ends in .glb"),
         ("encode a.ply -o b.splat", "encode writes .potr, .spz"),
-        ("encode a.ply -o b.spz --entropy zstd", "--entropy means nothing for .spz files"),
-        ("encode a.ply -o b.ply --sf-dc 9", "--sf-dc means nothing for .ply files"),
+        ("encode a.ply -o b.spz --entropy zstd", "--entropy does not apply to .spz files"),
+        ("encode a.ply -o b.ply --sf-dc 9", "--sf-dc does not apply to .ply files"),
         ("encode a.ply -o b.potr --spz-version 3", "potr_cl has no version to choose"),
         ("encode a.ply -o sub --to sog4", "'.sog4' is no suffix of what encode writes"),
         ("encode a.ply -o b.png", "a name that ends in .potr"),
@@ -101,7 +101,7 @@ WRONG = {
 def test_refused_in_one_line_before_any_work(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, call: str, said: str
 ) -> None:
-    for reader in ("potr_cl.cli.scenes.load_scene", "potr_cl.cli.files.decode", "potr_cl.cli.views.load_cameras"):
+    for reader in ("potr_cl.formats.load_scene", "potr_cl.cli.files.decode", "potr_cl.cli.views.load_cameras"):
         monkeypatch.setattr(reader, lambda *_, **__: pytest.fail("something was read"))
     before = sorted(folder.rglob("*"))
     assert cli.main(call.split()) == 2

@@ -124,9 +124,9 @@ def test_compare_without_cameras(scene_path, potr_path, capsys):
     captured = capsys.readouterr()
     assert "times smaller" in captured.out
     assert "25 virtual views of 480 x 480 pixels" in captured.out or "30 virtual views of 600 x 600" in captured.out
-    placed = [line for line in captured.err.splitlines() if "no --cameras" in line]
+    placed = [line for line in captured.out.splitlines() if "no --cameras" in line]
     assert len(placed) == 1
-    assert placed[0].endswith("A scene encoded with cameras looks best from those.")
+    assert placed[0].endswith("files encoded with cameras look best from those")
     report = json.loads(run(capsys, "compare", scene_path, potr_path, "--json", "--virtual-views", 2, "--size", 64))
     assert (report["a"]["splats"], report["b"]["splats"]) == (200, 200)
     assert [view["name"] for view in report["views"]] == ["virtual_000", "virtual_001"]

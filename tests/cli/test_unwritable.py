@@ -33,10 +33,10 @@ def gone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
         monkeypatch.setattr(f"{module}.{name}", instead)
 
-    for command in ("encode", "prune", "compact"):
+    for command in ("encode", "prune"):
         cli.command_parser([command])  # imports it
-    for module, name in (("encode", "encode"), ("edit", "prune"), ("edit", "compact")):
-        remove_first(f"potr_cl.cli.{module}", name)
+    for name in ("encoder.run_stages", "editing.log_forecast"):
+        remove_first(*f"potr_cl.api.{name}".rsplit(".", 1))
     return folder
 
 

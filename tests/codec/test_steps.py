@@ -250,7 +250,7 @@ def test_the_report_says_what_the_header_holds():
     report = file_report(open_file(file_of(scene, geometry)))
     assert report["colour_steps"]["scales"] == list(geometry.steps.scales)
     assert report["colour_steps"]["groups"] == 25
-    assert report["sections"]["colour: steps"]["serialised_bytes"] == 50 + 25
+    assert report["sections"]["colour: precision"]["serialised_bytes"] == 50 + 25
     assert "its group of 16 splats" in format_report(report)
     alike = file_report(open_file(file_of(scene, quantise_geometry(scene, BEST, ()))))
     assert alike["colour_steps"] is None

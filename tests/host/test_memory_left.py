@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from potr_cl.host import memory_left as module
-from potr_cl.host.memory_left import memory_left
+from potr_cl.host import mapped as module
+from potr_cl.host.mapped import memory_left
 
 
 @pytest.mark.skipif(not Path("/proc/meminfo").exists(), reason="not Linux")

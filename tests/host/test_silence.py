@@ -10,7 +10,7 @@ from PIL import Image
 
 from potr_cl.formats.images import opened_image
 from potr_cl.host.silence import whatever_warns, without_warnings
-from potr_cl.opencl.building import building
+from potr_cl.opencl.program_cache import building
 
 
 def test_nothing_is_shown_until_the_last_block_ends():

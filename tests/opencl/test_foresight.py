@@ -11,7 +11,7 @@ import pytest
 
 from potr_cl.errors import DeviceError
 from potr_cl.opencl.device import Device
-from potr_cl.opencl.foresight import Foresight
+from potr_cl.opencl.program_cache import Foresight
 
 PROGRAM = ("raster/columns.cl", ())
 

@@ -12,8 +12,8 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
-from potr_cl.opencl.building import building
 from potr_cl.opencl.device import Device
+from potr_cl.opencl.program_cache import building
 from potr_cl.raster.rasterizer import Rasterizer, render
 from tests.reference.scenes import random_scene, ring_of_cameras
 

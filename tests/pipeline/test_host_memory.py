@@ -8,7 +8,7 @@ from typing import Any, cast
 import pytest
 
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.host_memory import for_views
+from potr_cl.pipeline.fallback import for_views
 
 GB = 1_000_000_000
 

@@ -95,7 +95,7 @@ def test_names_and_splits(around_ball):
     assert is_virtual(around_ball)
     assert not is_virtual([])
     assert not is_virtual([dataclasses.replace(around_ball[0], name="photo")])
-    assert describe(around_ball).startswith("128 virtual views and 16 to judge by placed ")
+    assert describe(around_ball).startswith("128 virtual views and 16 to judge by, ")
     few = place_cameras(BALL, 5, 64)
     assert [c.split for c in few] == ["train"] * 5
     assert few[0].width == 64

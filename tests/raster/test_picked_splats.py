@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from potr_cl.opencl.memory import Memory
-from potr_cl.raster.picked_splats import PickedSplats, Picker, Picks
+from potr_cl.raster.picked_splats import IndexSubset, IndexSubsets, Picker
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers, uploaded
 from tests.cases.streets import street
@@ -28,7 +28,7 @@ def test_picked_splats_are_drawn_as_a_scene_of_their_own(device):
     with uploaded(device, scene) as whole, Memory(device) as memory:
         numbers = memory.upload(splats.astype(np.uint32), "some splats")
         with (
-            Rasterizer(device, PickedSplats(whole, numbers, len(splats))) as one,
+            Rasterizer(device, IndexSubset(whole, numbers, len(splats))) as one,
             Rasterizer(device, scene.subset(splats)) as other,
         ):
             for camera in cameras:
@@ -53,7 +53,7 @@ def test_the_numbers_of_several_choices_of_groups(device):
     groups = rng.integers(0, 40, 10_000).astype(np.uint32)
     wanted = rng.random((5, 40)) < np.array([0.0, 0.1, 0.5, 0.9, 1.0])[:, None]
     with Picker(device, groups) as picker, Memory(device) as memory:
-        picks = Picks(memory, picker, wanted)
+        picks = IndexSubsets(memory, picker, wanted)
         for choice in (3, 0, 4, 1, 2):
             expected = np.flatnonzero(wanted[choice][groups])
             assert picks.counts[choice] == len(expected)

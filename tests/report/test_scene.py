@@ -208,7 +208,7 @@ def test_extreme_values_are_told_in_numbers_that_json_knows():
 def test_every_format_that_is_read_is_told(tmp_path, data, scene):
     files = [path for path in (data / "foreign").iterdir() if path.is_file()]
     for entry in registry.SCENE_FORMATS:
-        if entry.save is not None:
+        if entry.save is not None and (entry is not page.FORMAT or page.TEMPLATE.exists()):
             path = tmp_path / f"scene{entry.suffixes[0]}"
             potr_cl.save(scene, path)
             files.append(path)

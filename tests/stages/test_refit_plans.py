@@ -13,7 +13,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.raster.picked_splats import PickedSplats
+from potr_cl.raster.picked_splats import IndexSubset
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages import refit as refit_stage
 from potr_cl.stages.refitting import own_views, placement
@@ -367,7 +367,7 @@ def test_launches_are_halved_where_the_device_has_no_room(device, picked, monkey
     together = []
 
     def failing(self, some, *args):
-        if isinstance(self.parameters, PickedSplats) == on:
+        if isinstance(self.parameters, IndexSubset) == on:
             together.append(len(some))
             if len(some) > 1:
                 raise DeviceMemoryError("no room")

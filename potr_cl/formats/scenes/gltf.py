@@ -29,9 +29,8 @@ from potr_cl.formats.scenes.gltf_writer import SPZ_EXTENSION
 from potr_cl.formats.scenes.scene_files import MOST_A_BYTE, cleaned, joined, log_of_scales, reading, shown
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.claims import check_claim
-from potr_cl.model.quaternions import quaternions_of, rotation_matrices
+from potr_cl.model.quaternions import quaternions_of, rotated_sh, rotation_matrices
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
-from potr_cl.model.sh_rotation import rotated_sh
 
 _log = logging.getLogger("potr_cl")
 

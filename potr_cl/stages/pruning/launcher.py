@@ -49,7 +49,7 @@ class SweepBuffers:
     numbers: cl.Buffer | None = None
 
 
-class CpuLauncher:
+class CpuSweepLauncher:
     """See :class:`SweepLauncher`.
 
     Args:
@@ -138,7 +138,7 @@ class _CpuKernels:
         self._staleness.launch((self._tiles,), _CPU_GROUP, queue)
 
 
-class GpuLauncher:
+class GpuSweepLauncher:
     """See :class:`SweepLauncher`.
 
     Args:
@@ -321,6 +321,6 @@ def launcher_for(rasterizer: Rasterizer, options: SweepOptions, fixed_point: Fix
     return launchers(device)(rasterizer, fixed_point, macros)
 
 
-def launchers(device: Device) -> type[CpuLauncher | GpuLauncher]:
+def launchers(device: Device) -> type[CpuSweepLauncher | GpuSweepLauncher]:
     """The kind of a device's launchers."""
-    return GpuLauncher if device.family == "gpu" else CpuLauncher
+    return GpuSweepLauncher if device.family == "gpu" else CpuSweepLauncher

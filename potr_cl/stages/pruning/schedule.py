@@ -24,7 +24,7 @@ F64 = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
-class RemovalEffects(Protocol):
+class EffectsMeasurer(Protocol):
     """What the controller asks of whoever measures the effects."""
 
     def measure(self) -> tuple[F64, F64]:
@@ -216,7 +216,7 @@ def _cheapest(score: F64, weight: F64, remaining: int) -> Indices:
 
 
 def prune(
-    effects: RemovalEffects,
+    effects: EffectsMeasurer,
     splats: int,
     options: PruningOptions,
     progress: Callable[[int, int], None] | None = None,

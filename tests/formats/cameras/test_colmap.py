@@ -83,8 +83,8 @@ def test_camera_models_that_are_not_read(model: Path, text_model_lines: Callable
     data = (model / "cameras.bin").read_bytes()
     for number, name in ((7, "FOV"), (11, "RAD_TAN_THIN_PRISM_FISHEYE"), (99, "number 99"), (-1, "number -1")):
         (model / "cameras.bin").write_bytes(data[:12] + struct.pack("<i", number) + data[16:])
-        refused(model, f"camera 1 has the model '{name}', which is not read: .* 'colmap image_undistorter'")
-    refused(text_model_lines("1 FOV 990 742 800 800 495 371 0.9\n"), "'1' has the model 'FOV', which is not read")
+        refused(model, f"camera 1 has the model '{name}', which is not supported: .* 'colmap image_undistorter'")
+    refused(text_model_lines("1 FOV 990 742 800 800 495 371 0.9\n"), "'1' has the model 'FOV', which is not supported")
 
 
 DISTORTED = {

@@ -200,12 +200,12 @@ def names_of(description: dict[str, Any]) -> dict[str, int]:
         (lambda d: d["nodes"][0].update(children=[0]), "node 0 stands twice"),
         (lambda d: d["nodes"][0].update(scale=[1, 1, -1]), "sheared or mirrored"),
         (lambda d: d["nodes"][0].update(matrix=[1, 0, 0, 0, 1, 1, *[0] * 4, 1, *[0] * 4, 1]), "sheared or mirrored"),
-        (lambda d: d["nodes"][0].update(scale=[0, 1, 1]), "no transform"),
+        (lambda d: d["nodes"][0].update(scale=[0, 1, 1]), "transform is invalid"),
         (lambda d: d["nodes"][0].update(rotation=[0, 0, 0, 0]), "length zero"),
         (lambda d: d["nodes"][0].update(translation=[1, 2]), "'translation' of a node is not 3 numbers"),
         (lambda d: d["nodes"][0].update(translation=[1, 2, "x"]), "not 3 numbers"),
         (lambda d: d.update(nodes=5), "among its nodes"),
-        (lambda d: d.update(scenes=[5]), "no object"),
+        (lambda d: d.update(scenes=[5]), "not an object"),
     ],
 )
 def test_what_is_refused(change: Any, message: str, tmp_path: Path) -> None:
