@@ -49,7 +49,7 @@ def test_files_of_another_tool_look_as_the_scene_does(device, data, plush_excerp
 
 @pytest.mark.parametrize(("name", "version"), WRITTEN)
 def test_what_is_written_looks_as_the_scene_does(device, tmp_path, plush_excerpt, plush_excerpt_cameras, name, version):
-    scene_writer(tmp_path / name, version)(plush_excerpt)
+    scene_writer(tmp_path / name, version=version)(plush_excerpt)
     scene = load_scene(tmp_path / name)
     assert len(scene) == len(plush_excerpt)
     assert psnr(device, plush_excerpt, scene, plush_excerpt_cameras) >= WRITTEN[name, version]
