@@ -8,10 +8,11 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -81,6 +82,13 @@ class _Job:
     @property
     def pool(self) -> Pool | None:
         return None if self.workers is None else self.workers.pool
+
+    def encoding(self, progress: Progress | None) -> Callable[[], Encoded]:
+        """What encodes it."""
+        return partial(
+            run_stages, self.scene, self.cameras, self.options, progress, self.device, kept=self.kept, in_frame=True,
+            tell=_log.info, pool=self.pool,
+        )  # fmt: skip
 
 
 class Encoder:
@@ -237,7 +245,14 @@ class Encoder:
             if report_view is not None and job.judging is not None:
                 job.judging.named(report_view)  # an unknown name is reported before the work
             before = Traffic() if job.pool is None else replace(job.pool.traffic)
-            encoded, search = self._encoded(job, progress)
+            search: dict[str, Any] | None = None
+            if self._target is None:
+                encoded = job.encoding(progress)()
+            else:
+                found = encode_to_target(
+                    job.scene, job.cameras, self._target, job.options, progress, job.device, _log.info, pool=job.pool
+                )
+                encoded, search = replace(found.encoded, options=found.options), search_report(self._target, found)
             watch = Stopwatch(progress)
             quality: dict[str, Any] | str = "not judged, as asked"
             if self._judge and job.judging is None:
@@ -267,19 +282,6 @@ class Encoder:
             if page is not None:
                 page.write(html_report(document, pictures).encode())
         return replace(encoded, report=document)
-
-    def _encoded(self, job: _Job, progress: Progress | None) -> tuple[Encoded, dict[str, Any] | None]:
-        """The file, and how it was searched for."""
-        if self._target is None:
-            encoded = run_stages(
-                job.scene, job.cameras, job.options, progress, job.device, kept=job.kept, in_frame=True, tell=_log.info,
-                pool=job.pool,
-            )  # fmt: skip
-            return encoded, None
-        found = encode_to_target(
-            job.scene, job.cameras, self._target, job.options, progress, job.device, _log.info, pool=job.pool
-        )
-        return replace(found.encoded, options=found.options), search_report(self._target, found)
 
     def _judged(
         self,
@@ -383,7 +385,7 @@ class Encoder:
         return ladder
 
     def _rung(self, job: _Job, file: Path, progress: Progress | None) -> Rung:
-        encoded, _ = self._encoded(job, progress)
+        encoded = job.encoding(progress)()
         psnr = ssim = None
         said = ""
         with proved(encoded, self._trust, None if job.judging is None else encoded.device) as written:

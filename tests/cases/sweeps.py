@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from potr_cl.model.scene import Scene
-from potr_cl.stages.pruning.measured import Removal
+from potr_cl.stages.pruning.removal import RemovalSweep
 
 
-def assert_same_bits(wanted: Removal, got: Removal, scene: Scene, rng: np.random.Generator) -> None:
+def assert_same_bits(wanted: RemovalSweep, got: RemovalSweep, scene: Scene, rng: np.random.Generator) -> None:
     """Both measure the same while an eighth of the splats goes four times, and colours change once."""
     for step in range(4):
         effects, found = wanted.measure(), got.measure()

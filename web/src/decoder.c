@@ -50,7 +50,7 @@ typedef struct {
     float sf_scale, sf_rotation, sf_opacity;
 } rules;
 
-static rules of_block;
+static rules of_block, of_tables;
 static bundled_file file;
 static scene_values values;
 static work room;
@@ -63,7 +63,6 @@ static float scale_table[LOOKED_UP], opacity_table[LOOKED_UP];
 /* Values of a bundle, splat by splat. */
 static float log_scales[3 * BUNDLE], quaternions[4 * BUNDLE], logits[BUNDLE], sh[3 * COEFFICIENTS * BUNDLE];
 static float dc[3 * BUNDLE];
-static uint32_t items[4 * 15 * BUNDLE];
 
 void *EXPORT(potr_out)(int which)
 {
@@ -133,10 +132,12 @@ void EXPORT(potr_begin)(
         inverse_of_class[k + CLASSES] = k >= 0 ? up << (k >> 2) : up >> -(k >> 2);
         steps_of_class[k + CLASSES] = -k >= 0 ? down << (-k >> 2) : down >> -(-k >> 2);
     }
-    for (int x = 0; x < LOOKED_UP; x++) {
-        scale_table[x] = log_scale(x);
-        opacity_table[x] = logit(x);
-    }
+    if (memcmp(&of_tables, &now, sizeof now)) /* blocks of a file have the same */
+        for (int x = 0; x < LOOKED_UP; x++) {
+            scale_table[x] = log_scale(x);
+            opacity_table[x] = logit(x);
+        }
+    of_tables = now;
     potr_bundles_begin(&room);
 }
 
@@ -209,16 +210,27 @@ int EXPORT(potr_steps)(const uint8_t *raw, uint32_t size)
     return 0;
 }
 
-/* Coefficients of a bundle's splats from their lists to `sh`. */
-static void spread(size_t splats, uint64_t listed)
+/* Coefficients of a bundle's splats to `sh`: those of `dc`, and those that are not 0. */
+static void spread(size_t splats, size_t steps)
 {
     const size_t all = 3 * (size_t)of_block.coefficients;
     memset(sh, 0, splats * all * sizeof *sh);
     for (size_t i = 0; i < splats; i++)
         for (size_t c = 0; c < 3; c++)
             sh[i * all + c] = dc[c * BUNDLE + i];
-    for (const uint32_t *item = items, *end = items + 4 * listed; item < end; item += 4)
-        memcpy(sh + (item[0] & (BUNDLE - 1)) * all + 3 * (item[0] / BUNDLE), item + 1, 3 * sizeof *sh);
+    for (size_t band = 0; band < 3; band++) {
+        const uint16_t *const places = room.places[band];
+        const level *const ys = room.channels[band][0], *const cos = room.channels[band][1], *const cgs = room.channels[band][2];
+        for (size_t i = 0; i < room.items[band]; i++) {
+            const size_t place = places[i], splat = place % LANES * steps + place / LANES;
+            const level y = ys[i], co = cos[i], cg = cgs[i], rest = y - cg;
+            const float divisor = sf_ac[room.ac_classes[place]];
+            float *const to = sh + splat * all + 3 * ((band + 1) * (band + 1) + room.coefficients[band][i]);
+            to[0] = (float)(rest + co) / divisor;
+            to[1] = (float)(y + cg) / divisor;
+            to[2] = (float)(rest - co) / divisor;
+        }
+    }
 }
 
 /* A bundle's values: of so many sections of the chain that begins with opacities, and of rotations. Returns what
@@ -230,7 +242,6 @@ int EXPORT(potr_bundle)(int bundle, int sections)
     values.quaternions = quaternions;
     values.logits = logits;
     values.dc = dc;
-    values.items = items;
     values.scale_table = scale_table;
     values.opacity_table = opacity_table;
     values.scale_levels = values.opacity_levels = LOOKED_UP;
@@ -253,7 +264,7 @@ int EXPORT(potr_bundle)(int bundle, int sections)
             for (size_t axis = 0; axis < 3; axis++)
                 log_scales[3 * i + axis] = log_scale(room.scales[axis][place]);
         }
-    spread(splats, values.listed);
+    spread(splats, steps);
     return FINE;
 }
 
