@@ -26,6 +26,7 @@ def child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The source of what is run instead of the trial; verdicts are kept for this test alone."""
     monkeypatch.delenv(verdict.TRUST_VARIABLE)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(verdict, "_file", lambda info: tmp_path / "verdicts" / str(info.index))
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(verdict, "_MODULE", "tried_instead")
     monkeypatch.setattr(discovery, "_passed_over", set())

@@ -243,7 +243,7 @@ def test_antialiased_scenes_stay_so(suffix, plush_excerpt, plush_excerpt_cameras
 
 @pytest.mark.slow
 def test_results_are_saved_in_their_own_format_and_others(plush_excerpt, tmp_path):
-    nothing = {"prune": False, "refit": False}
+    nothing = {"prune": False, "refit": False, "compact": False}
     encoded = potr_cl.encode(plush_excerpt, output=tmp_path / "a.spz", **nothing)
     assert (tmp_path / "a.spz").read_bytes() == encoded.data
     potr_cl.save(encoded, tmp_path / "b.spz")
