@@ -31,7 +31,7 @@ def _arrange(args: argparse.Namespace) -> None:
     if args.output is not None:
         return
     if len(args.scenes) != 2:
-        raise UsageError("give a scene and the name of what is written, or several scenes, --to and -o FOLDER")
+        raise UsageError("usage: convert IN OUT, or convert IN … --to .spz -o FOLDER")
     args.output = place(str(args.scenes.pop()))
 
 

@@ -85,7 +85,8 @@ def test_formats_import_no_heavy_library() -> None:
 # Reading and writing -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("entry", WRITTEN, ids=name)
+# What a page holds is rounded as encode rounds: tests/outputs/test_page.py.
+@pytest.mark.parametrize("entry", [entry for entry in WRITTEN if entry.name != "web page"], ids=name)
 @given(splats=st.integers(1, 400), degree=st.integers(0, 3), seed=st.integers(0, 99))
 @settings(
     max_examples=12,

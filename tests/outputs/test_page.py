@@ -82,6 +82,12 @@ def test_convert_leaves_no_splat_out(data, plush_excerpt, tmp_path):
     scene = potr_cl.load_scene(path)
     assert len(scene) == len(plush_excerpt)
     assert scene.sh_degree == plush_excerpt.sh_degree
+    for found, wanted, most in (
+        (scene.means, plush_excerpt.means, 0.01),
+        (scene.opacities, plush_excerpt.opacities, 0.05),
+        (scene.sh, plush_excerpt.sh, 0.1),
+    ):
+        assert np.abs(np.sort(found, axis=0) - np.sort(wanted, axis=0)).max() < most
 
 
 @needs_viewer

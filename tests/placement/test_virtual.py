@@ -301,7 +301,9 @@ def test_the_basis_is_that_of_the_rasterizer():
 
 @pytest.mark.slow
 def test_encode_places_them_itself(monkeypatch):
-    monkeypatch.setattr("potr_cl.pipeline.encode.place_cameras", lambda scene, device: place_cameras(scene, 6, 64))
+    monkeypatch.setattr(
+        "potr_cl.pipeline.encode.place_cameras", lambda scene, count, device: place_cameras(scene, 6, 64)
+    )
     scene, options = random_scene(150, 2), EncodeOptions.for_preset("paper", prune={"iterations": 2})
     given = encode(scene, place_cameras(scene, 6, 64), options)
     assert b"".join(encode(scene, None, options).pieces) == b"".join(given.pieces)

@@ -1,6 +1,7 @@
 """How fast does the browser's decoder decode, against native C on one core, and in how much memory?
 
     python -m tools.bench.web FILE.potr... [--rounds 7] [--rate MBIT] [--json FILE]
+    python -m tools.bench.web FILE.potr... --tab          # memory of a tab of Chromium, by workers
 
 By Node, whose WebAssembly is Chromium's, in one thread. Native, native without vectors of 512 bits, and both builds
 take turns; the first round warms them, and the best of the others counts, in seconds of CPU time. ``python -m
@@ -10,7 +11,11 @@ tools.make.web`` builds the decoder.
 from __future__ import annotations
 
 import os
+import shutil
+import threading
 import time
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -54,12 +59,59 @@ def measured(file: Path, rounds: int, rate: float = 0) -> tuple[dict[str, float]
     return paces, {"splats": splats, "arrays": arrays, "peak": peak, "over": slow}
 
 
+def tab_peak(file: Path, workers: int) -> float:
+    """Megabytes that a tab of Chromium needs at most to decode a file, more than before."""
+    from playwright.sync_api import sync_playwright  # of the extra browser
+
+    handler = partial(SimpleHTTPRequestHandler, directory=str(ROOT / "web"))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server, sync_playwright() as play:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        chromium = play.chromium.launch(
+            executable_path=shutil.which("chromium"), args=["--no-sandbox", "--disable-gpu"]
+        )
+        page = chromium.new_page()
+        page.set_default_timeout(600_000)
+        page.goto(f"http://127.0.0.1:{server.server_address[1]}/README.md")
+        page.set_content('<input type="file">')
+        page.set_input_files("input", file)
+        before = {pid: _memory(pid, "VmRSS") for pid in _tabs()}
+        page.evaluate(
+            "async (workers) => (await import('/dist/potr.js')).decode(document.querySelector('input').files[0], "
+            "{ workers }).then((scene) => void (globalThis.scene = scene))",
+            workers,
+        )
+        peak = max(_memory(pid, "VmHWM") - before[pid] for pid in _tabs() & before.keys())
+        chromium.close()
+        server.shutdown()
+    return peak
+
+
+def _tabs() -> set[int]:
+    """Processes of Chromium that hold pages."""
+    lines = {int(path.parent.name): path.read_bytes() for path in Path("/proc").glob("[0-9]*/cmdline")}
+    return {pid for pid, line in lines.items() if b"--type=renderer" in line}
+
+
+def _memory(pid: int, field: str) -> float:
+    lines = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
+    return int(lines[field].split()[0]) * 1024e-6
+
+
 def main() -> None:
     parser = plain_parser(__doc__)
     parser.add_argument("files", type=Path, nargs="+", metavar="FILE.potr")
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--rate", type=float, default=0, metavar="MBIT", help="of a slow server, Mbit/s")
+    parser.add_argument("--tab", action="store_true", help="memory of a tab of Chromium, instead")
     args = parser.parse_args()
+    if args.tab:
+        tabs = Results(None, args.json).table(
+            "tab", "Memory of a tab at most, MB more than before", "file; workers; tab|MB|.0f"
+        )
+        for file in args.files:
+            for workers in (0, 1, 2):
+                tabs.add(file.name, workers, tab_peak(file, workers))
+        return
     both = "{:.2f} ({:.2f}, {:.2f})"
     table = Results(None, args.json).table(
         "web", "The browser's decoder, million splats/s; in brackets of native, and of AVX2",
