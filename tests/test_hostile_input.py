@@ -20,7 +20,7 @@ pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="th
 ROOT = Path(__file__).parents[1]
 #: Formats whose files are attacked; compressed PLY is read by a library that may be missing.
 FORMATS = [
-    *("potr", "ply", "spz", "sog", "sog-folder", "sog-levels", "glb", "gltf", "splat", "ksplat", "ply.gz"),
+    *("potr", "ply", "spz", "sog", "sog-folder", "sog-levels", "glb", "gltf", "splat", "ksplat", "html", "ply.gz"),
     *("cameras.json", "transforms.json", "colmap-binary", "colmap-text", "png", "jpeg", "webp"),
     *(["compressed.ply"] if importlib.util.find_spec("gsply") else []),
 ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -176,3 +177,12 @@ def test_an_import_is_found_wherever_it_stands(tmp_path: Path) -> None:
     everywhere = {module for module, _ in imports(file)}
     assert everywhere == {"typing", "potr_cl.cli.files", "potr_cl.model.camera", "potr_cl.model.scene", "tools.bench"}
     assert {m for m, _ in imports(file, only_at_import=True)} == {"typing", "potr_cl.cli.files", "tools.bench"}
+
+
+def test_guides_name_files_that_are_there() -> None:
+    """A package's docstring says where to begin: it names modules of the package, or of folders below."""
+    for guide in sorted((ROOT / PACKAGE).rglob("__init__.py")):
+        text = ast.get_docstring(ast.parse(guide.read_text("utf-8"))) or ""
+        for named in re.findall(r"(?<![\w/`.])(?:[\w]+/)*\w+\.py\b", text):
+            found = [*guide.parent.glob(named), *(ROOT / PACKAGE).glob(named), *ROOT.glob(named)]
+            assert found, f"{guide.relative_to(ROOT)} names {named}, which is not there"

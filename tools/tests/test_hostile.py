@@ -11,6 +11,7 @@ from random import Random
 import pytest
 
 from potr_cl.codec.sections import Coder
+from potr_cl.formats.registry import SCENE_FORMATS
 from tests.reference.file_parts import File, sealed
 from tools.stress.hostile.bomb_files import BOMBS
 from tools.stress.hostile.formats import FORMATS
@@ -54,6 +55,12 @@ out = os.dup(1)
 verdict = judge.judge(path, 3)
 os.write(out, json.dumps([verdict.kind, verdict.text]).encode())
 """
+
+
+def test_every_format_of_scenes_is_attacked() -> None:
+    for entry in SCENE_FORMATS:
+        assert {suffix.lstrip(".") for suffix in entry.suffixes} & FORMATS.keys() or entry.names, entry.name
+
 
 SEEN = {
     "read": "return b'x'",

@@ -1,8 +1,6 @@
-"""What virtual cameras are placed with, NumPy alone. Begin with candidates.py.
+"""What views are placed with, NumPy alone: without cameras (:mod:`potr_cl.placement`), and between given ones.
 
-- candidates.py draws views all around and inside a scene, says what each shows, and rejects the implausible ones;
-- choice.py picks those that add most;
-- matter.py knows where the scene is, how large, and what hides what from a place;
-- colour_memory.py asks the colours from where they were trained;
-- sampling.py spreads points evenly.
+- given_views.py: what given views show, and where a camera might have been besides;
+- matter.py: where the scene is, how large, and what hides what from a place;
+- surface.py: points on the scene's surfaces; sampling.py: points spread evenly.
 """

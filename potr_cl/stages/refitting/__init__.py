@@ -5,5 +5,7 @@
 - colour_map.py is the linear map from colours to pictures, whose kernels are launched in view_kernels.py;
 - solver.py minimises the error, by conjugate gradients on the vectors of coefficients.py, with blocks.py as
   preconditioner;
-- own_views.py walks the views that one worker does.
+- own_views.py walks the views that one worker does; shared_map.py adds what others have found, by way of exchange.py;
+- placement.py decides where vectors and blocks lie, whole or in slices (sliced_arrays.py);
+- rounding.py rounds colours in rounds while the solution goes on.
 """

@@ -95,7 +95,7 @@ class Sweep:
         ]
 
     def fixed_point_scales(self, cameras: Sequence[Camera]) -> list[float]:
-        """What the sums of each view are multiplied by, see :func:`.fixed_point.fixed_point_scale`.
+        """What the sums of each view are multiplied by, see :func:`fixed_point_scale`.
 
         Args:
             cameras: all views; those that a launch does have one scale.

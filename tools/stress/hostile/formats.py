@@ -155,6 +155,7 @@ def _format(good: Callable[[], Any], changed: Callable[[Random], Any], name: str
 #: By name. docs/security.md states the costs.
 FORMATS: dict[str, Format] = {
     "potr": _scene(potr_files.originals, potr_files.changed, 64, 8192, "a.potr", read_potr),
+    "html": _scene(potr_files.page_originals, potr_files.changed_page, 64, 8192, "a.html"),
     "ply": _scene(ply_files.plain_originals, ply_files.changed_plain, 32, 64, "a.ply"),
     "compressed.ply": _scene(ply_files.compressed_originals, ply_files.changed_compressed, 32, 64, "a.compressed.ply"),
     "spz": _scene(spz_files.originals, spz_files.changed, 64, 2048, "a.spz"),

@@ -5,6 +5,7 @@ They are taken apart by :mod:`tests.reference.file_parts`, which shares no mista
 
 from __future__ import annotations
 
+import base64
 import dataclasses
 import itertools
 import struct
@@ -23,6 +24,7 @@ from potr_cl.codec.encoder import Level, code_levels
 from potr_cl.codec.quantize import HyperParameters, Preset
 from potr_cl.codec.steps.fitting import fit_steps
 from potr_cl.codec.steps.rule import ColourSteps
+from potr_cl.formats.scenes.page import BEGIN, END
 from potr_cl.model.scene import Scene
 from tests.reference.file_parts import STREAMS, File, Section
 from tests.reference.scenes import random_scene, ring_of_cameras
@@ -330,3 +332,18 @@ _CHANGES = (
     _behind_the_coder, _behind_the_coder, _behind_the_coder, _behind_the_coder,
     _in_bundles, _in_bundles, _in_bundles, _in_bundles, _in_bundles,
 )  # fmt: skip
+
+
+def page_originals() -> list[bytes]:
+    """Web pages with good files."""
+    return [_page(base64.b64encode(data)) for data in originals()]
+
+
+def changed_page(rng: Random) -> bytes:
+    """A page with a changed file in it, or whose text is changed."""
+    page = _page(base64.b64encode(changed(rng)))
+    return damaged(page, rng) if rng.random() < 0.5 else page
+
+
+def _page(text: bytes) -> bytes:
+    return b"".join((b"<!doctype html><title>a</title>", BEGIN, text, END))
