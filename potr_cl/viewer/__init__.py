@@ -1,6 +1,6 @@
 """The viewer in the browser: what a scene looks like, beside another one, and what quality would cost.
 
-:class:`potr_cl.viewer.server.Viewer` is the whole of it. The pictures are those of :class:`potr_cl.raster.rasterizer.Rasterizer`;
+:class:`potr_cl.viewer.server.Viewer` is the whole of it. The pictures are those of the rasterizer (potr_cl/raster);
 the page, its camera controls and its panel are viser's (the extra ``view``). One module an idea:
 
 - ``session``: the scenes that are looked at, on a device; ``losses``: what each view has lost;

@@ -255,6 +255,10 @@ def _jpeg(side: int) -> Files:
     return {"a.jpg": bytes(data)}
 
 
+def _page(files: Files) -> Files:
+    return {"a.html": potr_files.page_of(files["a.potr"])}
+
+
 _WEBP = struct.pack("<4sI8sIBI5x", b"RIFF", 22, b"WEBPVP8L", 10, 0x2F, 16382 | 16382 << 14)
 _BIG, _EQUAL = "pictures of 4,000², all splats claimed", "a million equal splats"
 
@@ -274,6 +278,10 @@ BOMBS: dict[str, dict[str, Bomb]] = {
         "the most splats, 7 planes each": partial(_as_much_as_is_let_through, 7),
         "1,000 blocks of 65,536 splats": lambda: _potr(65_536, 0, _one_leaf(65_536), blocks=1000),
         "2,000 blocks of a splat": partial(_blocks_of_one_splat, 2000),
+    },
+    "html": {
+        "a leaf of 4 million splats": lambda: _page(_potr(1 << 22, 0, _one_leaf(1 << 22))),
+        "the most splats that are let through": lambda: _page(_as_much_as_is_let_through(1)),
     },
     "ply": {
         "2³¹ splats claimed": _ply("binary_little_endian", [f"element vertex {1 << 31}", *_PROPERTIES], bytes(1000)),

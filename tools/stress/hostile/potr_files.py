@@ -336,14 +336,15 @@ _CHANGES = (
 
 def page_originals() -> list[bytes]:
     """Web pages with good files."""
-    return [_page(base64.b64encode(data)) for data in originals()]
+    return [page_of(data) for data in originals()]
 
 
 def changed_page(rng: Random) -> bytes:
     """A page with a changed file in it, or whose text is changed."""
-    page = _page(base64.b64encode(changed(rng)))
+    page = page_of(changed(rng))
     return damaged(page, rng) if rng.random() < 0.5 else page
 
 
-def _page(text: bytes) -> bytes:
-    return b"".join((b"<!doctype html><title>a</title>", BEGIN, text, END))
+def page_of(potr: bytes) -> bytes:
+    """A web page with a file in it."""
+    return b"".join((b"<!doctype html><title>a</title>", BEGIN, base64.b64encode(potr), END))
