@@ -54,7 +54,7 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
 PURPOSE: dict[Preset, str] = {
     "best": "small files, quickly",
     "smallest": "smaller still: more iterations, and a fit of all parameters; takes several times as long",
-    "fast": "fewer iterations and steps: faster, a little larger",
+    "fast": "fewer iterations and steps: faster, a little larger at equal quality",
     "paper": "the method of the paper: colours compacted splat by splat, zstd",
 }
 

@@ -57,7 +57,7 @@ def test_what_is_wrong_is_told_in_a_line(data, tmp_path, capsys, words, code, sa
     (tmp_path / "broken" / "ladder.json").write_text("{}")
     Ladder(tmp_path / "ladder.json", "", None, "", (Rung(0.5, "a.potr", 1, 1),)).save()
     names = {"scene": data / "plush_excerpt.ply", "ladder": tmp_path, "broken": tmp_path / "broken"}
-    assert main(["view", *(word.format(**names) for word in words), "--no-browser"]) == code
+    assert main(["view", "--no-browser", "--port", "0", *(word.format(**names) for word in words)]) == code
     told = capsys.readouterr().err.strip()
     assert said in told
     assert "\n" not in told

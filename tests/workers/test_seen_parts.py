@@ -18,7 +18,6 @@ from potr_cl.raster.carried import Excerpt
 from potr_cl.raster.rules import INRIA
 from potr_cl.stages.pruning import shared_removal
 from potr_cl.stages.refitting.exchange import DrawnRows
-from potr_cl.stages.refitting.packed_row import PackedRow
 from potr_cl.stages.refitting.shared_map import ColourPart
 from potr_cl.views import visibility
 from potr_cl.views.shares import ViewShares
@@ -158,12 +157,12 @@ def test_a_re_fit_without_room_for_that_sends_all(monkeypatch):
     expected = encode(scene, cameras, options, device=devices[0]).data
     refused = []
 
-    class WithoutRoom(PackedRow):
-        def settle(self):
+    class WithoutRoom(DrawnRows):
+        def take_flags(self, active):
             refused.append(self)
             raise DeviceMemoryError("no room")
 
-    monkeypatch.setattr("potr_cl.stages.refitting.exchange.PackedRow", WithoutRoom)
+    monkeypatch.setattr("potr_cl.stages.refitting.shared_map.DrawnRows", WithoutRoom)
     with ElsewherePool(devices) as pool:
         assert encode(scene, cameras, options, device=devices[0], pool=pool).data == expected
     assert refused
@@ -203,11 +202,11 @@ def test_workers_with_gpus_look_at_each_view_with_what_it_may_draw(keep, monkeyp
         where = f"potr_cl.{where}"
         kind = importlib.import_module(where).__dict__[name]
 
-        def noted(*args, kind=kind, **named):
+        def noting(self, *args, kind=kind, **named):
             made.append(kind.__name__)
-            return kind(*args, **named)
+            kind.__init__(self, *args, **named)
 
-        monkeypatch.setattr(f"{where}.{name}", noted)
+        monkeypatch.setattr(f"{where}.{name}", type(name, (kind,), {"__init__": noting}))
     devices = [open_device(family) for _ in range(3)]
     with ElsewherePool(devices) as pool:
         assert encode(scene, cameras, options, device=devices[0], pool=pool).data == expected

@@ -84,6 +84,7 @@ def build() -> None:
         _run([npm, "ci", "--ignore-scripts"], WEB)
     for script in ("check", "build"):
         _run([npm, "run", "--silent", script], WEB)
+    print(f"built {WEB / 'dist'} and the viewer of pages: encode -o scene.html works now")
 
 
 def main() -> None:

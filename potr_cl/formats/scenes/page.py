@@ -36,7 +36,10 @@ _QUALITY = 0.5
 def check_viewer() -> None:
     """Raises UsageError if this installation has no viewer to put into pages."""
     if not TEMPLATE.exists():
-        raise UsageError("this installation cannot make pages: build their viewer by 'python -m tools.make.web'")
+        raise UsageError(
+            "this installation has no viewer for pages: in a clone, 'pip install -e . ziglang' and "
+            "'python -m tools.make.web' build it (it needs Node 20 and npm; see docs/web.md)"
+        )
 
 
 def page_around(
