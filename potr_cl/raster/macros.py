@@ -10,6 +10,13 @@ def gpu_limits(device: Device) -> dict[str, int]:
     return {"NATIVE_EXP2": int(device.native_exp2)} | totals_limits(device)
 
 
+def sweep_limits(device: Device) -> dict[str, int]:
+    """Macros of a sweep over tiles that adds exact totals, of the device's family."""
+    if device.family == "gpu":
+        return gpu_limits(device)
+    return {"LANES": max(device.vector_width, 8)} | totals_limits(device)
+
+
 def totals_limits(device: Device) -> dict[str, int]:
     """Macros of the kernels with exact totals (cl/include/totals.clh)."""
     extensions = device.info.handle.extensions.split()

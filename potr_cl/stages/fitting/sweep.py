@@ -7,7 +7,7 @@ from typing import Any
 import pyopencl as cl
 
 from potr_cl.opencl.device import Device
-from potr_cl.raster.macros import gpu_limits, totals_limits
+from potr_cl.raster.macros import sweep_limits
 from potr_cl.raster.rules import RasterRules
 from potr_cl.raster.view_set import ViewSet, camera_struct
 from potr_cl.stages.fitting.fixed_point import LARGEST_GAP, LARGEST_VALUE
@@ -35,7 +35,6 @@ class Sweep:
     def __init__(self, device: Device, rules: RasterRules) -> None:
         self._gpu = device.family == "gpu"
         self.lanes, self.most_views = (1, _MOST_VIEWS) if self._gpu else (device.vector_width, 1)
-        of_family: dict[str, Any] = {"LANES": max(device.vector_width, 8), **totals_limits(device)}
         self._kernel = device.shared_kernel(
             f"fit/derivatives_{device.family}.cl",
             "derivatives",
@@ -43,7 +42,7 @@ class Sweep:
             TRANSMITTANCE_THRESHOLD=rules.transmittance_threshold,
             LARGEST_VALUE=LARGEST_VALUE,
             LARGEST_GAP=LARGEST_GAP,
-            **(gpu_limits(device) if self._gpu else of_family),
+            **sweep_limits(device),
         )
 
     def run(

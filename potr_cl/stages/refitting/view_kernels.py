@@ -17,7 +17,7 @@ import pyopencl as cl
 from potr_cl.model.camera import Camera
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.kernel import Kernel
-from potr_cl.raster.macros import gpu_limits, totals_limits
+from potr_cl.raster.macros import sweep_limits
 from potr_cl.raster.rules import RasterRules
 from potr_cl.raster.view_set import TILE, ViewSet, camera_struct
 from potr_cl.stages.refitting.layout import Layout
@@ -78,18 +78,15 @@ class Sweep:
         self._gpu = device.family == "gpu"
         self.lanes = 1 if self._gpu else device.vector_width
         self.most_views, self.gathered = (_MOST_VIEWS, 1) if self._gpu else (1, _GATHERED)
-        of_family: dict[str, Any] = {"LANES": max(device.vector_width, 8), **totals_limits(device)}
-        if self._gpu:
-            of_family = gpu_limits(device)
         self._kernels = [
             device.shared_kernel(
-                "refit/refit_gpu.cl" if self._gpu else "refit/refit_cpu.cl",
+                f"refit/refit_{device.family}.cl",
                 "refit_sweep",
                 ALPHA_CAP=float(rules.alpha_cap),
                 TRANSMITTANCE_THRESHOLD=rules.transmittance_threshold,
                 LARGEST_VALUE=LARGEST_VALUE,
                 WEIGHTS=weights,
-                **of_family,
+                **sweep_limits(device),
             )
             for weights in (0, 1)
         ]
