@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 from potr_cl.codec.container import MAGIC
 from potr_cl.codec.decoder import PotrFile, decode, open_file
 from potr_cl.errors import DataError, UsageError
-from potr_cl.host.unchanged import unchanged
+from potr_cl.host.inputs import unchanged
 from potr_cl.model.camera import Camera, test_views, train_views
 from potr_cl.model.scene import Scene
 

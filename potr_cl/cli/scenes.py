@@ -18,7 +18,7 @@ from potr_cl.formats import scene_writer
 from potr_cl.formats.scene_size import bytes_of_scene
 from potr_cl.formats.scenes import spz
 from potr_cl.formats.streams import received, send
-from potr_cl.host.standard_files import closed
+from potr_cl.host.process import closed
 from potr_cl.model.scene import Scene
 
 FROM_HELP = 'format of "-", standard input: .ply, .spz …; default: detected'

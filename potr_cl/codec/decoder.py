@@ -25,7 +25,7 @@ from potr_cl.codec.container import FIXED_BYTES, Block, FileHeader, header_bytes
 from potr_cl.codec.sections import Property
 from potr_cl.errors import DataError, UsageError
 from potr_cl.host import mapped
-from potr_cl.host.unchanged import State, refuse_changed, state_of, unchanged
+from potr_cl.host.inputs import State, refuse_changed, state_of, unchanged
 from potr_cl.model.box import Box
 from potr_cl.model.scene import Scene, joined, most_coefficients
 

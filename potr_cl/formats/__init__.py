@@ -16,7 +16,7 @@ import numpy as np
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats import gzipped, registry
 from potr_cl.formats.cameras.view_files import read_json
-from potr_cl.formats.lfs_pointer import refuse_lfs_pointer
+from potr_cl.host.inputs import refuse_lfs_pointer
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 

@@ -12,8 +12,8 @@ from pathlib import Path
 from potr_cl.errors import DataError, PotrError
 from potr_cl.formats import registry
 from potr_cl.formats.called import called
-from potr_cl.formats.lfs_pointer import refuse_lfs_pointer
 from potr_cl.formats.scenes.scene_files import opened
+from potr_cl.host.inputs import refuse_lfs_pointer
 from potr_cl.host.leftovers import temporary_folder
 
 SUFFIX = ".gz"

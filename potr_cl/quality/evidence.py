@@ -24,8 +24,9 @@ from potr_cl.model.agreement import Evidence
 from potr_cl.model.camera import Camera, resized, within_photographs
 from potr_cl.model.lens import Pinhole
 from potr_cl.model.scene import Scene, opacities_of
-from potr_cl.model.sightings import NEAR, looked_at
+from potr_cl.model.sightings import looked_at
 from potr_cl.model.spherical_harmonics import ac_basis
+from potr_cl.model.splat_groups import NEAR
 from potr_cl.quality.photographs import undistorted
 
 F64 = NDArray[np.float64]

@@ -25,7 +25,7 @@ from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.scenes import ply
 from potr_cl.host.mapped import bounded
 from potr_cl.host.threads import thread_pool
-from potr_cl.model.morton import morton_order
+from potr_cl.model.order import morton_order
 from potr_cl.model.scene import Scene
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions

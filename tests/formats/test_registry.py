@@ -26,7 +26,7 @@ from potr_cl.formats.registry import CAMERA_FORMATS, SCENE_FORMATS, listed
 from potr_cl.formats.scenes import page
 from potr_cl.formats.scenes.compressed_ply import is_compressed_ply
 from potr_cl.formats.scenes.scene_files import opened
-from potr_cl.host.installation import install_command
+from potr_cl.host.libraries import install_command
 from tests.cases.cameras import nerfstudio, view, write_json
 from tests.cases.scenes import in_order_of, turned_by
 from tests.reference.scenes import random_scene

@@ -6,7 +6,7 @@ import importlib.metadata
 
 import pytest
 
-from potr_cl.host.installation import install_command
+from potr_cl.host.libraries import install_command
 
 REQUIRES = [
     "numpy>=2.0",

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.host.threads import Run
-from potr_cl.model.morton import BITS, morton_codes
+from potr_cl.model.order import BITS, morton_codes
 
 #: Scenes of no more splats are one block; others have blocks of so many at most. A block's own header, models and steps
 #: are a few kilobytes, and its octree begins anew: next to nothing for a million.

@@ -15,7 +15,7 @@ from potr_cl.codec.native.table import definition
 from potr_cl.codec.octree.parser import parse
 from potr_cl.codec.octree.streams import DEEPEST_LEVEL, U8, U64, OctreeStreams, check_centres
 from potr_cl.host.threads import Run
-from potr_cl.model.morton import spread
+from potr_cl.model.order import spread
 
 #: Splats worked on at a time where each stands for itself: the temporaries of a block stay in the cache.
 _BLOCK = 1 << 15

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import DataError, UsageError
-from potr_cl.host.unchanged import unchanged
+from potr_cl.host.inputs import unchanged
 from potr_cl.model.camera import Camera
 from potr_cl.model.lens import MOST_HALF_FIELD, Lens, Pinhole, coverings
 

@@ -28,9 +28,9 @@ from potr_cl.formats.scenes.gltf_writer import EXTENSION as _EXTENSION
 from potr_cl.formats.scenes.gltf_writer import SPZ_EXTENSION
 from potr_cl.formats.scenes.scene_files import MOST_A_BYTE, cleaned, joined, log_of_scales, reading, shown
 from potr_cl.host.atomic_write import replacing
-from potr_cl.model.claims import check_claim
-from potr_cl.model.quaternions import quaternions_of, rotated_sh, rotation_matrices
+from potr_cl.host.inputs import check_claim
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
+from potr_cl.model.spherical_harmonics import quaternions_of, rotated_sh, rotation_matrices
 
 _log = logging.getLogger("potr_cl")
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from potr_cl.errors import PotrError, UsageError
 from potr_cl.formats.scenes.scene_files import arranged, cleaned, first_line
-from potr_cl.host.installation import install_command
+from potr_cl.host.libraries import install_command
 from potr_cl.model.scene import Scene
 
 #: Of this package, which brings the library.

@@ -22,7 +22,7 @@ from potr_cl.formats.scenes.ply_comments import ANTIALIASED_COMMENT, marked
 from potr_cl.formats.scenes.ply_rows import Target, read_rows
 from potr_cl.formats.scenes.scene_files import NO_EXTENT, cleaned, unfilled
 from potr_cl.host.atomic_write import replacing
-from potr_cl.host.unchanged import unchanged
+from potr_cl.host.inputs import unchanged
 from potr_cl.model.scene import MIP_SPLATTING_LOW_PASS, SH_COEFFICIENTS, Scene
 
 _log = logging.getLogger("potr_cl")

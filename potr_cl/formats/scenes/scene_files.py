@@ -17,9 +17,8 @@ import numpy as np
 from potr_cl.codec import octree
 from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.errors import DataError, PotrError, UsageError
-from potr_cl.formats.lfs_pointer import refuse_lfs_pointer
 from potr_cl.host import mapped
-from potr_cl.host.unchanged import unchanged
+from potr_cl.host.inputs import refuse_lfs_pointer, unchanged
 from potr_cl.model.scene import LOW_PASS, CleanReport, FloatArray, Scene
 
 #: Where somebody wants to know what was mended in files that are read.

@@ -42,7 +42,7 @@ from potr_cl.formats.scenes.sog_images import (
 from potr_cl.formats.scenes.sog_palette import areas, palette_of
 from potr_cl.formats.scenes.sog_steps import in_order, opacity_logits, quantised, unpacked_means, unpacked_rotations
 from potr_cl.host.atomic_write import replacing
-from potr_cl.model.claims import check_claim
+from potr_cl.host.inputs import check_claim
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
 
 #: What is packed in a SOG file is compressed already; only its description shrinks.

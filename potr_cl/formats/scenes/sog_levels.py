@@ -29,7 +29,7 @@ from potr_cl.formats.scenes.scene_files import (
     shown,
 )
 from potr_cl.formats.scenes.sog import Folder, Sog
-from potr_cl.model.claims import check_claim
+from potr_cl.host.inputs import check_claim
 from potr_cl.model.scene import Scene
 
 _log = logging.getLogger("potr_cl")

@@ -22,8 +22,8 @@ from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes.scene_files import MOST_A_BYTE, arranged, cleaned, opened, tell_of_low_pass
 from potr_cl.formats.scenes.spz_values import HALF_FLOATS, MOST_FRACTIONAL_BITS, POSITION_LIMIT, packed, unpacked
 from potr_cl.host.atomic_write import replacing
+from potr_cl.host.inputs import check_claim
 from potr_cl.host.threads import thread_pool
-from potr_cl.model.claims import check_claim
 from potr_cl.model.scene import SH_COEFFICIENTS, Scene
 
 _log = logging.getLogger("potr_cl")

@@ -14,7 +14,7 @@ from PIL import Image
 from potr_cl.errors import DataError
 from potr_cl.formats import load_scene
 from potr_cl.formats.scenes import sog
-from potr_cl.model.claims import FREE_SPLATS
+from potr_cl.host.inputs import FREE_SPLATS
 from tests.cases.own_warnings import no_warnings
 
 

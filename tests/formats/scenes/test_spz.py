@@ -15,7 +15,7 @@ import zstandard
 from potr_cl.errors import DataError
 from potr_cl.formats import load_scene
 from potr_cl.formats.scenes import spz
-from potr_cl.model.claims import FREE_SPLATS
+from potr_cl.host.inputs import FREE_SPLATS
 from tests.cases.own_warnings import no_warnings
 from tests.cases.scenes import in_order_of, turned_by
 from tests.reference.scenes import random_scene
