@@ -299,7 +299,7 @@ def rules_of(source: RasterRules | str) -> RasterRules:
 
 
 def bytes_of_source(source: SceneSource) -> int | None:
-    """Bytes of the file that a scene comes from, or of all its files (:mod:`potr_cl.formats.scene_size`); None where it
+    """Bytes of the file that a scene comes from, or of all its files (:mod:`potr_cl.formats.registry`); None where it
     comes from none, or whoever reads it will say so.
     """
     encoded = encoded_file(source)
@@ -307,7 +307,7 @@ def bytes_of_source(source: SceneSource) -> int | None:
         return len(encoded[1])
     if not isinstance(source, (str, os.PathLike)):
         return None
-    from potr_cl.formats.scene_size import bytes_of_scene
+    from potr_cl.formats.registry import bytes_of_scene
 
     return bytes_of_scene(source)
 

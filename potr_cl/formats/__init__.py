@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from potr_cl.errors import DataError, UsageError
-from potr_cl.formats import gzipped, registry
+from potr_cl.formats import registry, streams
 from potr_cl.formats.cameras.view_files import read_json
 from potr_cl.host.inputs import refuse_lfs_pointer
 from potr_cl.model.camera import Camera
@@ -44,7 +44,7 @@ def load_scene(path: str | os.PathLike[str], trust: bool = False, antialiased: b
         UsageError: the file cannot be opened, its extension is unknown, or it needs an extra.
         DataError: its content is damaged, or it holds too many splats for its size.
     """
-    with _silent_overflows(), gzipped.plain(Path(path), trust) as file:
+    with _silent_overflows(), streams.plain(Path(path), trust) as file:
         return registry.reader_of(file)(file, trust).rendered(antialiased)
 
 

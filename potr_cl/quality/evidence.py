@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import PotrError
-from potr_cl.formats.cameras.points import read_points
+from potr_cl.formats.cameras.view_files import read_points
 from potr_cl.formats.images import read_thumbnail
 from potr_cl.formats.scenes.scene_files import SH_0
 from potr_cl.model.agreement import Evidence

@@ -16,18 +16,18 @@ from numpy.typing import NDArray
 
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes.compressed_ply_chunks import in_chunks
 from potr_cl.formats.scenes.compressed_ply_values import (
     CHUNK,
     PackedGeometry,
     element_bytes,
+    in_chunks,
     packed_colours,
     packed_geometry,
     packed_sh,
     unpacked,
 )
 from potr_cl.formats.scenes.gsply_arrays import EXTRA, library, to_scene
-from potr_cl.formats.scenes.ply_comments import ANTIALIASED_COMMENT, marked
+from potr_cl.formats.scenes.ply_antialiasing import ANTIALIASED_COMMENT, marked
 from potr_cl.formats.scenes.scene_files import cleaned, opened, tell_of_low_pass, unit_quaternions
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene

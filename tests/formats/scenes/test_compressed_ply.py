@@ -11,8 +11,7 @@ from scipy.spatial import cKDTree
 from potr_cl.codec import octree
 from potr_cl.errors import DataError
 from potr_cl.formats import load_scene, scene_writer
-from potr_cl.formats.scenes.compressed_ply_chunks import in_chunks
-from potr_cl.formats.scenes.compressed_ply_values import CHUNK
+from potr_cl.formats.scenes.compressed_ply_values import CHUNK, in_chunks
 from tests.reference.scenes import random_scene
 
 pytest.importorskip("gsply", reason="the extra convert is not installed")

@@ -13,8 +13,7 @@ from potr_cl import DataError, Scene, convert, load_scene
 from potr_cl.cli import main
 from potr_cl.formats.scenes import sog
 from potr_cl.formats.scenes.sog_images import members, write_folder
-from potr_cl.formats.scenes.sog_palette import distinct_rows, palette_of
-from potr_cl.formats.scenes.sog_steps import in_order, quantised
+from potr_cl.formats.scenes.sog_values import distinct_rows, in_order, palette_of, quantised
 from tests.cases.scenes import in_order_of, turned_by
 
 
