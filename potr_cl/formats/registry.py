@@ -243,18 +243,9 @@ def suffixes_written() -> str:
     return listed(_scene_suffixes(entry for entry in SCENE_FORMATS if entry.save is not None))
 
 
-def extras_needed() -> str:
-    """For help: which scenes need which extra, a clause for each extra."""
-    clauses = []
-    for extra in dict.fromkeys(entry.extra for entry in SCENE_FORMATS if entry.extra is not None):
-        suffixes = _scene_suffixes(entry for entry in SCENE_FORMATS if entry.extra == extra)
-        clauses.append(f"{listed(suffixes, 'and')} {'need' if suffixes[1:] else 'needs'} the extra {extra}")
-    return "; ".join(clauses)
-
-
 def cameras_read() -> str:
-    """For messages and help: the kinds of cameras that are read, "a x, a y or a z", those without an extra first."""
-    return listed([f"a {entry.name}" for entry in sorted(CAMERA_FORMATS, key=lambda entry: entry.extra is not None)])
+    """For messages and help: the kinds of cameras that are read, "a x, a y or a z"."""
+    return listed([f"a {entry.name}" for entry in CAMERA_FORMATS])
 
 
 def json_cameras() -> str:

@@ -76,7 +76,7 @@ def install_command(extra: str) -> str:
     """What a user types to get what an extra of this package brings.
 
     The package may have been installed from a clone, from a wheel or from an index, and only an index would know
-    "potr-cl[convert]" by that name. So the command names the libraries themselves, as the package's metadata has them.
+    "potr-cl[view]" by that name. So the command names the libraries themselves, as the package's metadata has them.
 
     Args:
         extra: its name in pyproject.toml.

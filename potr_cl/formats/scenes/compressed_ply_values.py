@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from potr_cl.codec import octree
 from potr_cl.codec.logarithm import natural_logarithm
-from potr_cl.formats.scenes.scene_files import OTHER_PARTS, SH_0, with_largest
+from potr_cl.formats.scenes.scene_files import OTHER_PARTS, SH_0, unfilled, with_largest
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray, Scene
 
@@ -29,6 +29,8 @@ from potr_cl.model.scene import FloatArray, Scene
 CHUNK = 256
 #: Logarithms of scales outside are cut, as other writers do.
 _SCALE_LIMIT = np.float32(20)
+#: Splats unpacked at a time, whole chunks: the temporaries stay small.
+_BLOCK = 1 << 16
 #: What readers make of opacities of 0 and 1.
 _LARGEST_LOGIT = np.float32(10)
 #: Shifts and bits of three values in a word.
@@ -125,16 +127,26 @@ def element_bytes(packed: PackedGeometry, colours: tuple[FloatArray, Words], sh:
 
 def unpacked(chunk: bytes, vertex: bytes, sh: bytes) -> Scene:
     """The scene of what :func:`element_bytes` has returned."""
-    bounds = np.frombuffer(chunk, "<f4").reshape(-1, 3, 2, 3)
-    words = np.frombuffer(vertex, "<u4").reshape(-1, 4)
-    opacities = (words[:, 3] & np.uint32(255)).astype(np.uint8)
-    packed = PackedGeometry(bounds[:, 0], bounds[:, 1], words[:, 0], words[:, 1], words[:, 2], opacities)
-    colours = _unpacked_in_bounds(bounds[:, 2], words[:, 3], _COLOUR)
-    levels = np.frombuffer(sh, np.uint8).reshape(len(words), 3, -1).transpose(0, 2, 1)
-    coefficients = np.empty((len(words), 1 + levels.shape[1], 3), np.float32)
-    coefficients[:, 0] = (colours - np.float32(0.5)) / np.float32(SH_0)
-    coefficients[:, 1:] = unpacked_sh(levels)
-    return replace(unpacked_geometry(packed), sh=coefficients)
+    all_bounds = np.frombuffer(chunk, "<f4").reshape(-1, 3, 2, 3)
+    all_words = np.frombuffer(vertex, "<u4").reshape(-1, 4)
+    levels = np.frombuffer(sh, np.uint8).reshape(len(all_words), 3, -1).transpose(0, 2, 1)
+    scene = unfilled(len(all_words), 1 + levels.shape[1])
+
+    def unpack(start: int) -> None:
+        words, bounds = all_words[start : start + _BLOCK], all_bounds[start // CHUNK : (start + _BLOCK) // CHUNK]
+        opacities = (words[:, 3] & np.uint32(255)).astype(np.uint8)
+        packed = PackedGeometry(bounds[:, 0], bounds[:, 1], words[:, 0], words[:, 1], words[:, 2], opacities)
+        with np.errstate(all="ignore"):  # of bounds that are not finite, whose splats are dropped
+            colours = _unpacked_in_bounds(bounds[:, 2], words[:, 3], _COLOUR)
+            part = unpacked_geometry(packed)
+        coefficients = scene.sh[start : start + _BLOCK]
+        coefficients[:, 0] = (colours - np.float32(0.5)) / np.float32(SH_0)
+        coefficients[:, 1:] = unpacked_sh(levels[start : start + _BLOCK])
+        scene.put(start, replace(part, sh=coefficients))
+
+    with thread_pool() as pool:
+        list(pool.map(unpack, range(0, len(all_words), _BLOCK)))
+    return scene
 
 
 def _packed_in_bounds(values: FloatArray, places: Any) -> tuple[FloatArray, Words]:
