@@ -13,9 +13,8 @@ import pytest
 
 import potr_cl
 from potr_cl import cli
-from potr_cl.codec.blocks import geometry as blocks_geometry
-from potr_cl.codec.blocks.geometry import GeometryOfBlocks, quantise
-from potr_cl.codec.blocks.splitting import blocks_of
+from potr_cl.codec import blocks as blocks_geometry
+from potr_cl.codec.blocks import GeometryOfBlocks, blocks_of, quantise
 from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import decode, open_file
 from potr_cl.codec.encoder import Coded, Level, code_levels, code_scene
