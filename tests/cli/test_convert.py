@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import pytest
-
 from potr_cl.cli import main
 from potr_cl.formats.scenes import ply
-
-pytest.importorskip("gsply", reason="the extra convert is not installed")
 
 
 def test_convert_there_and_back(tmp_path, data, plush_excerpt, capsys):

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from potr_cl.formats import load_scene, save_scene
 from potr_cl.model.camera import Camera
-from potr_cl.model.quaternions import quaternions_of
 from potr_cl.model.scene import Scene, joined
+from potr_cl.model.spherical_harmonics import quaternions_of
 from tests.reference.captures import looking
 from tests.reference.frames import moved
 from tools.make.city import of_size, write_cameras
