@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import subprocess
 import sys
-import threading
 import tracemalloc
 from pathlib import Path
 
@@ -175,16 +173,6 @@ def test_a_device_without_end_is_refused():
     )
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=300)
     assert "UsageError: '/dev/zero' is not a regular file" in result.stderr
-
-
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes")
-def test_a_file_from_a_pipe_is_read(tmp_path):
-    data = made_of([LONE])
-    os.mkfifo(tmp_path / "pipe")
-    writer = threading.Thread(target=(tmp_path / "pipe").write_bytes, args=(data,))
-    writer.start()
-    assert len(decode(tmp_path / "pipe")) == 1
-    writer.join()
 
 
 def test_names_that_no_file_can_have(tmp_path):
