@@ -38,12 +38,15 @@ FOLDERS: dict[str, set[str]] = {
         "errors", "host", "model", "opencl", "placement",
         "raster", "views", "workers", "codec", "formats", "stages", "quality", "outputs",
     },
+    "levels": {
+        "errors", "host", "model", "opencl", "raster", "workers", "stages", "quality", "pipeline",
+    },
     "report": {"plain_text", "errors", "host", "model", "opencl", "codec", "formats", "quality", "pipeline"},
     "viewer": {"plain_text", "errors", "host", "model", "opencl", "raster", "formats", "quality", "report"},
     "api": {
         "plain_text", "errors", "host", "model", "opencl", "placement",
         "raster", "views", "codec", "ondevice", "formats", "stages",
-        "quality", "pipeline", "report", "outputs", "viewer", "workers",
+        "quality", "pipeline", "levels", "report", "outputs", "viewer", "workers",
     },
     # The commands as functions, and tables and words for its help.
     "cli": {"plain_text", "errors", "host", "model", "formats", "outputs", "report", "api"},

@@ -103,6 +103,7 @@ class EncodeChoices(StageChoices, total=False):
         to: suffix of the kind of file (".spz") where there is no ``output`` to tell it; .potr by default.
         spz_version: of an .spz file: 2, 3 or 4.
         title, author: shown on a page (.html).
+        levels: of detail, each with half as many splats: a number or "auto"; of a .potr file 1 by default.
         virtual_views: how many views to place without cameras.
         cameras_anyway: use the cameras even if they do not seem to be in the scene's frame.
         background: R, G, B from 0 to 1, or a colour's name; black by default.
@@ -118,6 +119,7 @@ class EncodeChoices(StageChoices, total=False):
     spz_version: int | None
     title: str | None
     author: str | None
+    levels: int | Literal["auto"] | None
     virtual_views: int | None
     cameras_anyway: bool | None
     background: ColourSource | None
@@ -138,6 +140,7 @@ def encode_options(
     memory: float | None = None,
     threads: int | None = None,
     cameras_anyway: bool | None = None,
+    levels: int | str | None = None,
     output: Output | None = None,
     stages: Collection[type[Stage]] | None = None,
 ) -> EncodeOptions:
@@ -148,6 +151,7 @@ def encode_options(
         choices: of stages, see :func:`potr_cl.pipeline.options.stage_changes`.
         stages: of which choices are allowed; None: of all.
         memory: in GiB.
+        levels: of detail, a number or "auto".
         output: the kind of file.
 
     Raises:
@@ -161,6 +165,7 @@ def encode_options(
         "memory": as_bytes(memory),
         "threads": threads,
         "cameras_anyway": cameras_anyway,
+        "levels": levels,
         "output": output,
     }
     changes = {name: value for name, value in changes.items() if value is not None} | stage_changes(choices, stages)

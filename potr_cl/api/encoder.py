@@ -24,6 +24,7 @@ from potr_cl.formats.registry import stem_of_scene
 from potr_cl.host.atomic_write import replacing
 from potr_cl.host.mapped import bounded
 from potr_cl.host.threads import in_background
+from potr_cl.levels.encoding import encode_levels
 from potr_cl.model.camera import Camera, within_photographs
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
@@ -85,8 +86,11 @@ class _Job:
 
     def encoding(self, progress: Progress | None) -> Callable[[], Encoded]:
         """What encodes it."""
+        run: Callable[..., Encoded] = run_stages
+        if self.options.wanted_levels != 1:
+            run = partial(encode_levels, judge=self.judging is not None)
         return partial(
-            run_stages, self.scene, self.cameras, self.options, progress, self.device, kept=self.kept, in_frame=True,
+            run, self.scene, self.cameras, self.options, progress, self.device, kept=self.kept, in_frame=True,
             tell=_log.info, pool=self.pool,
         )  # fmt: skip
 
@@ -128,6 +132,8 @@ class Encoder:
         self._options, self._target, self._virtual_views, self._judge = options, target, virtual_views, judge
         self._named, self._trust, self._antialiased = (device, cluster), trust, antialiased
         self._check_photographs(beside or cameras is not None)
+        if target is not None and options.wanted_levels != 1:
+            raise UsageError("--max-size and --min-psnr are for files of one level of detail: give -q with --levels")
         self._opened: Future[Workers] | None = None
         looks = any(s.asked_for and s.needs_views and not s.serves_others for s in options.stages)
         self._looks = looks or (judge and (beside or cameras is not None))
@@ -265,8 +271,8 @@ class Encoder:
                 # What cannot be decoded must not replace what can.
                 judged_on = None if job.judging is None else encoded.device
                 written = stack.enter_context(proved(encoded, self._trust, judged_on))
-                if file is not None:
-                    file.write(written.data)
+                if file is not None and output is not None:
+                    encoded.options.output.write(encoded.pieces, file, Path(output))
                     own.close()  # whatever fails now takes nothing from the file
                 if job.judging is not None:
                     quality, pictures = self._judged(job, job.judging, encoded, written, watch, page, report_view)

@@ -58,7 +58,7 @@ def encode(
         options: all options as one object, instead of keywords or to be changed by them.
         choices: options of stages by the names of their flags (``keep=0.5`` is ``--keep 0.5``, ``prune=False`` is
             ``--no-prune``, ``lambda_`` is ``--lambda``), or all of a stage: ``prune={"iterations": 16}``.
-            help(potr_cl.EncodeChoices) lists them with those that are seldom needed: to, virtual_views, memory,
+            help(potr_cl.EncodeChoices) lists them with those that are seldom needed: to, levels, virtual_views, memory,
             background, threads, trust, antialiased, cluster, cameras_anyway.
 
     Raises:
@@ -126,7 +126,7 @@ def _encoder(
     **own: Any,
 ) -> Encoder:
     left: dict[str, Any] = {**choices}
-    own |= {name: left.pop(name, None) for name in ("background", "memory", "threads", "cameras_anyway")}
+    own |= {name: left.pop(name, None) for name in ("background", "memory", "threads", "cameras_anyway", "levels")}
     others = {name: left.pop(name) for name in ("virtual_views", "cluster", "trust", "antialiased") if name in left}
     settings = encode_options(options, preset, left, **own)
     return Encoder(settings, target, cameras, device=device, judge=judge, **others)

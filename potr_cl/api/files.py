@@ -21,6 +21,7 @@ from potr_cl.api.inputs import (
 )
 from potr_cl.codec.decoder import decode as decode_file
 from potr_cl.codec.decoder import open_file
+from potr_cl.codec.levels import level_within, splats_of_levels
 from potr_cl.errors import DataError, UsageError
 from potr_cl.host.atomic_write import check_place, replacing
 from potr_cl.model.box import Box
@@ -116,6 +117,8 @@ def decode(
     sh_degree: int | None = None,
     *,
     box: Sequence[float] | None = None,
+    level: int | None = None,
+    splats: int | None = None,
     output: str | os.PathLike[str] | None = None,
 ) -> Scene:
     """Decode a .potr file, as the command ``decode`` does.
@@ -126,11 +129,13 @@ def decode(
         sh_degree: leave out SH coefficients of higher degrees, without decoding them; None: none.
         box: x0, y0, z0, x1, y1, z1 in world units: leave out splats whose centres lie outside. Of a file of blocks only
             those that meet the box are read.
+        level: of detail; the finest, 0, by default.
+        splats: take the finest level that has no more splats than this, in place of ``level``.
         output: a file to write the scene to as well, usually a .ply.
 
     Raises:
-        UsageError: the path cannot be read, ``output`` not be written to, there is no such degree, or no splat lies in
-            the box.
+        UsageError: the path cannot be read, ``output`` not be written to, there is no such degree or level, no level
+            has so few splats, or no splat lies in the box.
         DataError: not a .potr file, a damaged one, or too many splats for its size.
     """
     write = None
@@ -142,10 +147,28 @@ def decode(
     if data is None and not isinstance(file, (str, os.PathLike)):
         raise UsageError(f"expected the path of a .potr file, its bytes or an Encoded, not {type(file).__name__}")
     within = None if box is None else Box.of(box)
-    scene = decode_file(file if data is None else data, trust, sh_degree, within)  # type: ignore[arg-type]
+    source: str | os.PathLike[str] | bytes = file if data is None else data  # type: ignore[assignment]
+    level = chosen_level(source, level, splats, trust)
+    scene = decode_file(source, trust, sh_degree, within, level)
     if write is not None:
         write(scene)
     return scene
+
+
+def chosen_level(
+    file: str | os.PathLike[str] | bytes, level: int | None, splats: int | None, trust: bool = False
+) -> int:
+    """The level of detail that is asked for by its number or by how many splats it may have; the finest by default.
+
+    Raises:
+        UsageError: both are given, or no level has so few splats.
+        DataError: as :func:`decode`.
+    """
+    if splats is None:
+        return level or 0
+    if level is not None:
+        raise UsageError("give a level of detail or a number of splats, not both")
+    return level_within(open_file(file, trust), splats)
 
 
 def decode_block_by_block(
@@ -153,13 +176,15 @@ def decode_block_by_block(
     output: str | os.PathLike[str],
     trust: bool = False,
     sh_degree: int | None = None,
+    level: int | None = None,
+    splats: int | None = None,
 ) -> int | None:
     """Decode a .potr file of blocks into a .ply, with no more of its blocks in memory than are decoded side by side.
 
     Args:
         file: its path.
         output: the file to write.
-        trust, sh_degree: as of :func:`decode`.
+        trust, sh_degree, level, splats: as of :func:`decode`.
 
     Returns:
         The number of splats; None if the file is not one of blocks or the output no .ply: nothing was done then.
@@ -175,11 +200,14 @@ def decode_block_by_block(
     opened = open_file(file, trust)
     if len(opened.blocks) == 1:
         return None
+    chosen = chosen_level(file, level, splats, trust)
+    parts = opened.parts(sh_degree=sh_degree, level=chosen)
+    count = splats_of_levels(opened)[chosen] if chosen < opened.levels else 0  # then parts say what is wrong
     try:
-        ply.save_parts(output, opened.parts(sh_degree=sh_degree), opened.header.splats)
+        ply.save_parts(output, parts, count)
     except DataError as error:
         raise DataError(f"'{os.fspath(file)}': {error}") from None
-    return opened.header.splats
+    return count
 
 
 def decode_to_device(

@@ -11,7 +11,7 @@ from potr_cl.cli.batch import Row, add_batch_options, for_each_scene, jobs
 from potr_cl.cli.guard import CamerasBeside, StandardInput, StandardOutput, WrittenFolder, check_files, read_file
 from potr_cl.cli.options import SEVERAL, Commands, add_cluster_option, add_device_options, add_memory_option
 from potr_cl.cli.outputs import WrittenEncoded, WrittenPage, place, writing
-from potr_cl.cli.parser import whole_number
+from potr_cl.cli.parser import number_or_auto, whole_number
 from potr_cl.cli.progress import Progress
 from potr_cl.cli.scenes import (
     ANTIALIASED,
@@ -37,7 +37,7 @@ def _encoder(args: argparse.Namespace, output: Output) -> Encoder:
     """What the arguments ask for, checked before anything is read."""
     options = encode_options(
         None, args.preset, stage_choices(args), output=output, q=args.quality, background=args.background,
-        memory=args.memory, threads=args.threads, cameras_anyway=args.cameras_anyway,
+        memory=args.memory, threads=args.threads, cameras_anyway=args.cameras_anyway, levels=args.levels,
     )  # fmt: skip
     target = encode_target(None, args.max_size, args.min_psnr)
     beside = isinstance(args.cameras, CamerasBeside)
@@ -177,6 +177,13 @@ def add_encode(commands: Commands) -> None:
         choices=tuple(PRESETS),
         default=DEFAULT,
         help="; ".join(f"{name}: {purpose}" for name, purpose in PURPOSE.items()) + f"; default: {DEFAULT}",
+    )
+    p.add_argument(
+        "--levels",
+        type=number_or_auto,
+        metavar="N|auto",
+        help="levels of detail in the file, each with half the splats of the one before, made for views half as large; "
+        "auto: until one has fewer than 30,000, at most 6; default: 1 in .potr files, auto in lod-meta.json",
     )
     add_cameras_options(p)
     p.add_argument("--no-quality", action="store_true", help="skip judging the result; saves time")

@@ -10,6 +10,7 @@ from potr_cl.api.files import decode, decode_block_by_block
 from potr_cl.cli.batch import add_batch_options, for_each_scene, jobs
 from potr_cl.cli.guard import StandardOutput, read_file
 from potr_cl.cli.outputs import WrittenScene, place
+from potr_cl.cli.parser import whole_number
 from potr_cl.cli.scenes import add_from_option, add_trust_option, as_file, trust, write_scene
 from potr_cl.cli.terminal import say, say_document, say_done
 from potr_cl.formats.registry import suffixes_read, suffixes_written
@@ -27,12 +28,14 @@ def _decode_one(args: argparse.Namespace) -> None:
     started = time.perf_counter()
     with as_file(args.scene) as file:
         if args.box is None and not isinstance(args.output, StandardOutput):
-            splats = decode_block_by_block(file, args.output, args.trust, args.sh_degree)
+            splats = decode_block_by_block(
+                file, args.output, args.trust, args.sh_degree, args.level, args.splats
+            )  # fmt: skip
             if splats is not None:
                 seconds = time.perf_counter() - started
                 say_done(f"{args.output}: {splats:,} splats, decoded and written in {seconds:.2f} s")
                 return
-        scene = decode(file, args.trust, args.sh_degree, box=args.box)
+        scene = decode(file, args.trust, args.sh_degree, box=args.box, level=args.level, splats=args.splats)
     decoded = time.perf_counter()
     write_scene(args.output, scene, args.to)
     written = time.perf_counter()
@@ -65,6 +68,13 @@ def add_decode(commands: Commands) -> None:
         help="skip splats whose centres lie outside this box, in world units; of a file of blocks only those "
         "that meet the box are read; default: none",
     )  # fmt: skip
+    size = p.add_mutually_exclusive_group()
+    size.add_argument(
+        "--level", type=whole_number, metavar="K", help="the level of detail, 0 is the finest; default: 0"
+    )
+    size.add_argument(
+        "--splats", type=whole_number, metavar="N", help="the finest level of detail with at most N splats"
+    )
     add_trust_option(p)
     p.set_defaults(run=_decode)
 

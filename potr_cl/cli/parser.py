@@ -129,6 +129,15 @@ def whole_number(text: str) -> int:
     raise argparse.ArgumentTypeError(f"{plain(text, 40)!r} is not a whole number of at most {_MOST_DIGITS} digits")
 
 
+def number_or_auto(text: str) -> int | str:
+    """An integer, or the word "auto"; a type of arguments.
+
+    Raises:
+        argparse.ArgumentTypeError: it is neither.
+    """
+    return text if text == "auto" else whole_number(text)
+
+
 def _options(words: Iterable[str]) -> Iterable[str]:
     """The words that argparse takes for long options."""
     for word in words:

@@ -100,6 +100,11 @@ class PotrFile:
         """What the table says of each."""
         return self.header.blocks
 
+    @property
+    def levels(self) -> int:
+        """How many levels of detail there are."""
+        return self.blocks[0].level + 1
+
     def body(self, number: int, sh_degree: int | None = None) -> Body:
         """A block, read.
 
@@ -202,8 +207,9 @@ class PotrFile:
         return whole
 
     def _level(self, level: int) -> list[int]:
-        if not 0 <= level <= self.blocks[0].level:
-            raise UsageError(f"there is no level {level}: the file has levels 0 to {self.blocks[0].level}")
+        if not 0 <= level < self.levels:
+            there = "only level 0" if self.levels == 1 else f"levels 0 to {self.levels - 1}"
+            raise UsageError(f"there is no level {level}: the file has {there}")
         return self.header.of_level(level)
 
     def means(self) -> NDArray[np.float32]:
@@ -318,6 +324,7 @@ def decode(
     trust: bool = False,
     sh_degree: int | None = None,
     box: Box | None = None,
+    level: int = 0,
 ) -> Scene:
     """Decode a .potr file, given as bytes or as a path.
 
@@ -327,13 +334,14 @@ def decode(
             to the size of the file.
         sh_degree: leave out SH coefficients of higher degrees; None: none.
         box: leave out splats whose centres lie outside. Only blocks that meet the box are read.
+        level: of detail; 0 is the finest.
 
     Raises:
-        UsageError: the path cannot be read, there is no such degree, or no splat lies in the box.
+        UsageError: the path cannot be read, there is no such degree or level, or no splat lies in the box.
         DataError: damaged, or too many splats for its size.
     """
     try:
-        return open_file(source, trust).scene(sh_degree=sh_degree, box=box)
+        return open_file(source, trust).scene(sh_degree=sh_degree, box=box, level=level)
     except DataError as error:
         where = "" if isinstance(source, bytes) else os.fspath(source)
         raise error if where in str(error) else DataError(f"'{where}': {error}") from None

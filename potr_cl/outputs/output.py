@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, BinaryIO, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +58,32 @@ class Request:
     entropy: EntropyCoder = field(default_factory=EntropyCoder)
     progress: Callable[[str, float], None] = lambda what, done: None
     blocks: Callable[[], FloatArray] | None = None
+
+
+class LevelErrors(Protocol):
+    """What coarser levels of detail lose; each is measured when it is asked for."""
+
+    def of_level(self, level: int) -> float:
+        """By how far, world units, the splats of a level may be off those of the finest one; 0 of that itself."""
+        ...
+
+    def of_leaves(
+        self, scenes: Callable[[int], Scene], levels: int, leaves: NDArray[np.int64], spheres: FloatArray
+    ) -> NDArray[np.float64]:
+        """What each part of space loses in each level.
+
+        Args:
+            scenes: gives a level's scene, as readers see it.
+            levels: how many there are.
+            leaves: (N,) in which leaf each splat of the finest level lies.
+            spheres: (leaves, 4) centre and radius of a sphere around each, world units.
+
+        Returns:
+            (leaves, levels) float64 from 0 up, never falling from level to level; the finest has 0. Times the part of a
+            picture that a leaf's sphere covers, this is what the leaf's splats of that level add to the picture's mean
+            squared error.
+        """
+        ...
 
 
 class Rounded(Protocol):
@@ -112,6 +138,7 @@ class Output(ABC):
         steps: whether the steps of colours follow ``sf_dc`` and ``sf_sh`` freely, as a search for a size tries them.
         fixes_ac: whether :meth:`fix_ac` does anything.
         replaces: hyper-parameters that q does not set here: as ``drop``, where a coefficient of 0 saves no byte.
+        levels: of detail that a file has unless others are asked for, a number or "auto"; None: it has only one.
         bytes_a_splat: of its files, as a multiple of those of a .potr file of the same q, roughly: where a search for a
             size begins.
     """
@@ -122,6 +149,7 @@ class Output(ABC):
     fixes_ac: ClassVar[bool] = False
     replaces: ClassVar[Mapping[str, float]] = {}
     bytes_a_splat: ClassVar[float] = 1.0
+    levels: ClassVar[int | str | None] = None
 
     @classmethod
     def suffixes(cls) -> tuple[str, ...]:
@@ -211,6 +239,33 @@ class Output(ABC):
         if rounded is not None:
             return rounded, scene.sh
         return self.fix_ac(self.geometry(scene, request), scene.sh, None, request)
+
+    def of_level(self) -> Output:
+        """The kind of file that each level of detail is encoded to, before :meth:`levelled`."""
+        return self
+
+    def levelled(self, files: Sequence[bytes], errors: LevelErrors) -> list[bytes]:
+        """The pieces of one file of several levels of detail.
+
+        Args:
+            files: of :meth:`of_level`'s kind, the finest level first.
+            errors: what the coarser ones lose.
+        """
+        raise NotImplementedError
+
+    def write(self, pieces: Sequence[bytes], file: BinaryIO, path: Path) -> None:
+        """Write what was encoded.
+
+        Args:
+            pieces: of the file.
+            file: open under another name; it gets its own once this is done.
+            path: of the file, for others beside it.
+
+        Raises:
+            UsageError: one of these cannot be written.
+        """
+        for piece in pieces:
+            file.write(piece)
 
     def read(self, data: bytes, trust: bool = False) -> Scene:
         """The scene that a file's readers will see.

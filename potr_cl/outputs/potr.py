@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, fields
 from typing import ClassVar
@@ -11,6 +11,7 @@ from potr_cl.codec.blocks import AnyGeometry, GeometryOfBlocks, quantise
 from potr_cl.codec.decoder import PotrFile, decode, open_file
 from potr_cl.codec.encoder import Coded, code_scene
 from potr_cl.codec.geometry import Geometry
+from potr_cl.codec.levels import joined_levels
 from potr_cl.codec.quantisers import QUANTISERS
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.codec.sections import ORDER, SH, Property
@@ -23,7 +24,7 @@ from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
 from potr_cl.ondevice.decode import decode_to_device
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.colour_grid import ColourGrid
-from potr_cl.outputs.output import Output, Request, Rounded
+from potr_cl.outputs.output import LevelErrors, Output, Request, Rounded
 from potr_cl.raster.kept_scene import large_for
 from potr_cl.raster.scene_buffers import Drawable
 
@@ -48,6 +49,7 @@ class Potr(Output):
     )
     steps: ClassVar[bool] = True
     fixes_ac: ClassVar[bool] = True
+    levels: ClassVar[int | str | None] = 1
 
     def geometry(self, scene: Scene, request: Request) -> AnyGeometry:
         """See :func:`potr_cl.codec.blocks.quantise`."""
@@ -77,6 +79,11 @@ class Potr(Output):
             request.progress,
             rounded,
         )
+
+    def levelled(self, files: Sequence[bytes], errors: LevelErrors) -> list[bytes]:
+        """See :func:`potr_cl.codec.levels.joined_levels`."""
+        opened = [open_file(data, trust=True) for data in files]
+        return joined_levels(opened, [errors.of_level(level) for level in range(len(files))])
 
     def read(self, data: bytes, trust: bool = False) -> Scene:
         """See :func:`potr_cl.codec.decoder.decode`."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import DataError, PotrError, UsageError
-from potr_cl.host.atomic_write import write_pieces
+from potr_cl.host.atomic_write import replacing
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.coded_scene import CodedScene
@@ -30,6 +30,21 @@ from potr_cl.stages.refitting.photographs import PhotographChoice
 from potr_cl.stages.refitting.refit_options import Refitted
 from potr_cl.stages.views_between import Added
 from potr_cl.workers.pool import Pool, Traffic
+
+
+@dataclass(frozen=True)
+class LevelMade:
+    """A level of detail, as it was made.
+
+    Attributes:
+        splats: that it has.
+        scale: by how much smaller the pictures are in which it is shown.
+        psnr: there, against the full scene, in decibels; None: not judged.
+    """
+
+    splats: int
+    scale: float
+    psnr: float | None = None
 
 
 @dataclass(frozen=True)
@@ -54,6 +69,7 @@ class Encoded:
         parameters: the hyper-parameters that the stages took.
         shared: who did the work, where views were shared out.
         left_out: how many of the scene's SH degrees, the highest ones, the file's format has left out.
+        levels: of detail, the finest first, where there are several; splats, order and stages are of that one.
         report: of :func:`potr_cl.encode`, ready for JSON; printed, it is what the command ``encode`` prints.
     """
 
@@ -73,6 +89,7 @@ class Encoded:
     parameters: HyperParameters
     shared: SharedOut | None = None
     left_out: int = 0
+    levels: tuple[LevelMade, ...] = ()
     report: dict[str, Any] = field(default_factory=dict)
 
     def __repr__(self) -> str:
@@ -103,7 +120,8 @@ class Encoded:
             raise UsageError(
                 f"'{path}' is no name for a {own[0]} file: encode with to='{Path(path).suffix}', or name it *{own[0]}"
             )
-        write_pieces(path, self.pieces)
+        with replacing(path) as file:
+            self.options.output.write(self.pieces, file, Path(path))
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,8 @@ from potr_cl.stages.code import Code
 from potr_cl.stages.stage import Flag, Stage, flags, parameters
 
 S = TypeVar("S", bound=Stage)
+#: Levels of detail that a file may be asked to have.
+MOST_LEVELS = 12
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,7 @@ class EncodeOptions:
         threads: number of threads for work on the host; the bytes do not depend on it. 0: one for each processor.
         output: the kind of file that is made (:mod:`potr_cl.outputs.registry`).
         source_bytes: size of the file that the scene came from, for the metadata; None if it came from none.
+        levels: of detail, a number or "auto" (:mod:`potr_cl.levels`); None: as many as the kind of file has by itself.
     """
 
     q: float = 0.5
@@ -55,6 +58,7 @@ class EncodeOptions:
     threads: int = 0
     source_bytes: int | None = None
     output: Output = field(default_factory=Potr)
+    levels: int | str | None = None
 
     def __post_init__(self) -> None:
         if self.preset not in PRESETS:
@@ -65,9 +69,26 @@ class EncodeOptions:
         object.__setattr__(self, "q", float(self.q))
         if not self.stages:
             object.__setattr__(self, "stages", PRESETS[self.preset])
+        self._check_levels()
         code = next((stage for stage in self.stages if isinstance(stage, Code)), None)
         if self.preset == "paper" and code is not None and code.entropy == "bundles":
             raise UsageError("--entropy bundles is not for preset paper, whose steps are stored as plain streams")
+
+    def _check_levels(self) -> None:
+        levels = self.levels
+        if levels is None or levels == "auto" or (type(levels) is int and 1 <= levels <= MOST_LEVELS):
+            if self.output.levels is None and levels not in (None, 1):
+                raise UsageError(
+                    f"--levels does not apply to {self.output.suffix} files: only .potr files and lod-meta.json hold "
+                    "levels of detail"
+                )
+            return
+        raise UsageError(f"--levels is {levels!r}: give a number from 1 to {MOST_LEVELS}, or auto")
+
+    @property
+    def wanted_levels(self) -> int | str:
+        """How many levels of detail the file is to have, or "auto"."""
+        return self.levels or self.output.levels or 1
 
     @staticmethod
     def for_preset(preset: Preset = DEFAULT, **changes: Any) -> EncodeOptions:

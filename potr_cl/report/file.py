@@ -8,6 +8,7 @@ from typing import Any
 from potr_cl.codec.body import Body
 from potr_cl.codec.container import Block
 from potr_cl.codec.decoder import PotrFile
+from potr_cl.codec.levels import splats_of_levels
 from potr_cl.codec.sections import Coder, Property, Section
 from potr_cl.model.box import Box
 from potr_cl.model.scene import SH_COEFFICIENTS
@@ -134,7 +135,9 @@ def file_report(file: PotrFile) -> dict[str, Any]:
         "source_splats": metadata.get("source_splats"),
         "source_bytes": source,
         "ratio_to_source": source / header.file_bytes if isinstance(source, int) else None,
-        "levels": file.blocks[0].level + 1,
+        "levels": file.levels,
+        "level_splats": splats_of_levels(file),
+        "level_errors": [file.blocks[file.header.of_level(level)[0]].error for level in range(file.levels)],
         "sections": groups,
         "blocks": [_block_report(each) for each in file.blocks] if many else None,
     }
@@ -185,6 +188,11 @@ def format_report(report: dict[str, Any]) -> str:
     if report["blocks"] is not None:
         least, most = (choose(block["splats"] for block in report["blocks"]) for choose in (min, max))
         lines.append(f"blocks          {len(report['blocks'])}, of {least:,} to {most:,} splats")
+    if report["levels"] > 1:
+        lines += [
+            f"{'' if level else 'levels':<16}{level}: {splats:,} splats" + (f", error {error:.3g}" if level else "")
+            for level, (splats, error) in enumerate(zip(report["level_splats"], report["level_errors"], strict=True))
+        ]
     if report["ratio_to_source"] is not None:
         lines.append(f"source file     {report['source_bytes']:,} bytes, {report['ratio_to_source']:.1f} times as much")
     lines += [

@@ -74,6 +74,7 @@ def encode_report(
         "ratio": source_bytes / nbytes,
         "splats": splats,
         "bytes_a_splat": nbytes / splats,
+        "levels": [dataclasses.asdict(level) for level in encoded.levels if len(encoded.levels) > 1],
         "properties": options.output.properties(encoded.data),
         "quality": quality,
         "photographs": photographs,
@@ -229,6 +230,13 @@ def format_encode_report(report: dict[str, Any]) -> str:
                     f"           a quarter of the scene is shown by no more than {shown_by:.0f} of them: "
                     "from other directions it may match far worse"
                 )
+    if report.get("levels"):
+        lines += [
+            f"{'' if number else 'levels':<11}{number}: {level['splats']:,} splats"
+            + (f", PSNR {decibels(level['psnr'])}" if isinstance(quality, dict) else "")
+            + (f" in views of {level['scale']:.2f} times the size" if number else "")
+            for number, level in enumerate(report["levels"])
+        ]
     if report.get("fit") is not None:
         lines.append(f"fit        {report['fit']['said']}")
     photographs = report["photographs"]

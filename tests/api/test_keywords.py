@@ -61,6 +61,9 @@ VALUES: dict[str, tuple[list[str], Any]] = {
     "--min-psnr": (["28"], 28),
     "--preset": (["paper"], "paper"),
     "--virtual-views": (["5"], 5),
+    "--levels": (["2"], 2),
+    "--level": (["0"], 0),
+    "--splats": (["100000"], 100_000),
     "--report": (["{report}"], "{report}"),
     "--report-view": (["view_5"], "view_5"),
     "--order": (["{order}"], "{order}"),
@@ -121,7 +124,8 @@ VALUES: dict[str, tuple[list[str], Any]] = {
 }
 #: What only says how the work is done.
 SAME_RESULT = {"--threads", "--trust", "--memory", "--device", "--output", "--cameras", "--reference", "--report",
-               "--report-view", "--order", "--tolerance", "--cameras-anyway", "--unseen"}  # fmt: skip
+               "--report-view", "--order", "--tolerance", "--cameras-anyway", "--unseen",
+               "--level", "--splats"}  # fmt: skip
 #: What else has to be given for an option to have anything to do.
 WITH: dict[str, list[str]] = {"--report-view": ["--report"], "--compact-at": ["--compact"]}
 #: Options that cannot be given with cameras.

@@ -1,0 +1,105 @@
+"""Encodes with levels of detail."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import potr_cl
+from potr_cl import UsageError, cli
+from potr_cl.codec.decoder import open_file
+from potr_cl.codec.levels import splats_of_levels
+from potr_cl.levels.plan import views_of_level
+from potr_cl.model.camera import test_views as held_out
+from potr_cl.opencl.device import Device
+from potr_cl.raster.rasterizer import Rasterizer
+
+QUICK = {"iterations": 6, "views_between": 0, "refit": 2}
+
+
+@pytest.fixture(scope="module")
+def device():
+    device = Device()
+    yield device
+    assert device.allocated == 0, "an encode did not give all its memory back"
+
+
+@pytest.fixture(scope="module")
+def encoded(plush_excerpt, plush_excerpt_cameras, device):
+    return potr_cl.encode(
+        plush_excerpt, plush_excerpt_cameras, levels=3, keep=0.8, judge=True, device=device, **QUICK
+    )  # fmt: skip
+
+
+def mean_squared_error(device, scene, other, views) -> float:
+    errors = []
+    with Rasterizer(device, scene) as one, Rasterizer(device, other) as another:
+        for view in views:
+            errors.append(np.square(one.render(view)[0].clip(0, 1) - another.render(view)[0].clip(0, 1)).mean())
+    return float(np.mean(errors))
+
+
+def test_each_level_has_half_the_splats(encoded):
+    assert splats_of_levels(open_file(encoded.data)) == [1200, 600, 300]
+    assert [level.splats for level in encoded.levels] == [1200, 600, 300]
+    assert encoded.nbytes == len(encoded.data)
+    assert len(encoded.scene) == len(encoded.order) == 1200
+
+
+def test_the_finest_level_is_the_scene_without_levels(encoded, plush_excerpt, plush_excerpt_cameras, device):
+    alone = potr_cl.encode(plush_excerpt, plush_excerpt_cameras, keep=0.8, device=device, **QUICK)
+    for field in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
+        assert np.array_equal(getattr(encoded.scene, field), getattr(alone.scene, field)), field
+
+
+def test_a_level_is_made_for_the_views_in_which_it_is_shown(encoded, plush_excerpt, plush_excerpt_cameras, device):
+    """There it is nearer to the full scene than as many splats that were chosen for the views as they are."""
+    at_full_size = potr_cl.encode(plush_excerpt, plush_excerpt_cameras, count=300, device=device, **QUICK)
+    views = views_of_level(held_out(plush_excerpt_cameras), 2)
+    level = potr_cl.decode(encoded.data, level=2)
+    assert len(level) == len(at_full_size.scene)
+    own, other = (mean_squared_error(device, plush_excerpt, each, views) for each in (level, at_full_size.scene))
+    assert own < other
+
+
+def test_the_report_tells_each_level(encoded):
+    levels = encoded.report["levels"]
+    assert [level["splats"] for level in levels] == [1200, 600, 300]
+    assert levels[0]["psnr"] == pytest.approx(encoded.report["quality"]["psnr"])
+    assert levels[0]["psnr"] > levels[1]["psnr"] > levels[2]["psnr"] > 30
+    assert "2: 300 splats, PSNR" in str(encoded.report)
+
+
+def test_errors_are_those_of_pixels_in_the_scene(encoded):
+    errors = [block.error for block in open_file(encoded.data).blocks]
+    assert errors[2] == 0
+    assert errors[0] == pytest.approx(np.sqrt(2) * errors[1])
+
+
+def test_the_same_bytes_each_time(plush_excerpt, plush_excerpt_cameras, device):
+    files = [
+        potr_cl.encode(plush_excerpt, plush_excerpt_cameras, levels=2, count=200, device=device, **QUICK).data
+        for _ in range(2)
+    ]
+    assert files[0] == files[1]
+
+
+@pytest.mark.parametrize(
+    ("choices", "said"),
+    [
+        ({"levels": 0}, "--levels is 0: give a number from 1 to 12, or auto"),
+        ({"levels": "many"}, "--levels is 'many'"),
+        ({"levels": 2, "to": ".spz"}, "--levels does not apply to .spz files"),
+        ({"levels": 2, "max_size": 10_000}, "--max-size and --min-psnr are for files of one level"),
+        ({"levels": 2, "prune": False}, "leave out --no-prune, or give --levels 1"),
+    ],
+)
+def test_what_cannot_be_is_refused(plush_excerpt, plush_excerpt_cameras, choices, said):
+    with pytest.raises(UsageError, match=said):
+        potr_cl.encode(plush_excerpt, plush_excerpt_cameras, **QUICK, **choices)
+
+
+def test_the_command_line_takes_a_number_or_auto(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["encode", "no.ply", "-o", "a.potr", "--levels", "some"])
+    assert "--levels" in capsys.readouterr().err
