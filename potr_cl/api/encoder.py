@@ -246,7 +246,7 @@ class Encoder:
         with ExitStack() as stack:
             page = None if report is None else stack.enter_context(replacing(report))
             own = stack.enter_context(ExitStack())
-            file = None if output is None else own.enter_context(replacing(output))
+            file = None if output is None else own.enter_context(replacing(self._options.output.place(output)))
             job = stack.enter_context(self._prepared(source, progress))
             if report_view is not None and job.judging is not None:
                 job.judging.named(report_view)  # an unknown name is reported before the work

@@ -110,9 +110,11 @@ def encode_ladder(
 
 def _kind(path: str | os.PathLike[str] | None, choices: EncodeChoices) -> Output | None:
     version, title = choices.pop("spz_version", None), choices.pop("title", None)
+    count, extent = choices.pop("lod_chunk_count", None), choices.pop("lod_chunk_extent", None)
     return output_choice(
-        path, choices.pop("to", None), version=version, title=title, author=choices.pop("author", None)
-    )
+        path, choices.pop("to", None), version=version, title=title, author=choices.pop("author", None),
+        lod_chunk_count=count, lod_chunk_extent=extent,
+    )  # fmt: skip
 
 
 def _encoder(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from potr_cl.api.choices import DEFAULT, PRESETS, PURPOSE, encode_options, encode_target
 from potr_cl.api.encoder import Encoder, ladder_files
@@ -48,6 +49,12 @@ def _encoder(args: argparse.Namespace, output: Output) -> Encoder:
     )  # fmt: skip
 
 
+def _choices(args: argparse.Namespace) -> dict[str, Any]:
+    """What only some kinds of files leave to choose; None where it is not given."""
+    chunks = {"lod_chunk_count": args.lod_chunk_count, "lod_chunk_extent": args.lod_chunk_extent}
+    return format_choices(args) | chunks
+
+
 def _encode(args: argparse.Namespace) -> None:
     if args.ladder is not None:
         _ladder(args)
@@ -59,7 +66,7 @@ def _encode(args: argparse.Namespace) -> None:
         raise UsageError("--report-view needs --report, the page that shows it")
     if args.report is not None and len(works) > 1:
         raise UsageError("--report is about one scene: encode one at a time")
-    choices, first = format_choices(args), works[0]
+    choices, first = _choices(args), works[0]
     streamed = isinstance(first.output, StandardOutput)
     output = output_of_suffix(first.to, **choices) if streamed else output_of(first.output, **choices)
     several = len(works) > 1
@@ -107,7 +114,7 @@ def _ladder(args: argparse.Namespace) -> None:
     named_as_file = args.output.exists() or args.output.suffix.lower() in extensions()
     if not isinstance(args.output, WrittenFolder) and named_as_file:
         raise UsageError(f"--ladder writes several files: give -o a folder instead of '{args.output}'")
-    output = output_of_suffix(args.to or OUTPUTS[0].suffixes()[0], **format_choices(args))
+    output = output_of_suffix(args.to or OUTPUTS[0].suffixes()[0], **_choices(args))
     name = Path("scene") if isinstance(args.scene, StandardInput) else Path(args.scene)
     check_files(args, ladder_files(args.output, name, steps, output.suffix))
     with _encoder(args, output) as encoder, as_file(args.scene) as scene, Progress() as progress:
@@ -184,6 +191,18 @@ def add_encode(commands: Commands) -> None:
         metavar="N|auto",
         help="levels of detail in the file, each with half the splats of the one before, made for views half as large; "
         "auto: until one has fewer than 30,000, at most 6; default: 1 in .potr files, auto in lod-meta.json",
+    )
+    p.add_argument(
+        "--lod-chunk-count",
+        type=whole_number,
+        metavar="K",
+        help="of lod-meta.json: the most splats of a leaf of its tree, in thousands (1024); default 512",
+    )
+    p.add_argument(
+        "--lod-chunk-extent",
+        type=float,
+        metavar="UNITS",
+        help="of lod-meta.json: the largest side of a leaf, in world units; default 16",
     )
     add_cameras_options(p)
     p.add_argument("--no-quality", action="store_true", help="skip judging the result; saves time")

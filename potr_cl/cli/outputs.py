@@ -40,6 +40,9 @@ class WrittenNumbers(WrittenFile):
     """An array of NumPy."""
 
 
+#: The name of a file whose folder is made with it.
+_FOLDER = "lod-meta.json"
+
 #: What has suffixes of its own, and what it is called.
 _SUFFIXES: dict[type[WrittenFile], tuple[tuple[str, ...], str]] = {
     WrittenPage: ((".html", ".htm"), "a page of HTML"),
@@ -87,7 +90,8 @@ def check_file(path: WrittenFile, option: str = "-o") -> None:
     Raises:
         UsageError: it cannot be written, or not under this name.
     """
-    check_place(path)
+    made = path.name == _FOLDER and not path.parent.exists()
+    check_place(path.parent if made else path)
     check_name(path, option)
 
 

@@ -91,7 +91,7 @@ def encode_levels(
                 levels[k] = replace(levels[k], psnr=evaluator.psnr(single.output.read(data, trust=True)))
     watch("levels", 1.0)
     return replace(
-        first, pieces=pieces, nbytes=sum(map(len, pieces)), options=options, levels=tuple(levels),
+        first, pieces=pieces, nbytes=output.size(pieces), options=options, levels=tuple(levels),
         seconds=added_up(seconds, watch.seconds),
     )  # fmt: skip
 

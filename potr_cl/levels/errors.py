@@ -28,6 +28,8 @@ from potr_cl.stages.refitting.colour_refit import ColourRefit
 _VIEWS, _PIXELS = 32, 1 << 19
 #: Splats by which the size of a pixel in the scene is found.
 _SAMPLE = 1 << 14
+#: The tangent of half the field of view that the engine compares others with.
+_REFERENCE = math.tan(math.radians(22.5))
 #: What a splat without SH coefficients shows.
 _GREY = 0.5
 
@@ -63,17 +65,17 @@ class MeasuredErrors:
         return float(np.float32(np.median(sizes) / scale_of_level(level))) if sizes else 0.0
 
     def of_leaves(
-        self, scenes: Callable[[int], Scene], levels: int, leaves: NDArray[np.int64], spheres: FloatArray
+        self, scenes: Callable[[int], Scene], levels: int, leaves: NDArray[np.int64], boxes: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """See :meth:`potr_cl.outputs.output.LevelErrors.of_leaves`."""
-        found = np.zeros((len(spheres), levels))
+        found = np.zeros((len(boxes), levels))
         if not self.views or levels < 2:
             return found
         assert self.device is not None
         views = measuring_views(self.views)
-        covered = np.mean([covered_parts(view, spheres) for view in views], axis=0)
+        covered = np.mean([coverage(view, boxes) for view in views], axis=0)
         finest = scenes(0)
-        with SharedOut(self.device, finest, views, leaves, len(spheres), self.background, self.memory) as shared:
+        with SharedOut(self.device, finest, views, leaves, len(boxes), self.background, self.memory) as shared:
             for level in range(1, levels):
                 found[:, level] = shared.of(scenes(level))
         found /= np.maximum(covered, 1e-12)[:, None]
@@ -90,17 +92,21 @@ def measuring_views(views: Sequence[Camera]) -> list[Camera]:
     return small
 
 
-def covered_parts(view: Camera, spheres: FloatArray) -> NDArray[np.float64]:
-    """(n,) which part of the picture each sphere's disc has, 0 to 1; 0 of those behind the camera.
+def coverage(view: Camera, boxes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n,) about which part of the picture boxes (n, 6) cover, 0 to 1, by PlayCanvas' engine; 0 of those behind.
 
-    It is all of it for those that the camera is in; what lies beside the picture is not taken off.
+    The engine's rule: (r / (r + d))², with r half the box's diagonal and d its distance, times the tangent of half the
+    vertical field of view over that of 22.5 degrees.
     """
-    centres = spheres[:, :3].astype(np.float64) @ view.rotation.T + view.translation
-    distances, radii = np.linalg.norm(centres, axis=1), spheres[:, 3].astype(np.float64)
-    discs = np.pi * view.fx * view.fy * radii**2 / np.maximum(distances**2, 1e-30) / (view.width * view.height)
-    seen = (centres[:, 2] > 0) | (distances <= radii)
-    parts: NDArray[np.float64] = np.where(seen, np.where(distances <= radii, 1.0, np.minimum(discs, 1.0)), 0.0)
-    return parts
+    low, high = boxes[:, :3], boxes[:, 3:]
+    at = view.centre
+    distances = np.linalg.norm(np.clip(at, low, high) - at, axis=1)
+    radii = np.linalg.norm(high - low, axis=1) / 2
+    distances *= view.height / 2 / view.fy / _REFERENCE
+    depths = (low + high) / 2 @ view.rotation[2] + view.translation[2]
+    parts = np.square(radii / np.maximum(radii + distances, 1e-30))
+    found: NDArray[np.float64] = np.where((depths > 0) | (distances == 0), parts, 0.0)
+    return found
 
 
 class SharedOut:

@@ -8,6 +8,7 @@ that the file's readers will see (:meth:`Output.geometry`), has the output choos
 
 from __future__ import annotations
 
+import os
 import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -68,7 +69,7 @@ class LevelErrors(Protocol):
         ...
 
     def of_leaves(
-        self, scenes: Callable[[int], Scene], levels: int, leaves: NDArray[np.int64], spheres: FloatArray
+        self, scenes: Callable[[int], Scene], levels: int, leaves: NDArray[np.int64], boxes: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """What each part of space loses in each level.
 
@@ -76,12 +77,11 @@ class LevelErrors(Protocol):
             scenes: gives a level's scene, as readers see it.
             levels: how many there are.
             leaves: (N,) in which leaf each splat of the finest level lies.
-            spheres: (leaves, 4) centre and radius of a sphere around each, world units.
+            boxes: (leaves, 6) x0, y0, z0, x1, y1, z1 of each, world units.
 
         Returns:
             (leaves, levels) float64 from 0 up, never falling from level to level; the finest has 0. Times the part of a
-            picture that a leaf's sphere covers, this is what the leaf's splats of that level add to the picture's mean
-            squared error.
+            picture that a leaf covers, this is what its splats of that level add to the picture's mean squared error.
         """
         ...
 
@@ -252,6 +252,18 @@ class Output(ABC):
             errors: what the coarser ones lose.
         """
         raise NotImplementedError
+
+    def place(self, path: str | os.PathLike[str]) -> Path:
+        """The file to be written; a folder that is made with it exists then.
+
+        Raises:
+            UsageError: that cannot be made.
+        """
+        return Path(path)
+
+    def size(self, pieces: Sequence[bytes]) -> int:
+        """Bytes that they take once they are written."""
+        return sum(map(len, pieces))
 
     def write(self, pieces: Sequence[bytes], file: BinaryIO, path: Path) -> None:
         """Write what was encoded.

@@ -16,6 +16,7 @@ from potr_cl.outputs.ply import Ply
 from potr_cl.outputs.potr import Potr
 from potr_cl.outputs.sog import Sog
 from potr_cl.outputs.spz import Spz
+from potr_cl.outputs.streamed_sog import StreamedSog
 
 #: In the order in which people are told of them; the first is the usual one.
 OUTPUTS: tuple[type[Output], ...] = (
@@ -27,6 +28,10 @@ OUTPUTS: tuple[type[Output], ...] = (
     Ply,
     Page,
 )
+
+
+#: Those that are folders, which the name of the description asks for.
+FOLDERS: tuple[type[Output], ...] = (StreamedSog,)
 
 
 def output_of(path: Path, **choices: Any) -> Output:
@@ -41,6 +46,7 @@ def output_of(path: Path, **choices: Any) -> Output:
     """
     suffix = suffix_of_name(path)
     kind = next((kind for kind in OUTPUTS if suffix in kind.suffixes()), None)
+    kind = next((folder for folder in FOLDERS if path.name in folder.suffixes()), kind)
     if kind is None:
         raise UsageError(f"'{path}': encode writes {suffixes_encoded()} files{_instead(path)}")
     given = {name: value for name, value in choices.items() if value is not None}
@@ -73,7 +79,7 @@ def encoded_suffix(suffix: str) -> str:
 
 def suffixes_encoded() -> str:
     """For messages and help: the suffixes of all outputs, ".a, .b or .c"."""
-    return listed([suffix for kind in OUTPUTS for suffix in kind.suffixes()])
+    return listed([suffix for kind in (*OUTPUTS, *FOLDERS) for suffix in kind.suffixes()])
 
 
 def _instead(path: Path) -> str:

@@ -6,6 +6,7 @@ import io
 import math
 import zipfile
 from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
 from typing import ClassVar
 
 import numpy as np
@@ -149,8 +150,8 @@ class Sog(Output):
         sums = dict.fromkeys((*_IMAGES.values(), "other"), 0)
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             for entry in archive.infolist():
-                sums[_IMAGES.get(entry.filename.partition(".")[0], "other")] += entry.compress_size
-        sums["other"] += len(data) - sum(sums.values())
+                sums[_IMAGES.get(PurePosixPath(entry.filename).stem, "other")] += entry.compress_size
+        sums["other"] += self.size([data]) - sum(sums.values())
         return {name: nbytes for name, nbytes in sums.items() if nbytes}
 
 

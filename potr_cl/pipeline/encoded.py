@@ -120,7 +120,7 @@ class Encoded:
             raise UsageError(
                 f"'{path}' is no name for a {own[0]} file: encode with to='{Path(path).suffix}', or name it *{own[0]}"
             )
-        with replacing(path) as file:
+        with replacing(self.options.output.place(path)) as file:
             self.options.output.write(self.pieces, file, Path(path))
 
 

@@ -62,6 +62,8 @@ VALUES: dict[str, tuple[list[str], Any]] = {
     "--preset": (["paper"], "paper"),
     "--virtual-views": (["5"], 5),
     "--levels": (["2"], 2),
+    "--lod-chunk-count": (["2"], 2),
+    "--lod-chunk-extent": (["0.5"], 0.5),
     "--level": (["0"], 0),
     "--splats": (["100000"], 100_000),
     "--report": (["{report}"], "{report}"),

@@ -129,7 +129,7 @@ def members(images: SogImages) -> Iterator[tuple[str, bytes]]:
     Raises:
         DataError: there are more splats than an image has pixels.
     """
-    width, height = _size(len(images))
+    width, height = size_of_images(len(images))
 
     pictures: list[tuple[str, U8, int, int]] = [
         ("means_l.webp", (images.steps & 0xFF).astype(np.uint8), width, height),
@@ -166,11 +166,11 @@ def members(images: SogImages) -> Iterator[tuple[str, bytes]]:
     for name, files in named.items():
         meta[name]["files"] = files
     with thread_pool() as pool:
-        yield from pool.map(_image, pictures)
+        yield from pool.map(image_file, pictures)
     yield DESCRIPTION, json.dumps(meta, separators=(",", ":")).encode()
 
 
-def _image(picture: tuple[str, U8, int, int]) -> tuple[str, bytes]:
+def image_file(picture: tuple[str, U8, int, int]) -> tuple[str, bytes]:
     """The name and the bytes of a picture: its pixels one after another, its columns and rows."""
     name, pixels, columns, rows = picture
     # The last pixel goes on to the end of the image: what is repeated takes the fewest bytes.
@@ -179,7 +179,7 @@ def _image(picture: tuple[str, U8, int, int]) -> tuple[str, bytes]:
     return name, _webp(padded.reshape(rows, columns, -1))
 
 
-def _size(splats: int) -> tuple[int, int]:
+def size_of_images(splats: int) -> tuple[int, int]:
     """Width and height of an image with a pixel for each splat.
 
     Raises:

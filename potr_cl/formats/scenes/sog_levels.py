@@ -98,7 +98,7 @@ FORMAT = SceneFormat(
     note="of PlayCanvas; a folder of levels of detail: the finest is read, with the environment, or the level N of "
     "`FOLDER/lod-meta.json#N`",
     load=load,
-    not_written="nothing here writes streamed SOG: convert to .ply, and that with splat-transform",
+    not_written="levels of detail are made by the command encode: -o FOLDER/lod-meta.json",
     packed=True,
 )
 

@@ -1,0 +1,255 @@
+"""Streamed SOG: the tree and its leaves, the chunks, what is read of them, and the errors of leaves."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import potr_cl
+from potr_cl import Scene, UsageError, cli
+from potr_cl.codec.quantize import HyperParameters
+from potr_cl.formats import load_scene
+from potr_cl.levels.errors import MeasuredErrors, SharedOut, coverage
+from potr_cl.model.camera import train_views
+from potr_cl.opencl.device import Device
+from potr_cl.outputs.lod_tree import Limits, extents_of, lod_tree
+from potr_cl.outputs.output import Request
+from potr_cl.outputs.sog import Sog
+from potr_cl.outputs.streamed_sog import StreamedSog
+from potr_cl.raster.rasterizer import Rasterizer
+from tests.reference.scenes import random_scene
+
+COUNTS = (3000, 1500, 400)
+FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
+
+
+class Told:
+    """Errors that are told, in place of measured ones."""
+
+    def of_level(self, level: int) -> float:
+        return 0.0
+
+    def of_leaves(self, scenes, levels, leaves, boxes):
+        assert len(leaves) == len(scenes(0))
+        return np.arange(len(boxes))[:, None] * np.arange(levels) / 3
+
+
+@pytest.fixture(scope="module")
+def device():
+    device = Device()
+    yield device
+    assert device.allocated == 0
+
+
+@pytest.fixture(scope="module")
+def files() -> list[bytes]:
+    request = Request(HyperParameters.from_quality(0.5, "best"))
+    scene = random_scene(COUNTS[0], 1)
+    return [b"".join(Sog().file(scene.subset(np.arange(n)), None, request).pieces) for n in COUNTS]
+
+
+@pytest.fixture(scope="module")
+def folder(files, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("city") / "lod-meta.json"
+    output = StreamedSog(lod_chunk_count=1)
+    with path.open("wb") as file:
+        output.write(output.levelled(files, Told()), file, path)
+    return path
+
+
+def leaves_of(node: dict[str, Any]) -> list[dict[str, Any]]:
+    return [leaf for child in node["children"] for leaf in leaves_of(child)] if "children" in node else [node]
+
+
+def rows_of(scene: Scene) -> set[bytes]:
+    flat = [getattr(scene, field).reshape(len(scene), -1) for field in FIELDS]
+    return {row.tobytes() for row in np.concatenate(flat, axis=1)}
+
+
+def test_every_level_is_read_as_it_was_encoded(files, folder):
+    for level, data in enumerate(files):
+        before, after = Sog().read(data), load_scene(f"{folder}#{level}")
+        assert len(after) == COUNTS[level]
+        assert rows_of(after) == rows_of(before)
+
+
+def test_the_description(folder):
+    meta = json.loads(folder.read_text())
+    assert (meta["version"], meta["lodLevels"], meta["counts"]) == (1, 3, list(COUNTS))
+    assert meta["count"] == sum(COUNTS)
+    assert meta["lodErrors"] is True
+    assert "environment" not in meta
+    leaves = leaves_of(meta["tree"])
+    assert len(leaves) > 4
+    for number, leaf in enumerate(leaves):
+        assert sum(part["count"] for part in leaf["lods"].values()) <= 1024
+        assert leaf["errors"] == pytest.approx([0, number / 3, 2 * number / 3])
+    # The runs of each file follow one another and cover it, and a file is of one level.
+    runs: dict[int, list[tuple[int, int, str]]] = {}
+    for leaf in leaves:
+        for level, part in leaf["lods"].items():
+            runs.setdefault(part["file"], []).append((part["offset"], part["count"], level))
+    for number, name in enumerate(meta["filenames"]):
+        chunk = json.loads((folder.parent / name).read_text())
+        ends = list(itertools.accumulate(count for _, count, _ in sorted(runs[number])))
+        assert [offset for offset, _, _ in sorted(runs[number])] == [0, *ends[:-1]]
+        assert chunk["count"] == ends[-1]
+        assert {level for _, _, level in runs[number]} == {name[0]}
+        assert chunk["shN"]["count"] <= chunk["count"]
+
+
+def test_bounds_hold_the_ellipsoids(folder):
+    def check(node: dict[str, Any]) -> None:
+        for child in node.get("children", []):
+            assert all(np.array(child["bound"]["min"]) >= node["bound"]["min"])
+            assert all(np.array(child["bound"]["max"]) <= node["bound"]["max"])
+            check(child)
+
+    meta = json.loads(folder.read_text())
+    check(meta["tree"])
+    levels = [load_scene(f"{folder}#{level}") for level in range(3)]
+    ends = np.concatenate([[scene.means + s * extents_of(scene) for s in (-1, 1)] for scene in levels], axis=1)
+    bound = meta["tree"]["bound"]
+    assert np.allclose(ends[0].min(axis=0), bound["min"], rtol=1e-5)
+    assert np.allclose(ends[1].max(axis=0), bound["max"], rtol=1e-5)
+
+
+def test_an_ellipsoid_reaches_as_far_as_its_points():
+    scene = random_scene(5, 0)
+    points = np.random.default_rng(3).normal(size=(200_000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    for k in range(len(scene)):
+        w, *xyz = scene.quaternions[k].astype(np.float64)
+        scaled, axis = points * np.exp(scene.log_scales[k]), np.array(xyz)
+        turned = scaled + 2 * np.cross(axis, np.cross(axis, scaled) + w * scaled)
+        assert np.allclose(turned.max(axis=0), extents_of(scene)[k], rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("limits", "least"), [(Limits(500, 1e9, 500), 10), (Limits(5000, 1e9, 500), 1), (Limits(5000, 0.3, 100), 8)]
+)
+def test_nodes_are_split_as_the_limits_say(limits, least):
+    scenes = [random_scene(n, 0) for n in COUNTS]
+    leaves = list(lod_tree(scenes, limits).leaves())
+    assert len(leaves) >= least
+    for leaf in leaves:
+        centres = np.concatenate([scene.means[rows] for scene, rows in zip(scenes, leaf.rows, strict=True)])
+        assert len(centres) <= limits.splats
+        assert len(centres) <= limits.fewest or np.ptp(centres, axis=0).max() <= limits.extent
+    for level, scene in enumerate(scenes):
+        rows = np.concatenate([leaf.rows[level] for leaf in leaves])
+        assert np.array_equal(np.sort(rows), np.arange(len(scene)))
+
+
+def mean_squared_errors(device, scene, others, views) -> list[float]:
+    with Rasterizer(device, scene) as one:
+        pictures = [one.render(view)[0].clip(0, 1) for view in views]
+    found = []
+    for other in others:
+        with Rasterizer(device, other) as another:
+            own = [another.render(view)[0].clip(0, 1) for view in views]
+        found.append(float(np.mean([np.square(a - b).mean() for a, b in zip(pictures, own, strict=True)])))
+    return found
+
+
+def test_errors_of_leaves_add_up_and_say_where(plush_excerpt, plush_excerpt_cameras, device):
+    """Of a scene whose left half has lost its colours: the error is there, and all of it."""
+    views = train_views(plush_excerpt_cameras)
+    left = plush_excerpt.means[:, 0] < np.median(plush_excerpt.means[:, 0])
+    sh = plush_excerpt.sh.copy()
+    sh[left, 0] += 0.3
+    other = Scene(*(getattr(plush_excerpt, field) for field in FIELDS[:4]), sh)
+    with SharedOut(device, plush_excerpt, views, left.astype(np.int64), 2, (0, 0, 0)) as shared:
+        right_part, left_part = shared.of(other)
+        assert shared.of(plush_excerpt).tolist() == [0, 0]
+    (whole,) = mean_squared_errors(device, plush_excerpt, [other], views)
+    assert left_part + right_part == pytest.approx(whole, rel=1e-5)
+    assert left_part > 4 * right_part
+
+
+def test_an_error_times_what_the_leaf_covers_is_what_it_adds(plush_excerpt, plush_excerpt_cameras, device):
+    views = train_views(plush_excerpt_cameras)
+    fewer = plush_excerpt.subset(np.arange(0, len(plush_excerpt), 2))
+    scenes = [plush_excerpt, fewer]
+    boxes = np.concatenate([plush_excerpt.means.min(axis=0), plush_excerpt.means.max(axis=0)])[None]
+    leaves = np.zeros(len(plush_excerpt), np.int64)
+    errors = MeasuredErrors(device, views, plush_excerpt).of_leaves(scenes.__getitem__, 2, leaves, boxes)
+    assert errors[0, 0] == 0
+    covered = np.mean([coverage(view, boxes)[0] for view in views])
+    (whole,) = mean_squared_errors(device, plush_excerpt, [fewer], views)
+    assert errors[0, 1] * covered == pytest.approx(whole, rel=1e-5)
+
+
+def test_coverage_is_that_of_playcanvas_engine(plush_excerpt_cameras):
+    """Of a box around the middle of the picture: its radius over that and the distance, squared; for 45 degrees."""
+    view = dataclasses.replace(plush_excerpt_cameras[0], height=200, fy=100 / np.tan(np.radians(22.5)))
+    axis = view.rotation[2]
+    centre = view.centre + 5 * axis
+    box = np.concatenate([centre - 1, centre + 1])
+    nearest = np.linalg.norm(np.clip(view.centre, box[:3], box[3:]) - view.centre)
+    behind = np.concatenate([view.centre - 5 * axis - 1, view.centre - 5 * axis + 1])
+    around = np.concatenate([view.centre - 1, view.centre + 1])
+    expected = [3 / (np.sqrt(3) + nearest) ** 2, 0, 1]
+    assert np.allclose(coverage(view, np.array([box, behind, around])), expected)
+    wide = dataclasses.replace(view, fy=100 / np.tan(np.radians(45)))
+    assert coverage(wide, box[None])[0] < expected[0]
+
+
+@pytest.fixture(scope="module")
+def encoded(data, tmp_path_factory):
+    """By the command line, into a folder that is not there yet."""
+    path = tmp_path_factory.mktemp("made") / "city" / "lod-meta.json"
+    words = f"--cameras {data}/plush_excerpt_cameras.json --levels 3 --lod-chunk-count 1 --iterations 4 --refit 2"
+    assert (
+        cli.main(["encode", f"{data}/plush_excerpt.ply", "-o", str(path), *words.split(), "--views-between", "0"]) == 0
+    )
+    return path
+
+
+def test_the_command_writes_a_folder(encoded, capsys):
+    meta = json.loads(encoded.read_text())
+    counts = meta["counts"]
+    assert counts[1:] == [round(counts[0] / 2), round(counts[0] / 4)]
+    assert [len(load_scene(f"{encoded}#{level}")) for level in range(3)] == counts
+    for leaf in leaves_of(meta["tree"]):
+        assert leaf["errors"][0] == 0 < leaf["errors"][1] <= leaf["errors"][2]
+
+
+def test_python_makes_the_same_files(encoded, plush_excerpt, plush_excerpt_cameras, tmp_path):
+    result = potr_cl.encode(
+        plush_excerpt, plush_excerpt_cameras, levels=3, lod_chunk_count=1, iterations=4, refit=2, views_between=0,
+        output=tmp_path / "lod-meta.json",
+    )  # fmt: skip
+    made = sorted(path for path in tmp_path.rglob("*") if path.is_file())
+    assert [path.relative_to(tmp_path) for path in made] == sorted(
+        path.relative_to(encoded.parent) for path in encoded.parent.rglob("*") if path.is_file()
+    )
+    for path in made:
+        assert path.read_bytes() == (encoded.parent / path.relative_to(tmp_path)).read_bytes(), path
+    assert result.nbytes == sum(path.stat().st_size for path in made) == sum(result.report["properties"].values())
+    result.save(tmp_path / "again" / "lod-meta.json")
+    assert len(load_scene(f"{tmp_path / 'again'}#0")) == len(result.order)
+
+
+@pytest.mark.parametrize("flag", ["--lod-chunk-count", "--lod-chunk-extent"])
+def test_options_are_checked(flag, data, tmp_path, capsys):
+    scene = f"{data}/plush_excerpt.ply"
+    assert cli.main(["encode", scene, "-o", str(tmp_path / "lod-meta.json"), flag, "0"]) == 2
+    assert f"{flag} is 0, it must be above 0" in capsys.readouterr().err
+    assert cli.main(["encode", scene, "-o", str(tmp_path / "a.potr"), flag, "2"]) == 2
+    assert "to choose" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_cannot_be_made_is_refused_before_the_work(data, tmp_path, capsys):
+    place = tmp_path / "no" / "city" / "lod-meta.json"
+    assert cli.main(["encode", f"{data}/plush_excerpt.ply", "-o", str(place)]) == 2
+    assert "does not exist" in capsys.readouterr().err
+    with pytest.raises(UsageError, match="cannot make the folder"):
+        StreamedSog().place(place)
