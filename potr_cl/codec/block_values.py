@@ -21,7 +21,7 @@ from potr_cl.codec.bundles.sections import MAIN
 from potr_cl.codec.bundles.streams import largest_integer
 from potr_cl.codec.container import Block
 from potr_cl.codec.native.bundles import BEYOND_TABLE
-from potr_cl.codec.native.library import Functions
+from potr_cl.codec.native.declarations import CFunctions
 from potr_cl.codec.native.table import definition
 from potr_cl.codec.native.values import BundleShare, Tables, ValueArrays
 from potr_cl.codec.sections import Property
@@ -244,8 +244,8 @@ def bundle_share(bundles: int) -> BundleShare | None:
     return None
 
 
-def _bundle_share_of_c(functions: Functions, bundles: int) -> BundleShare:
-    return functions.bundle_share(bundles)
+def _bundle_share_of_c(c: CFunctions, bundles: int) -> BundleShare:
+    return BundleShare(c, bundles)
 
 
 class _Helpers:

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.logarithm import natural_logarithm
-from potr_cl.codec.native.library import Functions
+from potr_cl.codec.native import quantising
+from potr_cl.codec.native.declarations import CFunctions
 from potr_cl.codec.native.table import definition
 from potr_cl.errors import DataError, UsageError
 
@@ -342,11 +343,12 @@ def canonical_rotations(quaternions: F32, log_scales: F32, order: NDArray[np.int
 
 
 def _canonical_rotations_by_c(
-    functions: Functions, quaternions: F32, log_scales: F32, order: NDArray[np.int64] | None = None
+    c: CFunctions, quaternions: F32, log_scales: F32, order: NDArray[np.int64] | None = None
 ) -> tuple[F64, F32]:
     order = np.arange(len(quaternions)) if order is None else order
     imaginary, turned = np.empty((len(order), 3)), np.empty((len(order), 3), np.float32)
-    functions.quantising.canonical(
+    quantising.canonical(
+        c,
         np.ascontiguousarray(quaternions, np.float32),
         np.ascontiguousarray(log_scales, np.float32),
         np.ascontiguousarray(order, np.int64),
@@ -436,10 +438,10 @@ def nonzero_levels(sh: F32, sf_sh: float) -> NDArray[np.bool_]:
     return planar.transpose(2, 0, 1)
 
 
-def _nonzero_levels_by_c(functions: Functions, sh: F32, sf_sh: float) -> Any:
+def _nonzero_levels_by_c(c: CFunctions, sh: F32, sf_sh: float) -> Any:
     if not (sh.flags.c_contiguous and sh.dtype == np.float32):
         return NotImplemented
-    found = functions.quantising.nonzero_levels(sh, sf_sh, _LARGEST)
+    found = quantising.nonzero_levels(c, sh, sf_sh, _LARGEST)
     return NotImplemented if found is None else found.transpose(2, 0, 1)
 
 

@@ -19,7 +19,8 @@ from potr_cl.codec.bundles.ranges import Words, decode_stream, integer_type
 from potr_cl.codec.bundles.sections import MAIN, ORDER, ROTATION, Section
 from potr_cl.codec.bundles.streams import LOWEST, band, check_end, differences, no_words_left, step_terms, streams_of
 from potr_cl.codec.native.bundles import FINE, TOO_FEW_WORDS, BundledFile
-from potr_cl.codec.native.library import Functions, vectors
+from potr_cl.codec.native.declarations import CFunctions
+from potr_cl.codec.native.library import vectors
 from potr_cl.codec.native.table import definition
 from potr_cl.codec.sections import Property
 from potr_cl.codec.steps.rule import ColourSteps
@@ -117,7 +118,12 @@ class Reader:
         file = self.bundled_file(wanted)
         if file is not None:
             work = file.work()
-            return joined([_levels_of(self, file, bundle, wanted, work) for bundle in range(first, last)])
+            parts = []
+            for bundle in range(first, last):
+                said, number, levels = file.levels(bundle, wanted.sections, wanted.rotations, work)
+                check_said(self, said, number)
+                parts.append(levels)
+            return joined(parts)
         run = _Run(self, first, last, wanted)
         for key in wanted.keys:
             run.decode(key)
@@ -152,7 +158,7 @@ def bundled_file(
 
 
 def _bundled_file_by_c(
-    functions: Functions,
+    c: CFunctions,
     splats: int,
     sections: Mapping[int, Section | None],
     steps: ColourSteps | None,
@@ -162,8 +168,7 @@ def _bundled_file_by_c(
     if not all(section.fits for section in there.values()):
         return NotImplemented
     if not kept:
-        words = {number: section.for_native() for number, section in there.items()}
-        kept.append(functions.bundled_file(splats, words, steps, vectors()))
+        kept.append(BundledFile(c, splats, there, steps, vectors()))
     return kept[0]
 
 
@@ -319,26 +324,6 @@ def _items(masks: NDArray[np.uint8], width: int) -> tuple[NDArray[np.int32], NDA
     splat = places // np.int32(width)
     places -= splat * np.int32(width)
     return splat, places.astype(np.uint8)
-
-
-def _levels_of(reader: Reader, file: BundledFile, bundle: int, wanted: Wanted, work: NDArray[np.uint8]) -> Levels:
-    """A bundle's levels by the native path."""
-    said, number, found = file.integers(bundle, wanted.sections, wanted.rotations, work)
-    check_said(reader, said, number)
-    levels = Levels(bundle * BUNDLE, min((bundle + 1) * BUNDLE, reader.bundles.splats), found.opacities)
-    if wanted.sections > 1:
-        levels.scales = list(found.scales)
-    if wanted.sections > 2:
-        levels.dc = list(found.dc)
-    if wanted.rotations:
-        levels.rotations = list(found.rotations)
-    ends = np.cumsum((0, *found.items))
-    for k, key in enumerate(MAIN[3 : wanted.sections]):
-        if reader.section(key) is not None:
-            own = slice(ends[k], ends[k + 1])
-            splats = found.splats[own].astype(np.int32)
-            levels.ac.append(Items(splats, found.coefficients[own], found.channels[:, own]))
-    return levels
 
 
 def check_said(reader: Reader, said: int, number: int) -> None:

@@ -5,7 +5,8 @@ takes them: where their numbers are (:func:`address`).
 from __future__ import annotations
 
 import ctypes
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,7 +97,11 @@ _SHORT = {
 }
 
 
-def declared(path: str) -> dict[str, Any]:
+#: The functions of the library by name. They may be called from several threads at a time.
+CFunctions: TypeAlias = "Mapping[str, Any]"
+
+
+def declared(path: str) -> CFunctions:
     """The functions of a library by name, told what they take.
 
     Raises:
@@ -109,6 +114,15 @@ def declared(path: str) -> dict[str, Any]:
         functions[name] = (keeping if name in _SHORT else library)[name]
         functions[name].restype, functions[name].argtypes = result, arguments
     return functions
+
+
+#: Integers of splats are below this in magnitude, so that sums of three fit.
+LARGEST = 1 << 29
+
+
+def fits(largest: int) -> bool:
+    """Whether C can take integers of at most some magnitude."""
+    return largest < LARGEST
 
 
 def address(array: NDArray[Any], dtype: type[np.generic], number: int, writable: bool = False) -> int:

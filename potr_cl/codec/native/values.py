@@ -5,7 +5,7 @@ levels (:class:`Tables`), and how threads share the bundles out (:class:`BundleS
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.native.declarations import address
+from potr_cl.codec.native.declarations import CFunctions, address
 from potr_cl.codec.steps.rule import CLASSES
 
 if TYPE_CHECKING:
@@ -260,12 +260,12 @@ class BundleShare:
     Threads may begin before the file is open: they wait for it, and leave the interpreter to others.
 
     Args:
-        functions: of the library.
+        c: the library's functions.
         bundles: of the file.
     """
 
-    def __init__(self, functions: Mapping[str, Any], bundles: int) -> None:
-        self._c = functions
+    def __init__(self, c: CFunctions, bundles: int) -> None:
+        self._c = c
         self._said = np.full(bundles, -1, np.int32)
         said = address(self._said, np.int32, bundles, True)
         self._share = _Share(said=said, rooms=1, bundles=bundles, end=bundles)
@@ -283,7 +283,7 @@ class BundleShare:
 
         Args:
             file: that has the bundles.
-            sections, rotations: what of them, as of :meth:`potr_cl.codec.native.bundles.BundledFile.integers`.
+            sections, rotations: what of them, as of :meth:`potr_cl.codec.native.bundles.BundledFile.levels`.
             values: where it goes: arrays of all splats, or memory for some bundles, which take turns. Then they wait
                 until there is room for them (:meth:`allow`).
             tables: what makes values of levels.
@@ -334,7 +334,7 @@ class BundleShare:
 
         Returns:
             What C says of it, and the section at fault, as
-            :meth:`potr_cl.codec.native.bundles.BundledFile.integers` does. BEYOND_TABLE: its values are not whole.
+            :meth:`potr_cl.codec.native.bundles.BundledFile.levels` does. BEYOND_TABLE: its values are not whole.
         """
         if not 0 <= bundle < len(self._said):
             raise TypeError("the native path was asked for what is not there")
