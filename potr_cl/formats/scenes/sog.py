@@ -27,7 +27,6 @@ from potr_cl.formats.scenes.scene_files import (
     reading,
     related,
     tell_of_low_pass,
-    unfilled,
     unit_quaternions,
 )
 from potr_cl.formats.scenes.sog_images import (
@@ -237,7 +236,7 @@ class Sog:
         for name, images in (("means", 2), ("quats", 1), ("scales", 1), ("sh0", 1)):
             for index in range(images):
                 self._check_pixels(name, index)
-        scene = unfilled(count, coefficients)
+        scene = Scene.blank(count, coefficients, by_splat=True)
         self._fill_means(scene.means)
         quaternions, scales = self._pixels("quats", 0), self._pixels("scales", 0)
         book = self._codebook("scales")
