@@ -218,11 +218,7 @@ class BlockValues:
         )
 
     def _by_numpy(self, bundles: range, wanted: Wanted, arrays: ValueArrays) -> None:
-        """Fill arrays with the values of some bundles, which are decoded side by side.
-
-        Raises:
-            DataError: damaged.
-        """
+        """Fill arrays with the values of some bundles, which are decoded side by side. Raises DataError if damaged."""
         levels = self.reader.levels(bundles.start, bundles.stop, wanted)
         dequantizer.fill(arrays, self.block, levels, self.reader.steps, self.activation)
 

@@ -45,7 +45,7 @@ def load_scene(path: str | os.PathLike[str], trust: bool = False, antialiased: b
         DataError: its content is damaged, or it holds too many splats for its size.
     """
     with _silent_overflows(), streams.plain(Path(path), trust) as file:
-        return registry.reader_of(file)(file, trust).rendered(antialiased)
+        return registry.format_of(file).load(file, trust).rendered(antialiased)
 
 
 def scene_writer(path: str | os.PathLike[str], **choices: Any) -> Callable[[Scene], None]:
@@ -61,7 +61,7 @@ def scene_writer(path: str | os.PathLike[str], **choices: Any) -> Callable[[Scen
             such choice or version.
     """
     path = Path(path)
-    entry, save = registry.written_format(path), registry.writer_of(path)
+    entry = registry.written_format(path)
     if "source" not in entry.choices:
         choices.pop("source", None)
     given = {name: value for name, value in choices.items() if value is not None}
@@ -72,7 +72,8 @@ def scene_writer(path: str | os.PathLike[str], **choices: Any) -> Callable[[Scen
         raise UsageError(f"'{path}': {entry.name} {has}, not {version}")
     for name in given.keys() - {"version", *entry.choices}:
         raise UsageError(f"'{path}': {entry.name} has no {name} to choose")
-    return partial(save, path, **given)
+    assert entry.save is not None
+    return partial(entry.save, path, **given)
 
 
 def save_scene(path: str | os.PathLike[str], scene: Scene, **choices: Any) -> None:

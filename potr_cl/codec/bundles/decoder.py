@@ -87,19 +87,11 @@ class Reader:
 
     @cached_property
     def steps(self) -> ColourSteps | None:
-        """The steps of colours.
-
-        Raises:
-            DataError: damaged.
-        """
+        """The steps of colours. Raises DataError if damaged."""
         return self._open_steps()
 
     def section(self, key: Property) -> Section | None:
-        """A section; None if the file has none.
-
-        Raises:
-            DataError: damaged.
-        """
+        """A section; None if the file has none. Raises DataError if damaged."""
         if key not in self._sections:
             found = self._open_section(key)
             self._sections[key] = None if found is None else Section(key, found[0], self.bundles, found[1])
@@ -131,11 +123,7 @@ class Reader:
         return run.levels
 
     def bundled_file(self, wanted: Wanted = EVERYTHING) -> BundledFile | None:
-        """What the native path decodes bundles from; None where NumPy is to be taken.
-
-        Raises:
-            DataError: damaged.
-        """
+        """What the native path decodes bundles from; None where NumPy is to be taken. Raises DataError if damaged."""
         # By whatever path, they are looked at before anything is decoded.
         sections = {ORDER.index(key): self.section(key) for key in wanted.keys}
         steps = self.steps if wanted.sections > 2 else None
@@ -327,11 +315,7 @@ def _items(masks: NDArray[np.uint8], width: int) -> tuple[NDArray[np.int32], NDA
 
 
 def check_said(reader: Reader, said: int, number: int) -> None:
-    """What the native path says of a bundle, and of the section at fault.
-
-    Raises:
-        DataError: damaged.
-    """
+    """What the native path says of a bundle, and of the section at fault. Raises DataError if damaged."""
     if said == FINE:
         return
     section = reader.section(ORDER[number])

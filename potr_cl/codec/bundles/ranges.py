@@ -79,11 +79,7 @@ class Words:
         np.copyto(self._first, self._last)
 
     def check(self) -> None:
-        """Check that there was a word whenever one was asked for.
-
-        Raises:
-            DataError: there was not.
-        """
+        """Check that there was a word whenever one was asked for. Raises DataError if there was not."""
         if (self._first > self._ends).any():
             raise no_words_left(self._what)
 

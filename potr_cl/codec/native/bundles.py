@@ -293,11 +293,7 @@ class BundledFile:
         return max((number - 2 for number in range(3, sections) if self._file.words[number]), default=0)
 
     def check(self, bundle: int, sections: int, rotations: bool) -> int:
-        """Splats of a bundle, of which so much can be decoded.
-
-        Raises:
-            TypeError: it cannot.
-        """
+        """Splats of a bundle, of which so much can be decoded. Raises TypeError if it cannot."""
         if not 0 <= bundle * _BUNDLE < self.splats or not 1 <= sections < SECTIONS or (rotations and sections < 2):
             raise TypeError("the native path was asked for what is not there")
         return min(self.splats - bundle * _BUNDLE, _BUNDLE)

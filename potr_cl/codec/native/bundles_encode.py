@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +15,13 @@ from potr_cl.codec.bundles.streams import Stream
 from potr_cl.codec.native.bundles import SECTIONS, STREAMS
 from potr_cl.codec.native.declarations import CFunctions, address
 from potr_cl.codec.sections import SH, Property
+from potr_cl.host.threads import Spare
 
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]
 U16 = NDArray[np.uint16]
 U32 = NDArray[np.uint32]
-T = TypeVar("T")
 
 #: Rows of the sums of products, and numbers of a stream.
 COLUMNS, NUMBERS = 22, 21
@@ -75,27 +74,6 @@ class CodedBundle:
     rotation_states: U32
 
 
-class _Pool(Generic[T]):
-    """Room that threads work in: as many as there are threads at work."""
-
-    def __init__(self, make: Callable[[], T]) -> None:
-        self._make = make
-        self._free: list[T] = []
-
-    @contextmanager
-    def taken(self) -> Iterator[T]:
-        try:
-            room = self._free.pop()
-        except IndexError:
-            room = self._make()
-        yield room
-        self._free.append(room)
-
-    def all(self) -> list[T]:
-        """All that was made, while nobody is at work."""
-        return self._free
-
-
 class BundleEncoder:
     """A file's integers, whose bundles any thread may go through.
 
@@ -134,10 +112,10 @@ class BundleEncoder:
             for k, integers in enumerate(own, start=first):
                 to[k] = self._keep(integers, np.int32, splats)
         self._streams = (_Stream * STREAMS)()
-        self._work = _Pool(lambda: np.zeros(c["potr_bundles_encoding"](), np.uint8))
-        self._sums = _Pool(lambda: (np.zeros((STREAMS, COLUMNS, COLUMNS), np.int64), np.zeros(STREAMS, np.uint32)))
-        self._counts = _Pool(lambda: np.zeros((STREAMS, _TOKENS, _TOKENS), np.uint32))
-        self._words = _Pool(lambda: np.empty(_WORDS * _BUNDLE + 2, np.uint16))
+        self._work = Spare(lambda: np.zeros(c["potr_bundles_encoding"](), np.uint8))
+        self._sums = Spare(lambda: (np.zeros((STREAMS, COLUMNS, COLUMNS), np.int64), np.zeros(STREAMS, np.uint32)))
+        self._counts = Spare(lambda: np.zeros((STREAMS, _TOKENS, _TOKENS), np.uint32))
+        self._words = Spare(lambda: np.empty(_WORDS * _BUNDLE + 2, np.uint16))
         for place, stream in zip(self._streams, streams, strict=True):
             number, some = len(stream.terms), stream.coefficients
             if number > 12 or number + some > NUMBERS - 2:

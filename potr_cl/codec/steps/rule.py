@@ -89,11 +89,7 @@ class ColourSteps:
 
     @staticmethod
     def from_bytes(raw: bytes, splats: int) -> ColourSteps:
-        """Undo :meth:`to_bytes`; nothing in the bytes is trusted.
-
-        Raises:
-            DataError: damaged.
-        """
+        """Undo :meth:`to_bytes`; nothing in the bytes is trusted. Raises DataError if damaged."""
         impossible = DataError("section 'steps' describes impossible steps")
         if len(raw) < _HEAD.size:
             raise impossible

@@ -114,11 +114,7 @@ def save_parts(path: str | os.PathLike[str], parts: Iterable[Scene], splats: int
 
 
 def pieces_of_parts(parts: Iterable[Scene], splats: int) -> Iterator[bytes | memoryview]:
-    """The bytes of :func:`save_parts`, as those of :func:`pieces`.
-
-    Raises:
-        DataError: as :func:`save_parts`.
-    """
+    """The bytes of :func:`save_parts`, as those of :func:`pieces`. Raises DataError if as :func:`save_parts`."""
     kind: tuple[int, bool, float] | None = None
     left = splats
     for part in parts:

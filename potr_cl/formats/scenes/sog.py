@@ -10,7 +10,7 @@ import json
 import math
 import os
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -65,9 +65,11 @@ def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
     """
     folder = file_in_folder(path, DESCRIPTION)
     if folder is not None:
-        parts = Folder(folder)
+        description, images = read_folder(folder)
         with reading(path):
-            return cleaned(path, Sog(path, parts.description(), parts.stored, parts.size, trust).scene())
+            return cleaned(
+                path, Sog(path, description, images.__getitem__, folder_bytes(description, images), trust).scene()
+            )
     with opened(path) as (file, size):
         archive = _opened_archive(path, file, size)
         scene = Sog(path, archive.read(DESCRIPTION), archive.read, size, trust).scene()
@@ -123,38 +125,24 @@ FORMAT = SceneFormat(
 )
 
 
-class Folder:
-    """The files of a SOG folder, each of which is read once.
-
-    Args:
-        path: of its description.
-
-    Attributes:
-        size: bytes of the description and the images that it names.
+def read_folder(path: Path) -> tuple[bytes, dict[str, bytes]]:
+    """The description of a SOG folder, at ``path``, and the images that it names, each read once.
 
     Raises:
         UsageError: one of the files cannot be opened.
         DataError: the description is damaged, or names a file outside of the folder.
     """
+    description, names = _described(path)
+    images = {}
+    for name in names:
+        with opened(related(path, name)) as (file, _):
+            images[name] = file.read()
+    return description, images
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._description, names = _described(path)
-        self._images = {name: self._read(name) for name in names}
-        self.size = len(self._description) + sum(map(len, self._images.values()))
 
-    def description(self) -> bytes:
-        """The bytes of meta.json."""
-        return self._description
-
-    def stored(self, name: str) -> bytes:
-        """The bytes of an image."""
-        return self._images[name]
-
-    def _read(self, name: str) -> bytes:
-        with opened(related(self._path, name)) as (file, _):
-            content: bytes = file.read()
-        return content
+def folder_bytes(description: bytes, images: Mapping[str, bytes]) -> int:
+    """Of all files of a SOG folder that were read."""
+    return len(description) + sum(map(len, images.values()))
 
 
 def _described(path: Path) -> tuple[bytes, list[str]]:
