@@ -302,10 +302,7 @@ def _read(path: Path, state: State, offset: int, nbytes: int) -> bytes:
 
 
 def decode(
-    source: bytes | str | os.PathLike[str],
-    trust: bool = False,
-    sh_degree: int | None = None,
-    box: Box | None = None,
+    source: bytes | str | os.PathLike[str], trust: bool = False, sh_degree: int | None = None, box: Box | None = None
 ) -> Scene:
     """Decode a .potr file, given as bytes or as a path.
 

@@ -122,11 +122,7 @@ _AT_A_TIME = 1 << 16
 
 
 def fill(
-    arrays: ValueArrays,
-    block: Block,
-    levels: Levels,
-    steps: ColourSteps | None,
-    activation: Activation | None = None,
+    arrays: ValueArrays, block: Block, levels: Levels, steps: ColourSteps | None, activation: Activation | None = None
 ) -> None:
     """Values of some splats' levels into the arrays that there are.
 

@@ -22,6 +22,7 @@ from potr_cl.codec.native import quantising
 from potr_cl.codec.native.declarations import CFunctions
 from potr_cl.codec.native.table import definition
 from potr_cl.errors import DataError, UsageError
+from potr_cl.model.spherical_harmonics import rotation_matrices
 
 Integers = NDArray[np.signedinteger]
 F32 = NDArray[np.float32]
@@ -282,17 +283,7 @@ def _octahedral_rotations() -> tuple[F64, NDArray[np.intp]]:
                 g[i], g[j] = np.sqrt(0.5), sign * np.sqrt(0.5)
                 quaternions.append(g)
     table = np.array(quaternions)
-    permutations = []
-    for w, x, y, z in table:
-        matrix = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
-        permutations.append(np.abs(matrix).argmax(axis=0))
-    return table, np.array(permutations)
+    return table, np.abs(rotation_matrices(table)).argmax(axis=1)
 
 
 _GROUP, _PERMUTATIONS = _octahedral_rotations()
@@ -331,11 +322,7 @@ def canonical_rotations(quaternions: F32, log_scales: F32, order: NDArray[np.int
     gw, gx, gy, gz = _GROUP[best].T
     w, x, y, z = q.T
     product = np.stack(
-        [
-            w * gx + x * gw + y * gz - z * gy,
-            w * gy - x * gz + y * gw + z * gx,
-            w * gz + x * gy - y * gx + z * gw,
-        ],
+        [w * gx + x * gw + y * gz - z * gy, w * gy - x * gz + y * gw + z * gx, w * gz + x * gy - y * gx + z * gw],
         axis=1,
     )
     product[np.take_along_axis(real, best[:, None], axis=1)[:, 0] < 0] *= -1

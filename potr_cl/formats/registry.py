@@ -50,11 +50,7 @@ _GZIP = b"\x1f\x8b"
 
 #: In the order in which a folder is searched for them. cameras.json stands before transforms.json, for it lists just
 #: the views that a scene was trained with, as they were.
-CAMERA_FORMATS: tuple[CameraFormat, ...] = (
-    colmap.FORMAT,
-    cameras_json.FORMAT,
-    transforms.FORMAT,
-)
+CAMERA_FORMATS: tuple[CameraFormat, ...] = (colmap.FORMAT, cameras_json.FORMAT, transforms.FORMAT)
 
 
 def format_of(path: Path) -> SceneFormat:

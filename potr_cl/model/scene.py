@@ -115,12 +115,7 @@ class Scene:
         for name in _ARRAYS:
             object.__setattr__(self, name, _cast(getattr(self, name), name))
         n = len(self.means) if self.means.ndim else 0
-        wanted = {
-            "means": (n, 3),
-            "log_scales": (n, 3),
-            "quaternions": (n, 4),
-            "opacity_logits": (n,),
-        }
+        wanted = {"means": (n, 3), "log_scales": (n, 3), "quaternions": (n, 4), "opacity_logits": (n,)}
         for name, shape in wanted.items():
             array = getattr(self, name)
             if array.shape != shape:

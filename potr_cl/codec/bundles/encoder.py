@@ -52,9 +52,7 @@ _FEW = 1 << 15
 
 
 def encode(
-    values: Mapping[Property, Values],
-    classes: NDArray[np.int8],
-    run: Run = map,
+    values: Mapping[Property, Values], classes: NDArray[np.int8], run: Run = map
 ) -> dict[Property, bytes] | None:
     """Code all integers of splats that a file holds.
 
@@ -244,10 +242,7 @@ def encode_natively(
         own or Fitted(stream, some, model)
         for stream, some, model, own in zip(streams, numbers, models, without, strict=True)
     ]
-    states = {
-        MAIN[0]: [bundle.states for bundle in coded],
-        ROTATION: [bundle.rotation_states for bundle in coded],
-    }
+    states = {MAIN[0]: [bundle.states for bundle in coded], ROTATION: [bundle.rotation_states for bundle in coded]}
 
     def section(number: int) -> bytes:
         key = ORDER[number]

@@ -16,10 +16,7 @@ _REAL = ctypes.c_float
 
 #: Argument types and result of each function, in the order of the C declarations.
 _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
-    "potr_octree_levels": (
-        _NUMBER,
-        [_POINTER, _SIZE, _POINTER, _SIZE, _NUMBER, _NUMBER, _POINTER, _POINTER, _POINTER],
-    ),
+    "potr_octree_levels": (_NUMBER, [_POINTER, _SIZE, _POINTER, _SIZE, _NUMBER, _NUMBER, _POINTER, _POINTER, _POINTER]),
     "potr_octree_cut": (_SIZE, []),
     "potr_octree_cuts": (
         _SIZE,
@@ -39,10 +36,7 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
     "potr_octree_sizes": (_SIZE, []),
     "potr_octree_survey": (None, [_POINTER, _SIZE, _SIZE, _NUMBER, *[_POINTER] * 3]),
     "potr_octree_streams": (None, [_POINTER, _SIZE, _SIZE, _NUMBER, *[_POINTER] * 8]),
-    "potr_octree_decoded": (
-        None,
-        [_POINTER, _SIZE, _SIZE, _NUMBER, *[_POINTER] * 4, _SIZE, _SIZE, _POINTER],
-    ),
+    "potr_octree_decoded": (None, [_POINTER, _SIZE, _SIZE, _NUMBER, *[_POINTER] * 4, _SIZE, _SIZE, _POINTER]),
     "potr_bundles_table": (_NUMBER, [_POINTER, _SIZE, _SIZE, *[_POINTER] * 3]),
     "potr_bundles_vectors": (_NUMBER, []),
     "potr_bundles_work": (_SIZE, []),

@@ -91,13 +91,7 @@ class Walk:
     """
 
     def __init__(
-        self,
-        c: CFunctions,
-        tree: Tree,
-        leaf_levels: U8,
-        multiplicities: U64,
-        splats: int,
-        parts: int,
+        self, c: CFunctions, tree: Tree, leaf_levels: U8, multiplicities: U64, splats: int, parts: int
     ) -> None:
         if len(leaf_levels) and int(leaf_levels.max()) > tree.depth:
             raise TypeError("the native path was given leaves below the octree")

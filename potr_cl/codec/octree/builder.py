@@ -304,13 +304,7 @@ def _serialise_tree(
 
 
 def _leaf_levels(
-    axes: list[F64],
-    low: list[float],
-    side: float,
-    grid: list[U64],
-    alone: NDArray[np.int8],
-    depth: int,
-    limit: F64,
+    axes: list[F64], low: list[float], side: float, grid: list[U64], alone: NDArray[np.int8], depth: int, limit: F64
 ) -> NDArray[np.int8]:
     """The first level from ``alone`` on whose cell centre lies within the limit; ``depth`` at the latest."""
     level_of = np.full(len(alone), depth, np.int8)

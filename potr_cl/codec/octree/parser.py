@@ -155,12 +155,7 @@ def _parse_by_c(
     _check_leaves(streams, tree.singles, tree.crowded, splats)
     _check_leaf_levels(streams)
     walk = native_octree.Walk(
-        c,
-        tree,
-        streams.leaf_levels,
-        streams.multiplicities,
-        splats,
-        max(1, min(parts, splats // _PART)),
+        c, tree, streams.leaf_levels, streams.multiplicities, splats, max(1, min(parts, splats // _PART))
     )
     list(run(walk.leaves, range(walk.parts)))
     counts = walk.counts

@@ -39,14 +39,7 @@ from potr_cl.formats.scenes.sog_images import (
     bundle,
     write_folder,
 )
-from potr_cl.formats.scenes.sog_values import (
-    areas,
-    in_order,
-    palette_of,
-    quantised,
-    unpacked_means,
-    unpacked_rotations,
-)
+from potr_cl.formats.scenes.sog_values import areas, in_order, palette_of, quantised, unpacked_means, unpacked_rotations
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
 
@@ -189,12 +182,7 @@ class Sog:
     """
 
     def __init__(
-        self,
-        path: str | os.PathLike[str],
-        description: bytes,
-        read: Callable[[str], bytes],
-        size: int,
-        trust: bool,
+        self, path: str | os.PathLike[str], description: bytes, read: Callable[[str], bytes], size: int, trust: bool
     ) -> None:
         self._path, self._read = path, read
         meta = json.loads(description)
