@@ -193,17 +193,10 @@ def level_type(largest: float) -> type[np.signedinteger]:
 
 
 def quantize_scales(log_scales: F64, sf_scale: float) -> Integers:
-    """Natural logarithms of standard deviations to levels, in steps of 1 / SF of the standard deviations themselves.
+    """Natural logarithms of standard deviations, float64 of any shape, to levels >= 0 of the same shape.
 
-    Args:
-        log_scales: float64, of any shape.
-        sf_scale: steps a world unit.
-
-    Returns:
-        Integers >= 0 of the same shape.
-
-    Raises:
-        DataError: one is too large for a file.
+    In steps of 1 / SF world units of the standard deviations themselves. Raises DataError if one is too large for a
+    file.
     """
     with np.errstate(over="ignore"):
         return _to_levels(np.exp(log_scales), sf_scale, "standard deviation")
@@ -358,28 +351,17 @@ def rotation_factors(scales: Sequence[NDArray[np.integer]], sf_rotation: float) 
 
 
 def quantize_rotations(imaginary: F64, factor: float | F32) -> Integers:
-    """One imaginary part of unit quaternions to levels, in steps of 1 / factor.
+    """One imaginary part of unit quaternions, (N,) float64, to signed levels, (N,).
 
-    Args:
-        imaginary: (N,) float64, -1 to 1.
-        factor: steps a unit, one for all splats or (N,).
-
-    Returns:
-        (N,) signed integers.
-
-    Raises:
-        DataError: one is too large for a file.
+    In steps of 1 / factor, which is one for all splats or (N,). Raises DataError if one is too large for a file.
     """
     return _to_levels(imaginary, factor, "quaternion component")
 
 
 def dequantize_rotations(levels: Sequence[NDArray[np.integer]], factor: float | F32, out: F32) -> None:
-    """Three times (N,) levels, of x, y, z, to unit quaternions w, x, y, z in ``out``; w ≥ 0 is computed from the rest.
+    """Levels of x, y and z, (N,) each, to unit quaternions w, x, y, z in ``out``, (N, 4) float32.
 
-    Args:
-        levels: of x, y and z, (N,) each.
-        factor: steps a unit, one for all splats or (N,).
-        out: (N, 4) float32, to be filled.
+    ``factor``: steps a unit, one for all splats or (N,). w ≥ 0 is computed from the rest.
     """
     rest = np.ones(len(out), np.float32)
     factor = np.asarray(factor, np.float32)
