@@ -3,15 +3,126 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.clustering.launch import launcher_for
-from potr_cl.clustering.rows import QUARTER, rows_of_centres
+from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
+from potr_cl.opencl.kernel import Kernel
 from potr_cl.opencl.memory import Memory, Owner
+
+#: Floats in a row are a multiple of this.
+QUARTER = 4
+#: Points that a thread works on at a time.
+_TOGETHER = 1 << 14
+
+
+def width_of(groups: int, coordinates: int) -> int:
+    """Floats in a row of vectors of so many groups of so many coordinates."""
+    return -(-groups * (1 + coordinates) // QUARTER) * QUARTER
+
+
+def rows_of_points(points: FloatArray, weights: FloatArray) -> FloatArray:
+    """(N, width) float32, C order.
+
+    Args:
+        points: (N, G, C).
+        weights: (N, G).
+    """
+    n, groups, coordinates = points.shape
+    rows = np.zeros((n, width_of(groups, coordinates)), np.float32)
+
+    def fill(start: int) -> None:
+        some = slice(start, start + _TOGETHER)
+        rows[some, :groups] = weights[some]
+        weighted = points[some] * (weights[some, :, None] * np.float32(-2))
+        rows[some, groups : groups * (1 + coordinates)] = weighted.reshape(len(weighted), -1)
+
+    with thread_pool() as pool:
+        list(pool.map(fill, range(0, n, _TOGETHER)))
+    return rows
+
+
+def rows_of_centres(centres: FloatArray) -> FloatArray:
+    """(K, width) float32, C order.
+
+    Args:
+        centres: (K, G, C).
+    """
+    count, groups, coordinates = centres.shape
+    rows = np.zeros((count, width_of(groups, coordinates)), np.float32)
+    rows[:, :groups] = np.square(centres.astype(np.float64)).sum(axis=2)
+    rows[:, groups : groups * (1 + coordinates)] = centres.reshape(count, -1)
+    return rows
+
+
+def centres_of_sums(sums: FloatArray, centres: FloatArray) -> FloatArray:
+    """(K, G, C), the weighted means of clusters; where nothing has any weight, a centre stays.
+
+    Args:
+        sums: (K, width), of the rows of each cluster's points.
+        centres: (K, G, C), those before.
+    """
+    count, groups, coordinates = centres.shape
+    mass = sums[:, :groups, None].astype(np.float64)
+    weighted = sums[:, groups : groups * (1 + coordinates)].reshape(count, groups, coordinates)
+    return np.where(mass > 0, -0.5 * weighted / np.where(mass > 0, mass, 1), centres).astype(np.float32)
+
+
+def errors_at_zero(points: FloatArray, weights: FloatArray) -> NDArray[np.float64]:
+    """(N,) the constant of each point: its distance to zero."""
+    errors = np.empty(len(points))
+
+    def add(start: int) -> None:
+        some = slice(start, start + _TOGETHER)
+        np.einsum(
+            "ngc,ngc,ng->n", points[some], points[some], weights[some], dtype=np.float64, optimize=False,
+            out=errors[some],
+        )  # fmt: skip
+
+    with thread_pool() as pool:
+        list(pool.map(add, range(0, len(points), _TOGETHER)))
+    return errors
+
+
+#: Work-items of a GPU's work-group, a point each.
+_GROUP = 128
+
+
+@dataclass(frozen=True)
+class NearestLauncher:
+    """Runs the kernel "nearest" in one family's way.
+
+    Attributes:
+        block: points that are compared with the same centres.
+        group: work-items of a work-group, and for a block.
+    """
+
+    kernel: Kernel
+    block: int
+    group: int
+
+    def enqueue(self, blocks: int, **arguments: Any) -> None:
+        """Enqueue it for so many blocks, with the arguments that cl/clustering/nearest_*.cl declare."""
+        self.kernel.bind(**arguments).launch((blocks * self.group,), (self.group,))
+
+
+def launcher_for(device: Device, width: int) -> NearestLauncher:
+    """The launcher of the device's kernel family, for rows of so many floats.
+
+    Raises:
+        DeviceError: the kernels cannot be built.
+    """
+    if device.family == "gpu":
+        kernel = device.shared_kernel("clustering/nearest_gpu.cl", "nearest", WIDTH=width, GROUP=_GROUP)
+        return NearestLauncher(kernel, _GROUP, _GROUP)
+    lanes = device.vector_width
+    kernel = device.shared_kernel("clustering/nearest_cpu.cl", "nearest", WIDTH=width, LANES=lanes)
+    return NearestLauncher(kernel, lanes, 1)
+
 
 U32 = NDArray[np.uint32]
 
@@ -41,7 +152,7 @@ class Points(Owner):
 
     Args:
         device: to compute on.
-        rows: (N, width) float32 (:mod:`potr_cl.clustering.rows`).
+        rows: (N, width) float32 (:mod:`potr_cl.clustering.comparison`).
 
     Raises:
         DeviceError: the device has too little memory, or the kernels cannot be built.

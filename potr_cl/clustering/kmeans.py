@@ -21,8 +21,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.clustering.comparison import U32, Lists, Points, sorted_by_label
-from potr_cl.clustering.rows import centres_of_sums, errors_at_zero, rows_of_points
+from potr_cl.clustering.comparison import (
+    U32,
+    Lists,
+    Points,
+    centres_of_sums,
+    errors_at_zero,
+    rows_of_points,
+    sorted_by_label,
+)
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device

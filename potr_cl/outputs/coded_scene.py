@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import Output
-from potr_cl.raster.carried import Carried
+from potr_cl.raster.resident import Carried
 from potr_cl.raster.scene_buffers import Drawable
 
 
@@ -30,7 +30,7 @@ class CodedScene(Carried):
         return len(self.data)
 
     def on(self, device: Device) -> AbstractContextManager[Drawable]:
-        """See :meth:`potr_cl.raster.carried.Carried.on`.
+        """See :meth:`potr_cl.raster.resident.Carried.on`.
 
         Raises:
             DataError: nobody can read it.

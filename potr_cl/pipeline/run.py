@@ -4,30 +4,132 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Sequence
+import logging
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.errors import DeviceMemoryError
 from potr_cl.host.threads import in_background
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
+from potr_cl.outputs.output import Output
 from potr_cl.pipeline.encoded import Encoded, SharedOut
 from potr_cl.pipeline.fallback import Attempt, attempts, for_views, on_device
-from potr_cl.pipeline.fit_trial import Trial, only_if_it_pays
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.pipeline.stopwatch import Stopwatch
-from potr_cl.placement.guard import unresolved
-from potr_cl.raster.kept_scene import KeptScene
-from potr_cl.stages.between.price import priced
-from potr_cl.stages.fit import Fit, LeftOut
-from potr_cl.stages.fitting.fit import Fitted
-from potr_cl.stages.guarded import Unresolved, as_they_were
+from potr_cl.placement.rays import unresolved
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.resident import KeptScene
+from potr_cl.raster.scene_buffers import Drawable
+from potr_cl.stages.fit import Fit
+from potr_cl.stages.fitting.fit import held_out_error
+from potr_cl.stages.fitting.fitted import File, Fitted, LeftOut, TwoFiles
 from potr_cl.stages.prune import Prune
-from potr_cl.stages.pruning.unseen import part_of_area
 from potr_cl.stages.refit import Refit
-from potr_cl.stages.stage import Interlude, Stage, State, Workbench
+from potr_cl.stages.stage import Interlude, Progress, Stage, State, Workbench
+from potr_cl.stages.unseen import Unresolved, as_they_were, part_of_area
+from potr_cl.stages.views_between import priced
+from potr_cl.views.targets import RenderedTargets
 from potr_cl.workers.pool import Pool, Traffic
+
+_log = logging.getLogger("potr_cl")
+
+
+def added_up(*parts: Mapping[str, float]) -> dict[str, float]:
+    """Seconds by stage of several stopwatches together."""
+    found: dict[str, float] = {}
+    for part in parts:
+        for stage, seconds in part.items():
+            found[stage] = found.get(stage, 0.0) + seconds
+    return found
+
+
+class Stopwatch:
+    """Passes progress on, and notes how long each stage took. Time of a stage within another is not counted twice.
+
+    Attributes:
+        seconds: wall time by stage, in the order in which they began.
+        tell: takes lines about the work.
+    """
+
+    def __init__(self, progress: Progress | None = None, tell: Callable[[str], None] | None = None) -> None:
+        self._progress = progress
+        self.tell: Callable[[str], None] = tell or _log.debug
+        self._running: str | None = None
+        self._last = time.perf_counter()
+        self.seconds: dict[str, float] = {}
+
+    def __call__(self, stage: str, done: float) -> None:
+        now = time.perf_counter()
+        self.seconds.setdefault(stage, 0.0)
+        self.seconds[self._running or stage] += now - self._last
+        self._running, self._last = stage if done < 1 else None, now
+        if self._progress is not None:
+            self._progress(stage, done)
+
+
+_NO_SMALLER = "on the views that were held out, a file with it was no better than one without"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What the two files are made and judged with.
+
+    Attributes:
+        remaining: the stages after the fit, up to the one that makes the file.
+        output: the kind of file.
+        device: that judges.
+        source: the uncompressed scene, as it may lie there.
+        background: R, G, B behind the scene.
+    """
+
+    remaining: Callable[[State], State]
+    output: Output
+    device: Device
+    source: Drawable
+    background: tuple[float, float, float]
+
+    def of(self, state: State) -> File:
+        """The file that a state becomes, and how well it shows the views that a fit holds out."""
+        coded = self.remaining(state).learnt.coded
+        assert coded is not None, "the last stage makes the file"
+        with (
+            self.output.seen(b"".join(coded.pieces), self.device, trust=True) as seen,
+            Rasterizer(self.device, self.source, background=self.background) as rasterizer,
+        ):
+            targets = RenderedTargets(rasterizer, state.views)
+            error = held_out_error(self.device, seen, state.views, targets, state.added, self.background)
+        return File(coded.nbytes, error)
+
+
+def only_if_it_pays(before: State, after: State, trial: Trial) -> State:
+    """The state after a fit, or that before it where a file with the fit would be no better.
+
+    Args:
+        before, after: the fit. ``after`` is returned as it is where the fit was left out, was interrupted, gained much,
+            or went on to photographs, which are judges of their own.
+        trial: makes the files.
+
+    Returns:
+        One of the two; what both files came to is told with what the fit says of itself.
+
+    Raises:
+        As the stages.
+    """
+    told = after.learnt.fitted
+    if not isinstance(told, Fitted) or not told.in_doubt or told.ended_early or told.photographs is not None:
+        return after
+    left_out = LeftOut(_NO_SMALLER)
+    try:
+        files = TwoFiles(trial.of(before.having_learnt(fitted=left_out)), trial.of(after))
+    except DeviceMemoryError:  # where there is no room to compare files, the fit's own judgement has to do
+        return after
+    if files.pays:
+        return after.having_learnt(fitted=dataclasses.replace(told, files=files))
+    return before.having_learnt(fitted=dataclasses.replace(left_out, files=files))
 
 
 class Run:

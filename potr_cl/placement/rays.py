@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.model.camera import Camera
+from potr_cl.model.scene import Scene
 from potr_cl.model.unseen import bounds
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory
 from potr_cl.opencl.structs import struct_dtype
-from potr_cl.placement.space import Space
+from potr_cl.placement.space import NEAR, Space
 
 F64 = NDArray[np.float64]
 
@@ -114,3 +115,40 @@ def _grid(space: Space) -> NDArray[np.void]:
     grid = np.zeros((), struct_dtype(_SOURCE, "Grid"))
     grid["shape"] = space.shape
     return grid
+
+
+#: Pixels that the larger standard deviation of a splat of median size must have, and the views in which it must.
+_PIXELS, _VIEWS = 1.2, 2
+#: Who stands has so many free cells around; and what lies farther than this from there, in cells, is buried.
+_CLEAR, _DEEP = 2, 3
+#: Splats at a time.
+_BLOCK = 1 << 20
+
+
+def unresolved(device: Device, scene: Scene, cameras: Sequence[Camera]) -> NDArray[np.bool_]:
+    """(N,) which splats of a scene no two views have resolved.
+
+    Args:
+        device: finds what is seen.
+        scene: clean, at least one splat.
+        cameras: the views.
+
+    Raises:
+        DeviceError: the device has no room, or failed.
+    """
+    space = Space.of(scene)
+    exposed = space.near_free(_CLEAR, _DEEP)
+    cells = np.concatenate(
+        [space.cell_of(scene.means[first : first + _BLOCK]) for first in range(0, len(scene), _BLOCK)]
+    )
+    beyond = np.flatnonzero(cells < 0)
+    used = np.flatnonzero(np.bincount(cells[cells >= 0], minlength=len(exposed)).astype(bool) & exposed)
+    points = np.concatenate([space.middles(used), scene.means[beyond].astype(np.float64)])
+    own = np.exp(np.clip(scene.log_scales[beyond].max(axis=1).astype(np.float64), -60, 60))
+    sizes = np.concatenate([space.sizes_near(points[: len(used)]), own])
+    seen = resolved_by(device, space, cameras, points, sizes, _PIXELS, NEAR, _VIEWS) >= _VIEWS
+    wanting = np.zeros(len(exposed), bool)
+    wanting[used] = ~seen[: len(used)]
+    found: NDArray[np.bool_] = wanting[np.maximum(cells, 0)] & (cells >= 0)
+    found[beyond] = ~seen[len(used) :]
+    return found

@@ -16,8 +16,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.quality.compare import Comparison, comparing, comparison_of, mean_view
 from potr_cl.quality.figures import ViewFigures
 from potr_cl.quality.judging import Judging, Looks
-from potr_cl.raster.carried import Carried
-from potr_cl.raster.kept_scene import KeptScene
+from potr_cl.raster.resident import Carried, KeptScene
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.workers.pool import Pool
 

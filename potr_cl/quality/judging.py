@@ -26,17 +26,15 @@ from potr_cl.quality.figures import Against, ViewFigures
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.quality.metrics import Lpips, psnr
 from potr_cl.quality.metrics_device import in_batches
-from potr_cl.raster.carried import Carried, HostScene, LentScene
-from potr_cl.raster.kept_scene import KeptScene, lying_on
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.resident import Carried, HostScene, KeptScene, LentScene, lying_on
 from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
 from potr_cl.views.pictures import SeenRasterizer, groups_worth_it, rasterizer_of
 from potr_cl.views.targets import RenderedTargets, Room, TargetPictures
-from potr_cl.workers.dealing import shares
 from potr_cl.workers.helping import Helping
 from potr_cl.workers.parts import Each, Parts
-from potr_cl.workers.pool import Part, Pool
+from potr_cl.workers.pool import Part, Pool, shares
 
 #: Bytes of the uncompressed scene's pictures that are kept from one candidate to the next; others are rendered again.
 CACHED_PICTURES = 1 << 30

@@ -29,11 +29,9 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
-from potr_cl.raster.launcher import launcher_for
-from potr_cl.raster.pictures_in_sets import render_in_sets
-from potr_cl.raster.preparation import Preparation
+from potr_cl.raster.launcher import RasterLauncher
+from potr_cl.raster.preparation import Preparation, Projection, render_in_sets
 from potr_cl.raster.preparing_memory import PreparingMemory
-from potr_cl.raster.projection import Projection
 from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers, uploaded
 from potr_cl.raster.view_set import View, ViewSet
@@ -86,7 +84,7 @@ class Rasterizer(Owner):
                 self._scene, self._owns = scene, False
             else:
                 self._scene, self._owns = uploaded(device, scene), True
-            self._launcher = launcher_for(device, rules)
+            self._launcher = RasterLauncher(device, rules)
             self._projection = Projection(device, self._scene, rules, self._launcher.lanes)
         self._preparation = Preparation(device, self._scene.stride, self._projection, self._launcher, preparing)
         memory = self._preparation.memory

@@ -15,8 +15,8 @@ from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import standpoints
 from potr_cl.stages.compaction.ridge import ColourModel, CompactionOptions, Compactor, Weighting
 from potr_cl.stages.compaction.view_weights import ViewWeights
-from potr_cl.stages.pruning.measured import Measured, measurement
-from potr_cl.stages.pruning.staleness import SweepOptions
+from potr_cl.stages.pruning.helpers import Measured, measurement
+from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.stages.stage import Flag, Importances, Interlude, Stage, State, Workbench, option
 
 

@@ -8,13 +8,11 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from potr_cl.codec.encoder import Coded
     from potr_cl.codec.quantize import HyperParameters
-    from potr_cl.stages.fit import LeftOut
-    from potr_cl.stages.fitting.fit import Fitted
-    from potr_cl.stages.guarded import Unresolved
+    from potr_cl.stages.fitting.fitted import Fitted, LeftOut
+    from potr_cl.stages.held_out import PhotographChoice
     from potr_cl.stages.pruning.schedule import Pruned
-    from potr_cl.stages.pruning.unseen import Unseen
-    from potr_cl.stages.refitting.photographs import PhotographChoice
     from potr_cl.stages.refitting.refit_options import Refitted
+    from potr_cl.stages.unseen import Unresolved, Unseen
     from potr_cl.stages.views_between import Added
     from potr_cl.views.shares import ViewShares
 

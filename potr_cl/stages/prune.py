@@ -11,23 +11,23 @@ from numpy.typing import NDArray
 from potr_cl.errors import UsageError
 from potr_cl.host.threads import in_background, thread_pool
 from potr_cl.model.scene import FloatArray
-from potr_cl.raster.kept_scene import lying_on
+from potr_cl.raster.resident import lying_on
 from potr_cl.raster.scene_buffers import SceneBuffers
-from potr_cl.raster.surely_seen import surely_seen
-from potr_cl.stages.guarded import Unresolved
-from potr_cl.stages.pruning.measured import Measured, measurement
-from potr_cl.stages.pruning.on_device import prune_scene
+from potr_cl.stages.pruning.controller import prune_scene
+from potr_cl.stages.pruning.helpers import Measured, measurement
 from potr_cl.stages.pruning.removal import LARGEST_LIMIT, RemovalSweep
 from potr_cl.stages.pruning.schedule import Course, Pruned, PruningOptions
-from potr_cl.stages.pruning.staleness import SweepOptions
-from potr_cl.stages.pruning.unseen import (
+from potr_cl.stages.pruning.sweep import SweepOptions
+from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
+from potr_cl.stages.unseen import (
     CHOICES,
+    Unresolved,
     Unseen,
     as_of_whole,
     find_unseen,
     without_directions,
 )
-from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
+from potr_cl.views.reached import surely_seen
 from potr_cl.views.shares import ViewShares
 from potr_cl.views.visibility import MOST_SEEN, Visibility, groups_of_large, seen_part, visibility_of_large
 from potr_cl.workers.pool import Pool
@@ -50,9 +50,9 @@ class Prune(Stage):
         iterations, decay, mapping_a: of the schedule (:class:`potr_cl.stages.pruning.schedule.PruningOptions`).
         unseen: "keep" or "drop": what becomes of splats that no training view's picture reaches
             (:mod:`potr_cl.model.unseen`). With ``keep`` or ``count`` they go first in any case. "protect", and "keep"
-            where views were placed: what no view has resolved stays as it is (:mod:`potr_cl.placement.guard`).
+            where views were placed: what no view has resolved stays as it is (:mod:`potr_cl.placement.rays`).
         tolerance, turns, transmittance_threshold: of the measurements
-            (:class:`potr_cl.stages.pruning.staleness.SweepOptions`).
+            (:class:`potr_cl.stages.pruning.sweep.SweepOptions`).
 
     Raises:
         UsageError: a value is out of range.

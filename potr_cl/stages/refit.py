@@ -20,15 +20,15 @@ from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.outputs.output import Rounded
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.guarded import as_important
-from potr_cl.stages.refitting.colour_refit import ColourRefit, HelpFrom
-from potr_cl.stages.refitting.coming_scene import ComingScene
-from potr_cl.stages.refitting.photographs import PhotographChoice, hold_out
-from potr_cl.stages.refitting.placement import placed
+from potr_cl.stages.held_out import PhotographChoice, hold_out
+from potr_cl.stages.refitting.coefficients import placed
+from potr_cl.stages.refitting.colour_refit import ColourRefit
+from potr_cl.stages.refitting.helpers import colour_shares
 from potr_cl.stages.refitting.refit import active_coefficients, chosen_coefficients, refit_colours
-from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
-from potr_cl.stages.refitting.shared_map import colour_shares
+from potr_cl.stages.refitting.refit_options import ComingScene, RefitOptions, Refitted
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
+from potr_cl.stages.unseen import as_important
+from potr_cl.views.shares import HelpFrom
 from potr_cl.views.targets import HostTargets, PhotographTargets, PicturesAhead, Targets, targets_of
 
 #: A scene that takes more than this part of the memory that is given makes room for the re-fit.
@@ -132,7 +132,7 @@ class Refit(Stage):
     def run(self, state: State, bench: Workbench) -> State:
         """Re-fit the colours, and leave a :class:`potr_cl.stages.refitting.refit_options.Refitted` in ``learnt``.
 
-        With photographs, also a :class:`potr_cl.stages.refitting.photographs.PhotographChoice` as "photographs".
+        With photographs, also a :class:`potr_cl.stages.held_out.PhotographChoice` as "photographs".
         """
         bench.progress("refit", 0.0)
         parameters = bench.parameters

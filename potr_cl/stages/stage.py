@@ -27,7 +27,7 @@ from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import Output, Request, Rounded
 from potr_cl.outputs.potr import Potr
-from potr_cl.raster.kept_scene import KeptScene, PartOfKept
+from potr_cl.raster.resident import KeptScene, PartOfKept
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.stages.learnt import Learnt
 from potr_cl.views.shares import ViewShares
@@ -158,7 +158,7 @@ class Workbench:
         return scene if self.kept is None else self.kept.drawable(self.opened, scene)
 
     def placed(self, state: State, some: NDArray[np.int64] | None = None) -> Scene | KeptScene | PartOfKept:
-        """A state's scene, or where devices have it, for :func:`potr_cl.raster.kept_scene.lying_on`.
+        """A state's scene, or where devices have it, for :func:`potr_cl.raster.resident.lying_on`.
 
         Args:
             state: whose scene.

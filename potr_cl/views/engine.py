@@ -25,12 +25,11 @@ from potr_cl.errors import DeviceMemoryError
 from potr_cl.model.camera import Camera
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import MARGIN, Memory, Owner, Reused
-from potr_cl.raster.view_cache import GEOMETRY, ViewCache
 from potr_cl.raster.view_set import ViewSet
-from potr_cl.views.budget import target_bytes
-from potr_cl.views.groups import ViewGroup
+from potr_cl.views.budget import GEOMETRY, ViewCache, target_bytes
 from potr_cl.views.plan import ViewPlan
 from potr_cl.views.subsets import Left, SplatSource, Subset
+from potr_cl.views.visibility import ViewGroup
 
 
 class Work(Protocol):

@@ -16,10 +16,10 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.model.splat_groups import SplatGroups
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner, Reused
-from potr_cl.raster.kept_scene import fits_whole, whole_on_device
 from potr_cl.raster.picked_splats import NO_SPLAT, IndexSubset, IndexSubsets, Picker
 from potr_cl.raster.preparing_memory import PreparingMemory
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.resident import fits_whole, whole_on_device
 from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.raster.scene_buffers import SPLAT_GROUP, Drawable, SceneBuffers, gathered
 from potr_cl.views import visibility

@@ -8,12 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.model.splat_groups import Indices
-from potr_cl.raster.carried import Excerpt
+from potr_cl.raster.resident import Excerpt
 from potr_cl.views.visibility import Visibility
+from potr_cl.workers.pool import Pool, Shares
+
+if TYPE_CHECKING:
+    from potr_cl.raster.resident import KeptScene
+    from potr_cl.views.targets import PicturesAhead
 
 
 @dataclass(frozen=True)
@@ -47,6 +53,11 @@ class ViewShares:
     shares: tuple[ViewShare, ...]
     names: tuple[str, ...] = ()
 
+    @property
+    def dealt(self) -> Shares:
+        """Who does which: the master none."""
+        return Shares([], [share.numbers for share in self.shares], self.names)
+
     @staticmethod
     def of(
         views: Sequence[Camera],
@@ -74,3 +85,17 @@ class ViewShares:
                 splats, of_these = sights.of_views(own)
                 shares.append(ViewShare(own, splats, Excerpt(source, numbers[splats]), of_these))
         return ViewShares(views, tuple(shares), tuple(busy))
+
+
+@dataclass(frozen=True)
+class HelpFrom:
+    """Workers that do some of the views.
+
+    Attributes:
+        pool: the workers.
+        source: the scene whose pictures are the targets, perhaps kept on devices, or with pictures of it there; or who
+            does which views, and has what these see of it.
+    """
+
+    pool: Pool
+    source: Scene | KeptScene | PicturesAhead | ViewShares

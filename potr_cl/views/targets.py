@@ -30,12 +30,11 @@ from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.ferry import Cargo, Ferry
 from potr_cl.opencl.memory import Memory, Owner, Scratch
-from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.picked_splats import IndexSubsets
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.resident import KeptScene
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
-from potr_cl.raster.view_cache import ViewCache
-from potr_cl.views.budget import target_bytes
+from potr_cl.views.budget import ViewCache, target_bytes
 from potr_cl.views.pictures import SeenRasterizer
 from potr_cl.views.visibility import Visibility
 

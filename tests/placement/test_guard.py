@@ -13,13 +13,12 @@ from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.pipeline.run import Run
-from potr_cl.pipeline.stopwatch import Stopwatch
-from potr_cl.placement.guard import unresolved
+from potr_cl.pipeline.run import Run, Stopwatch
+from potr_cl.placement.rays import unresolved
 from potr_cl.placement.virtual import place_cameras
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.code import Code
-from potr_cl.stages.pruning.on_device import prune_scene
+from potr_cl.stages.pruning.controller import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions
 from potr_cl.stages.stage import State

@@ -13,9 +13,9 @@ from potr_cl.codec.quantize import HyperParameters
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.raster import kept_scene, scene_buffers
-from potr_cl.raster.kept_scene import KeptScene, PartOfKept, lying_on
+from potr_cl.raster import resident, scene_buffers
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.resident import KeptScene, PartOfKept, lying_on
 from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.stage import State, Workbench
@@ -95,7 +95,7 @@ def test_an_encode_uploads_its_scene_once_and_makes_the_same_bytes(
     monkeypatch.setattr(scene_buffers.SceneBuffers, "write_sh", counted)
     once = encode(plush_excerpt, plush_excerpt_cameras, OPTIONS, device=device).data
     assert sum(scenes) == 1
-    monkeypatch.setattr(kept_scene, "_PART", 1 << 40)
+    monkeypatch.setattr(resident, "_PART", 1 << 40)
     scenes.clear()
     assert encode(plush_excerpt, plush_excerpt_cameras, OPTIONS, device=device).data == once
     assert sum(scenes) > 1
@@ -172,7 +172,7 @@ def test_without_what_no_view_sees_the_scene_is_still_uploaded_once(
     assert found.unseen is not None
     assert found.unseen.splats > 0
     assert splats == [len(scene)]
-    monkeypatch.setattr(kept_scene, "_PART", 1 << 40)
+    monkeypatch.setattr(resident, "_PART", 1 << 40)
     assert encode(scene, cameras, options, device=device).data == found.data
 
 

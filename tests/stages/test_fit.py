@@ -12,9 +12,10 @@ from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import resized
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.fit import Fit, LeftOut
-from potr_cl.stages.fitting.fit import FitOptions, Fitted, fit_scene, held_out_error
-from potr_cl.stages.fitting.views import batches, share_out
+from potr_cl.stages.fit import Fit
+from potr_cl.stages.fitting.fit import FitOptions, batches, fit_scene, held_out_error
+from potr_cl.stages.fitting.fitted import Fitted, LeftOut
+from potr_cl.stages.held_out import share_out
 from potr_cl.stages.learnt import Learnt
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.stage import State, Workbench

@@ -13,10 +13,10 @@ from potr_cl.model.camera import resized, train_views
 from potr_cl.outputs.ply import Ply
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fit import Fit
+from potr_cl.stages.fitting.adam import Factors, in_form_of_files
 from potr_cl.stages.fitting.fit import FitOptions, fit_scene
-from potr_cl.stages.fitting.parameters import Factors, in_form_of_files
 from potr_cl.stages.fitting.settling import Looking, Settling, settle
-from potr_cl.stages.fitting.views import share_out
+from potr_cl.stages.held_out import share_out
 from potr_cl.stages.refit import Refit
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.views.targets import RenderedTargets

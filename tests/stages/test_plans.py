@@ -15,16 +15,16 @@ from potr_cl.codec.quantize import HyperParameters
 from potr_cl.model import splat_groups
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.raster import kept_scene
+from potr_cl.raster import resident
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers, gathered, uploaded
 from potr_cl.stages import prune
 from potr_cl.stages.pruning import removal
-from potr_cl.stages.pruning.measured import measurement
-from potr_cl.stages.pruning.on_device import prune_scene
+from potr_cl.stages.pruning.controller import prune_scene
+from potr_cl.stages.pruning.helpers import measurement
 from potr_cl.stages.pruning.removal import RemovalSweep, planned_sweep
 from potr_cl.stages.pruning.schedule import PruningOptions
-from potr_cl.stages.pruning.staleness import SweepOptions
+from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.views import budget, visibility
 from potr_cl.views.shares import ViewShares
@@ -64,7 +64,7 @@ def sweep(devices, grouping, options, scene, cameras, elsewhere=False, spared=No
     sights = None if grouping == "whole" else Visibility.of(scene, cameras)
     with ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
         if grouping == "by view":  # as a GPU with memory of its own does
-            patch.setattr(kept_scene, "fits_whole", lambda device, scene: True)
+            patch.setattr(resident, "fits_whole", lambda device, scene: True)
         pool = None
         if len(devices) > 1:
             pool = stack.enter_context((ElsewherePool if elsewhere else HostPool)(devices))

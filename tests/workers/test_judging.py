@@ -21,9 +21,9 @@ from potr_cl.quality.by_photographs import judge_by_photographs
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.quality.judging import JudgingPart
-from potr_cl.raster import kept_scene
-from potr_cl.raster.kept_scene import KeptScene
+from potr_cl.raster import resident
 from potr_cl.raster.rasterizer import Rasterizer, render
+from potr_cl.raster.resident import KeptScene
 from potr_cl.raster.scene_buffers import SceneBuffers, uploaded
 from potr_cl.views import pictures, visibility
 from potr_cl.views.pictures import SeenRasterizer, rasterizer_of
@@ -377,9 +377,9 @@ def test_a_ladder_keeps_the_scene_on_the_devices(plush_excerpt, cameras, tmp_pat
     expected = potr_cl.encode_ladder(plush_excerpt, tmp_path / "alone", "0.2,0.4", cameras, options)
     sent = []
     for how in ("uploaded", "copied"):  # to the first device, and from there to the other one
-        bring = getattr(kept_scene, how)
+        bring = getattr(resident, how)
         monkeypatch.setattr(
-            kept_scene, how, lambda device, scene, bring=bring: sent.append(device) or bring(device, scene)
+            resident, how, lambda device, scene, bring=bring: sent.append(device) or bring(device, scene)
         )
     devices = [open_device("cpu") for _ in range(2)]
     found = potr_cl.encode_ladder(plush_excerpt, tmp_path / "together", "0.2,0.4", cameras, options, device=devices)

@@ -14,7 +14,7 @@ from potr_cl.model.camera import Camera
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.removal import RemovalSweep
-from potr_cl.stages.pruning.staleness import SweepOptions
+from potr_cl.stages.pruning.sweep import SweepOptions
 from tests.reference import raster as reference
 from tools.stress.cases import Case
 from tools.stress.derivatives import check_derivatives, tellable

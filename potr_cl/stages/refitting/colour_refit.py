@@ -8,60 +8,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera
-from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
-from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.raster.scene_buffers import stride_of
 from potr_cl.stages.refitting.blocks import SplatBlocks
-from potr_cl.stages.refitting.coefficients import Coefficients
+from potr_cl.stages.refitting.coefficients import Coefficients, Place, placed
 from potr_cl.stages.refitting.colour_map import ColourMap
-from potr_cl.stages.refitting.coming_scene import AnyScene, ComingScene, arrived, colourless
-from potr_cl.stages.refitting.layout import Layout
+from potr_cl.stages.refitting.helpers import ColourHelpers, colour_parts, colour_shares
 from potr_cl.stages.refitting.own_views import OwnViews
-from potr_cl.stages.refitting.placement import Place, placed
-from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
-from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts, colour_shares
+from potr_cl.stages.refitting.refit_options import AnyScene, ComingScene, RefitOptions, Refitted, arrived, colourless
+from potr_cl.stages.refitting.sliced_arrays import Layout
 from potr_cl.stages.refitting.solver import ColourSolver, Solved
-from potr_cl.stages.refitting.view_kernels import Sweep
+from potr_cl.stages.refitting.view_kernels import RefitSweep
 from potr_cl.views.reached import Reach, reached_splats
-from potr_cl.views.shares import ViewShares
-from potr_cl.views.targets import PicturesAhead, Targets
-from potr_cl.workers.dealing import Shares
-from potr_cl.workers.pool import Pool
-
-
-@dataclass(frozen=True)
-class HelpFrom:
-    """Workers that do some of the views of a re-fit.
-
-    Attributes:
-        pool: the workers.
-        source: the scene whose pictures are the targets, perhaps kept on devices, or with pictures of it there; or who
-            does which views, and has what these see of it.
-    """
-
-    pool: Pool
-    source: Scene | KeptScene | PicturesAhead | ViewShares
-
-    def shares(self, views: int) -> Shares:
-        """Who does which of so many views.
-
-        Raises:
-            WorkerLost: no worker is left.
-        """
-        if isinstance(self.source, ViewShares):
-            return Shares([], [share.numbers for share in self.source.shares], self.source.names)
-        return colour_shares(self.pool, views)
+from potr_cl.views.shares import HelpFrom, ViewShares
+from potr_cl.views.targets import Targets
 
 
 class ColourRefit(Owner):
@@ -104,12 +74,15 @@ class ColourRefit(Owner):
         with ExitStack() as owned:
             own: Sequence[int] = range(len(cameras))
             others = None
-            if help_from is not None and (share := help_from.shares(len(cameras))).others:
-                own, pool = share.own, help_from.pool
-                others = owned.enter_context(
-                    colour_parts(pool, share, scene, rules, background, help_from.source, cameras, memory)
-                )
-            sweep = Sweep(device, rules)
+            if help_from is not None:
+                pool, source = help_from.pool, help_from.source
+                share = source.dealt if isinstance(source, ViewShares) else colour_shares(pool, len(cameras))
+                if share.others:
+                    own = share.own
+                    others = owned.enter_context(
+                        colour_parts(pool, share, scene, rules, background, source, cameras, memory)
+                    )
+            sweep = RefitSweep(device, rules)
             layout = Layout(len(scene), stride_of(len(scene)), scene.sh.shape[1], sweep.lanes)
             # The vectors come first: prepared views can do with less memory, and only take longer then.
             size = layout.splats, layout.sh_count
@@ -134,7 +107,7 @@ class ColourRefit(Owner):
                 self._written = scene.sh
             helpers = None
             if others is not None:
-                helpers = owned.enter_context(SharedViews(self.coefficients, others, pool.in_process))
+                helpers = owned.enter_context(ColourHelpers(self.coefficients, others, pool.in_process))
             rasterizer, reach = looked or looked_at(place.views)
             views = owned.enter_context(
                 OwnViews(sweep, rasterizer, self.coefficients, cameras, background, place.views, own, reach)

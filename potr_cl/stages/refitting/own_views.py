@@ -18,13 +18,12 @@ from potr_cl.model.camera import Camera
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.view_cache import ViewCache
 from potr_cl.raster.view_set import TABLE_ENTRY, ViewSet
-from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
+from potr_cl.stages.compaction.view_weights import pixel_weight
 from potr_cl.stages.refitting.coefficients import Coefficients, Vector
-from potr_cl.stages.refitting.view_kernels import Picks, Sweep, SweptSums, ViewKernels, gathered_scale
+from potr_cl.stages.refitting.view_kernels import Picks, RefitSweep, SweptSums, ViewKernels, gathered_scale
 from potr_cl.views import plan as plans
-from potr_cl.views.budget import free_memory, target_bytes, tiles_of
+from potr_cl.views.budget import ViewCache, free_memory, target_bytes, tiles_of
 from potr_cl.views.engine import Launch, Ready, ViewEngine
 from potr_cl.views.reached import Reach
 from potr_cl.views.subsets import ListedSplats, Subset, WholeScene
@@ -139,7 +138,7 @@ class OwnViews(Owner):
 
     def __init__(
         self,
-        sweep: Sweep,
+        sweep: RefitSweep,
         rasterizer: Rasterizer,
         coefficients: Coefficients,
         cameras: Sequence[Camera],
@@ -151,7 +150,7 @@ class OwnViews(Owner):
         self._device = device = coefficients.device
         layout = coefficients.layout
         self._coefficients, self._background, self._sweep = coefficients, background, sweep
-        weights = [_weight(camera) for camera in cameras]
+        weights = [pixel_weight(camera) for camera in cameras]
         self.one = gathered_scale(cameras, weights)
         self._fixed_points = sweep.fixed_point_scales(cameras)
         self.count = len(cameras)
@@ -324,8 +323,3 @@ def _part(buffer: cl.Buffer, number: int, parts: int) -> cl.Buffer:
     """One of some equal parts of a buffer."""
     nbytes = buffer.size // parts
     return buffer if parts == 1 else buffer.get_sub_region(number * nbytes, nbytes)
-
-
-def _weight(camera: Camera) -> float:
-    """What a pixel of a view counts."""
-    return REFERENCE_PIXELS / (camera.width * camera.height)

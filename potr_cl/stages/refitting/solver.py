@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.coefficients import Coefficients, Vector
 from potr_cl.stages.refitting.colour_map import ColourMap
-from potr_cl.stages.refitting.layout import Ridge
 from potr_cl.stages.refitting.refit_options import Descent, Selection
+from potr_cl.stages.refitting.sliced_arrays import Ridge
 from potr_cl.views.targets import Targets
 
 #: Steps end where the residual's square, as the preconditioner measures it, has shrunk by this: single precision has no

@@ -16,7 +16,7 @@ from potr_cl.model.order import ascending
 from potr_cl.opencl.kernel import Kernel
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.opencl.structs import bytes_before, struct_dtype
-from potr_cl.raster.macros import totals_limits
+from potr_cl.raster.sweep import totals_limits
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import Course, Indices, Iteration, Pruned, PruningOptions, prune
 

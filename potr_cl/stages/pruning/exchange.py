@@ -37,7 +37,7 @@ class AlivePacking(Owner):
     Args:
         device: that has the totals.
         splats: N.
-        states: (N,) uint8 in its memory, :class:`potr_cl.stages.pruning.survivors.SplatState`.
+        states: (N,) uint8 in its memory, :class:`potr_cl.stages.pruning.buffers.SplatState`.
 
     Raises:
         DeviceError: the device has no room.
@@ -100,7 +100,7 @@ class ChangedTotals(Owner):
     Args:
         device: that has the totals.
         splats: N.
-        states: (N,) uint8 in its memory, :class:`potr_cl.stages.pruning.survivors.SplatState`. Nobody asks for the
+        states: (N,) uint8 in its memory, :class:`potr_cl.stages.pruning.buffers.SplatState`. Nobody asks for the
             totals of splats that are not alive.
 
     Raises:

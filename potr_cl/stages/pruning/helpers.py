@@ -1,18 +1,11 @@
-"""Removal effects whose views are measured by several: :class:`RemovalPart` does some of them on a worker, and
-:class:`OtherViews` takes to the master's device what they find.
-
-All totals are integers, in units that follow from all views (:class:`potr_cl.stages.pruning.fixed_point.FixedPoint`).
-So it makes no difference to any bit who measures which view. The master's device adds up: what other devices of this
-process lend, or what has changed elsewhere since it was last told (:mod:`~potr_cl.stages.pruning.travelling_totals`).
-What is decided is decided in one place, from the sums: by :mod:`potr_cl.stages.pruning.schedule`, or on the master's
-device by :mod:`potr_cl.stages.pruning.on_device`.
-"""
+"""Removal effects measured by several."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -23,15 +16,19 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner, Scratch
 from potr_cl.opencl.relay import Lent, Relay
-from potr_cl.raster.carried import Excerpt
-from potr_cl.raster.kept_scene import KeptScene, PartOfKept, lying_on, whole_on_device
-from potr_cl.stages.pruning.removal import F64, Indices, add_totals, planned_sweep
-from potr_cl.stages.pruning.staleness import SweepOptions
-from potr_cl.stages.pruning.survivors import Bits
-from potr_cl.stages.pruning.travelling_totals import AddedChanges, AlivePacking, ChangedTotals, Changes
+from potr_cl.raster.resident import Excerpt, KeptScene, PartOfKept, lying_on, whole_on_device
+from potr_cl.raster.scene_buffers import SceneBuffers
+from potr_cl.stages.pruning.buffers import Bits
+from potr_cl.stages.pruning.exchange import AddedChanges, AlivePacking, ChangedTotals, Changes
+from potr_cl.stages.pruning.removal import F64, Indices, RemovalSweep, add_totals, planned_sweep
+from potr_cl.stages.pruning.sweep import SweepOptions
+from potr_cl.stages.stage import State, Workbench
+from potr_cl.views.plan import none
+from potr_cl.views.shares import ViewShares
+from potr_cl.views.subsets import NoSplats
 from potr_cl.views.visibility import Visibility
 from potr_cl.workers.parts import Each, Parts, Pending
-from potr_cl.workers.pool import Part, Pool
+from potr_cl.workers.pool import Part, Pool, shares
 
 
 class RemovalPart(Part):
@@ -83,7 +80,7 @@ class RemovalPart(Part):
     def changes(self) -> Changes:
         """By how much the totals of the splats that are left have changed since the last call; all, at the first.
 
-        See :mod:`potr_cl.stages.pruning.travelling_totals`; valid until the next call.
+        See :mod:`potr_cl.stages.pruning.exchange`; valid until the next call.
         """
         sweep = self._sweep
         if self._changed is None:
@@ -143,7 +140,7 @@ class RemovalPart(Part):
         self._owned.close()
 
 
-class OtherViews(Owner):
+class RemovalHelpers(Owner):
     """What others measure, for the :class:`potr_cl.stages.pruning.removal.RemovalSweep` of the master's device.
 
     Args:
@@ -249,3 +246,93 @@ class OtherViews(Owner):
     def close(self) -> None:
         """Give the master's device memory back; the parts are the caller's."""
         self._owned.close()
+
+
+@contextmanager
+def measurement(
+    state: State,
+    bench: Workbench,
+    options: SweepOptions,
+    sights: Visibility | None = None,
+    spared: NDArray[np.bool_] | None = None,
+    dealt: ViewShares | None = None,
+    seen: NDArray[np.int64] | None = None,
+) -> Iterator[RemovalSweep]:
+    """A removal sweep over the views of a state, its splats numbered as in the state's scene.
+
+    Args:
+        state, bench, options: of the stage.
+        sights: what the views see, where each had better be looked at with what it sees.
+        spared: as of :class:`~potr_cl.stages.pruning.removal.RemovalSweep`; only with ``sights``.
+        dealt: the views, for a pool whose workers get what these see and no more of the scene.
+        seen: (n,) numbers of the splats that the sweep is to have, ascending, which it numbers from 0 on; None: all.
+
+    Raises:
+        DeviceError: the scene or a view does not fit the device.
+    """
+
+    def progress(done: int, count: int) -> None:
+        bench.progress("prepare views", done / count)
+
+    device, pool, views = bench.opened, bench.pool, state.views
+    splats = len(state.scene) if seen is None else len(seen)
+    share = None if pool is None else shares(pool, len(views))
+    with ExitStack() as stack:
+        if pool is None or share is None or not share.others:
+            scene = None
+            if sights is not None:
+                scene = state.scene if seen is None else state.scene.subset(seen)
+                drawable = stack.enter_context(whole_on_device(device, bench.drawable(scene)))
+            else:
+                drawable = stack.enter_context(lying_on(device, bench.placed(state, seen)))
+            given_all = (device, drawable, views, options, bench.background, sights, None, progress, scene, spared)
+            yield stack.enter_context(planned_sweep(*given_all))
+            return
+        given: list[tuple[Any, ...]] = []
+        if dealt is not None:
+            share = dealt.dealt
+            for part in dealt.shares:
+                excerpt = stack.enter_context(pool.shared(part.excerpt))
+                given.append((excerpt, views, options, bench.background, part.numbers, part.sights))
+        else:
+            sent = stack.enter_context(bench.shared(pool, state, seen))
+            sights = sights if pool.in_process else None
+            given = [(sent, views, options, bench.background, numbers, sights) for numbers in share.others]
+        parts = stack.enter_context(Parts(pool, RemovalPart, given, options.memory, share.names))
+        numbers = None if dealt is None else [each.splats for each in dealt.shares]
+        helpers = stack.enter_context(RemovalHelpers(device, splats, parts, pool, numbers))
+        if share.own:
+            drawable = stack.enter_context(lying_on(device, bench.placed(state, seen)))
+            # Only what lies on the device already is looked at in parts.
+            own_sights = sights if isinstance(drawable, SceneBuffers) else None
+            own = (device, drawable, views, options, bench.background, own_sights, share.own, progress)
+            sweep = stack.enter_context(planned_sweep(*own, helpers=helpers))
+        else:
+            source = NoSplats(device, splats)
+            sweep = stack.enter_context(RemovalSweep(source, views, options, plan=none(), helpers=helpers))
+        parts.ready()
+        yield sweep
+
+
+class Measured:
+    """What a sweep measured of the splats that are left.
+
+    Args:
+        removal: the sweep, which has measured.
+        left: (n,) the sweep's numbers of the splats that are left, ascending.
+    """
+
+    def __init__(self, removal: RemovalSweep, left: NDArray[np.int64]) -> None:
+        self._removal = removal
+        self._places = np.full(removal.splats, -1, np.int64)
+        self._places[left] = np.arange(len(left))
+
+    def view_importances(self) -> Iterator[tuple[int, NDArray[np.int64], NDArray[np.float64]]]:
+        """I_k(s) of the splats that are left, view by view.
+
+        Yields:
+            The number of the view, the numbers among those left of the splats that it sees, ascending, and the mean of
+            T α of each over the view's pixels.
+        """
+        for view, seen, importances in self._removal.view_importances():
+            yield view, self._places[seen], importances

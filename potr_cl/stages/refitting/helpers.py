@@ -1,5 +1,5 @@
 """Products of a re-fit whose views are done by several: :class:`ColourPart` does some of them on a worker, and
-:class:`SharedViews` adds what the others find.
+:class:`ColourHelpers` adds what the others find.
 """
 
 from __future__ import annotations
@@ -20,24 +20,22 @@ from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.opencl.narrow import Narrowed
 from potr_cl.opencl.relay import Lent
-from potr_cl.raster.carried import Excerpt
-from potr_cl.raster.kept_scene import KeptScene, lying_on, whole_on_device
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.resident import Excerpt, KeptScene, lying_on, whole_on_device
 from potr_cl.raster.rules import RasterRules
 from potr_cl.raster.scene_buffers import stride_of
 from potr_cl.stages.refitting.coefficients import Coefficients
-from potr_cl.stages.refitting.coming_scene import AnyScene, arrived, colourless
 from potr_cl.stages.refitting.exchange import DrawnRows, Exchange, SentVector
-from potr_cl.stages.refitting.layout import Layout
 from potr_cl.stages.refitting.own_views import Look, OwnViews, parts_of
-from potr_cl.stages.refitting.view_kernels import Sweep
+from potr_cl.stages.refitting.refit_options import AnyScene, arrived, colourless
+from potr_cl.stages.refitting.sliced_arrays import Layout
+from potr_cl.stages.refitting.view_kernels import RefitSweep
 from potr_cl.views.reached import reached_splats
 from potr_cl.views.shares import ViewShares
 from potr_cl.views.targets import PicturesAhead, Targets, targets_of
 from potr_cl.views.visibility import Visibility
-from potr_cl.workers.dealing import Shares, shares
 from potr_cl.workers.parts import Each, Parts, Pending
-from potr_cl.workers.pool import Part, Pool, Shared
+from potr_cl.workers.pool import Part, Pool, Shared, Shares, shares
 
 
 @dataclass(frozen=True)
@@ -101,7 +99,7 @@ class ColourPart(Part):
     ) -> None:
         self._device = device
         with ExitStack() as owned:
-            sweep = Sweep(device, rules)
+            sweep = RefitSweep(device, rules)
             layout = Layout(len(scene), stride_of(len(scene)), sh_count, sweep.lanes)
             self._coefficients = owned.enter_context(Coefficients(device, layout))
             self._exchange = owned.enter_context(Exchange(self._coefficients))
@@ -236,12 +234,12 @@ _AT_ONCE = 1 << 26
 _OWN_SPEED = 1.06
 
 
-class SharedViews(Owner):
-    """A :class:`potr_cl.stages.refitting.colour_map.Helpers`.
+class ColourHelpers(Owner):
+    """What others add to the products of a :class:`potr_cl.stages.refitting.colour_map.ColourMap`.
 
     Args:
         coefficients: the master's, whose vectors are sent.
-        others: parts, each a :class:`potr_cl.stages.refitting.shared_map.ColourPart`.
+        others: parts, each a :class:`ColourPart`.
         in_process: whether they are threads of this process, which read what lies on the master's device themselves.
 
     Raises:
@@ -338,7 +336,7 @@ class SharedViews(Owner):
 
 
 def colour_shares(pool: Pool, views: int) -> Shares:
-    """Who does which of a re-fit's views; raises what :func:`potr_cl.workers.dealing.shares` does."""
+    """Who does which of a re-fit's views; raises what :func:`potr_cl.workers.pool.shares` does."""
     return shares(pool, views, parts_of(views), _OWN_SPEED)
 
 
