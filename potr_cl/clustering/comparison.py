@@ -164,13 +164,10 @@ class Points(Owner):
         self._launcher = launcher_for(device, self._width)
         self._sums = device.shared_kernel("clustering/sums.cl", "sums", WIDTH=self._width)
         self._memory = Memory(device)
-        try:
+        with device.all_or_nothing():
             self._rows = self._memory.upload(rows, "vectors to be clustered")
             self._labels = self._memory.allocate(4 * self._count, "the clusters of vectors")
             self._scores = self._memory.allocate(4 * self._count, "the distances of vectors")
-        except BaseException:
-            self.close()
-            raise
 
     def nearest(
         self,
@@ -219,10 +216,6 @@ class Points(Owner):
             ).launch((count * self._width // QUARTER,))
             sums: FloatArray = self._device.download(result, (count, self._width), np.float32)
         return sums
-
-    def close(self) -> None:
-        """Give the device's memory back."""
-        self._memory.close()
 
 
 def _blocks(count: int, cell_of: U32 | None, cells: int, size: int) -> tuple[U32, U32]:

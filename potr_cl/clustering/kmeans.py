@@ -15,7 +15,6 @@ All choices are made in a fixed order: a device gives the same bits on every run
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,6 +32,7 @@ from potr_cl.clustering.comparison import (
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Owner
 
 _F64 = NDArray[np.float64]
 
@@ -77,13 +77,7 @@ class Clusters:
 
 
 def cluster(
-    device: Device,
-    points: FloatArray,
-    weights: FloatArray,
-    entries: int,
-    rate: Rate | None = None,
-    steps: int = STEPS,
-    progress: Callable[[float], None] = lambda done: None,
+    device: Device, points: FloatArray, weights: FloatArray, entries: int, rate: Rate | None = None
 ) -> Clusters:
     """Find centres from which the points are little away, by the weighted sum of their squared distances.
 
@@ -94,23 +88,14 @@ def cluster(
         weights: (N, G) float32, 0 or more.
         entries: K, the most centres there may be, 1 or more.
         rate: what entries and labels take; None: nothing.
-        steps: of Lloyd's algorithm.
-        progress: called with the part of the work that is done.
 
     Raises:
         DeviceError: the device failed, or has too little memory.
     """
-    progress(0.0)
-    finder = _Finder(device, points, weights, entries, rate)
-    try:
-        for step in range(steps):
-            finder.improve(refill=rate is None and step < steps - 1)
-            progress((step + 1) / (steps + 1))
-        clusters = finder.clusters()
-    finally:
-        finder.close()
-    progress(1.0)
-    return clusters
+    with _Finder(device, points, weights, entries, rate) as finder:
+        for step in range(STEPS):
+            finder.improve(refill=rate is None and step < STEPS - 1)
+        return finder.clusters()
 
 
 def assigned(
@@ -173,7 +158,7 @@ class _Homed:
         return self.numbers[labels].astype(np.uint32), scores
 
 
-class _Finder:
+class _Finder(Owner):
     """Centres of some points, step by step."""
 
     def __init__(
@@ -188,8 +173,8 @@ class _Finder:
         self._taken, self._constants = taken, errors_at_zero(taken, mass)
         count = min(entries, len(taken))
         cells = _cells(device, taken, mass, count)
-        self._at = Points(device, rows_of_points(taken, mass))
-        try:
+        with device.all_or_nothing():
+            self._at = Points(device, rows_of_points(taken, mass))
             cell_of, scores = self._at.nearest(cells)
             errors = np.maximum(self._constants + scores, 0)
             errors += errors.mean() * 1e-3 or 1.0  # where all points are alike, too
@@ -201,9 +186,6 @@ class _Finder:
                 self._held = 0
                 self._centres[0] = 0
             self._bits = None if rate is None else np.full(count, math.log2(count), np.float32)
-        except BaseException:
-            self.close()
-            raise
 
     def improve(self, refill: bool) -> None:
         """One step: each point to its best centre, each centre to the mean of its points.
@@ -240,7 +222,6 @@ class _Finder:
         return Clusters(self._centres, _in_parts(self._device, self._points, self._weights, homed))
 
     def close(self) -> None:
-        """Give the device's memory back."""
         self._at.close()
 
 

@@ -78,9 +78,6 @@ class StagedBundles(Owner):
             groups = -(-max(splats, items) // SPLAT_GROUP)
             self._spread.launch((groups * SPLAT_GROUP,), (SPLAT_GROUP,))
 
-    def close(self) -> None:
-        self._memory.close()
-
 
 @contextmanager
 def pinned_rooms(device: Device, number: int) -> Iterator[list[PackedValues]]:
@@ -180,11 +177,7 @@ class DeviceBundles(BundleTaker):
 
 
 def decode_to_device(
-    file: PotrFile,
-    device: Device,
-    sh_degree: int | None = None,
-    antialiased: bool | None = None,
-    threads: int = 0,
+    file: PotrFile, device: Device, sh_degree: int | None = None, antialiased: bool | None = None, threads: int = 0
 ) -> SceneBuffers:
     """Decode a file into a device's memory: the same bits there as of its scene that was decoded and uploaded.
 
@@ -209,24 +202,18 @@ def decode_to_device(
     count = most_coefficients(head.sh_degree, sh_degree)
 
     def decoded(number: int) -> SceneBuffers:
-        buffers = SceneBuffers(device, file.blocks[number].splats, count, asked, low_pass)
-        try:
+        with device.all_or_nothing():
+            buffers = SceneBuffers(device, file.blocks[number].splats, count, asked, low_pass)
             file.of(number, lambda body: _decode(body, buffers, threads, sh_degree), sh_degree)
-        except BaseException:
-            buffers.close()
-            raise
         return buffers
 
     if len(numbers) == 1:
         return decoded(numbers[0])
-    whole = SceneBuffers(device, file.header.splats, count, asked, low_pass)
-    try:
+    with device.all_or_nothing():
+        whole = SceneBuffers(device, file.header.splats, count, asked, low_pass)
         for number in numbers:
             with decoded(number) as part:
                 whole.write_part(part, file.blocks[number].first)
-    except BaseException:
-        whole.close()
-        raise
     return whole
 
 

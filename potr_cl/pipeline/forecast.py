@@ -67,11 +67,7 @@ def log_forecast(
 
 
 def memory_needed(
-    scene: Scene,
-    cameras: Sequence[Camera],
-    options: EncodeOptions,
-    device: Device,
-    kept: KeptScene | None = None,
+    scene: Scene, cameras: Sequence[Camera], options: EncodeOptions, device: Device, kept: KeptScene | None = None
 ) -> float:
     """Bytes at the peak: the whole process's on a CPU, the device's on a GPU; roughly.
 

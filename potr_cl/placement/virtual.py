@@ -90,11 +90,7 @@ _OTHERS = 1 << 16
 
 
 def place_cameras(
-    scene: Scene,
-    count: int | None = None,
-    size: int | None = None,
-    field: float = FIELD,
-    device: Device | None = None,
+    scene: Scene, count: int | None = None, size: int | None = None, field: float = FIELD, device: Device | None = None
 ) -> list[Camera]:
     """Views that cover what someone would look at, and others to judge by.
 

@@ -111,13 +111,7 @@ class RasterLauncher:
         """
         of_views, stride, lists = self._of(views), self._stride(views), self._lists(views)
         self._fill.bind(
-            **of_views,
-            **stride,
-            bounds=bounds,
-            shapes=views.shapes,
-            counts=counts,
-            keys=keys,
-            capacity=views.capacity,
+            **of_views, **stride, bounds=bounds, shapes=views.shapes, counts=counts, keys=keys, capacity=views.capacity
         )
         self._over_splats(self._fill, views)
         of_sort = {}

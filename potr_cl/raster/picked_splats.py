@@ -105,9 +105,6 @@ class Picker(Owner):
                 self.device.queue.finish()
         return numbers, picks.counts[0]
 
-    def close(self) -> None:
-        self._memory.close()
-
 
 class IndexSubsets:
     """The numbers of the splats of several choices of groups, which are found without waiting for the device.
@@ -126,12 +123,7 @@ class IndexSubsets:
     """
 
     def __init__(
-        self,
-        memory: Memory,
-        picker: Picker,
-        wanted: NDArray[np.bool_],
-        states: cl.Buffer | None = None,
-        state: int = 0,
+        self, memory: Memory, picker: Picker, wanted: NDArray[np.bool_], states: cl.Buffer | None = None, state: int = 0
     ) -> None:
         choices, groups = wanted.shape
         chunks = max(-(-picker.splats // _CHUNK), 1)

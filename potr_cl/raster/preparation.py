@@ -16,7 +16,7 @@ from potr_cl.raster.launcher import RasterLauncher
 from potr_cl.raster.preparing_memory import PreparingMemory
 from potr_cl.raster.rules import LEAST_COMPENSATION, RasterRules
 from potr_cl.raster.scene_buffers import SPLAT_GROUP, SceneBuffers
-from potr_cl.raster.view_set import View, ViewSet
+from potr_cl.raster.view_set import ViewSet
 
 
 class Projection(Owner):
@@ -39,7 +39,7 @@ class Projection(Owner):
     def __init__(self, device: Device, scene: SceneBuffers, rules: RasterRules, lanes: int) -> None:
         self._scene, self._lanes = scene, lanes
         self._replaced: cl.Buffer | None = None  # other SH coefficients than the scene's
-        self._other_sh = Memory(device)
+        self._memory = Memory(device)
         self.filter_macros = _filter_macros(scene)
         self._kernel = device.shared_kernel(
             "raster/project.cl",
@@ -91,11 +91,8 @@ class Projection(Owner):
             The buffer of the former coefficients, which is the caller's to free; None if they are the scene's own.
         """
         former = self._replaced
-        self._replaced = self._scene.other_sh(self._other_sh, sh)
-        return None if former is None else self._other_sh.release(former)
-
-    def close(self) -> None:
-        self._other_sh.close()
+        self._replaced = self._scene.other_sh(self._memory, sh)
+        return None if former is None else self._memory.release(former)
 
 
 def _filter_macros(scene: SceneBuffers) -> dict[str, float]:
@@ -240,6 +237,52 @@ class Preparation(Owner):
         if not self.shares:
             self.memory.rest()
 
+    def in_sets(self, composite: Callable[[ViewSet], None], cameras: Sequence[Camera], most: int) -> None:
+        """Prepare and composite views, in sets of about one size: drivers take long to give memory and to take it back.
+
+        Args:
+            composite: enqueues the pictures of a set, and what becomes of them.
+            cameras: of the views.
+            most: how many a set has at most; fewer, where the device has no room.
+
+        Raises:
+            DeviceMemoryError: a view alone does not fit the device.
+        """
+        number = 0
+        views: ViewSet | None = None
+        try:
+            while number < len(cameras):
+                left = len(cameras) - number
+                sets = -(-left // most)
+                some = cameras[number : number - (-left // sets)]
+                try:
+                    former, views = views, None
+                    views = self._instead_of(former, some)
+                except DeviceMemoryError:
+                    if most == 1:
+                        raise
+                    most = max(len(some) // 2, 1)
+                    continue
+                composite(views)
+                number += len(some)
+        finally:
+            if views is not None:
+                views.close()
+                self.close()
+
+    def _instead_of(self, former: ViewSet | None, cameras: Sequence[Camera]) -> ViewSet:
+        """Prepared views, in the memory of others that nobody needs any more, if they fit in there."""
+        if former is not None:
+            fits = False
+            try:
+                fits = len(former.views) == len(cameras) and self.prepare_again(former, cameras)
+            finally:
+                if not fits:
+                    former.close()
+            if fits:
+                return former
+        return self.prepare_set(cameras)
+
     def close(self) -> None:
         """Give the memory back, unless it is the caller's."""
         if not self.shares:
@@ -249,72 +292,10 @@ class Preparation(Owner):
 def _accepted(views: ViewSet, found: list[int]) -> list[int]:
     """Note in the views how many intersections the device has found, and return that."""
     for view, count in zip(views.views, found, strict=True):
-        _accept(view, count)
+        if count == 0xFFFFFFFF:
+            raise DeviceError(
+                f"view '{view.camera.name}' needs more than 2^32 tile intersections: "
+                "too many huge splats for this image size"
+            )
+        view.intersection_count = count
     return found
-
-
-def _accept(view: View, count: int) -> None:
-    if count == 0xFFFFFFFF:
-        raise DeviceError(
-            f"view '{view.camera.name}' needs more than 2^32 tile intersections: "
-            "too many huge splats for this image size"
-        )
-    view.intersection_count = count
-
-
-def render_in_sets(
-    preparation: Preparation,
-    composite: Callable[[ViewSet], None],
-    cameras: Sequence[Camera],
-    most: int,
-    memory: Memory | None,
-) -> None:
-    """Prepare and composite views, in sets of about one size: drivers take long to give memory and to take it back.
-
-    Args:
-        preparation: of the scene.
-        composite: enqueues the pictures of a set, and what becomes of them.
-        cameras: of the views.
-        most: how many a set has at most; fewer, where the device has no room.
-        memory: to prepare views in; None: of their own.
-
-    Raises:
-        DeviceMemoryError: a view alone does not fit the device.
-    """
-    number = 0
-    views: ViewSet | None = None
-    try:
-        while number < len(cameras):
-            left = len(cameras) - number
-            sets = -(-left // most)
-            some = cameras[number : number - (-left // sets)]
-            try:
-                former, views = views, None
-                views = _prepared_instead(preparation, former, some, memory)
-            except DeviceMemoryError:
-                if most == 1:
-                    raise
-                most = max(len(some) // 2, 1)
-                continue
-            composite(views)
-            number += len(some)
-    finally:
-        if views is not None:
-            views.close()
-            preparation.close()
-
-
-def _prepared_instead(
-    preparation: Preparation, former: ViewSet | None, cameras: Sequence[Camera], memory: Memory | None
-) -> ViewSet:
-    """Prepared views, in the memory of others that nobody needs any more, if they fit in there."""
-    if former is not None:
-        fits = False
-        try:
-            fits = len(former.views) == len(cameras) and preparation.prepare_again(former, cameras)
-        finally:
-            if not fits:
-                former.close()
-        if fits:
-            return former
-    return preparation.prepare_set(cameras, memory)

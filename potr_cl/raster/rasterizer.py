@@ -30,7 +30,7 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.launcher import RasterLauncher
-from potr_cl.raster.preparation import Preparation, Projection, render_in_sets
+from potr_cl.raster.preparation import Preparation, Projection
 from potr_cl.raster.preparing_memory import PreparingMemory
 from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers, uploaded
@@ -149,16 +149,13 @@ class Rasterizer(Owner):
                     return self._image.buffer, self._transmittance.buffer
                 views.make_room([count + count // 4])
 
-    def render_into(
-        self, cameras: Sequence[Camera], target: cl.Buffer, start: int = 0, memory: Memory | None = None
-    ) -> None:
+    def render_into(self, cameras: Sequence[Camera], target: cl.Buffer, start: int = 0) -> None:
         """Render views one behind the other into a buffer; on a GPU, several at a time.
 
         Args:
             cameras: of the views.
             target: takes (pixels, 3) float32.
             start: byte where they begin.
-            memory: on a GPU, to prepare views in, as of :meth:`prepare_set`.
         """
         device = self.device
 
@@ -174,7 +171,7 @@ class Rasterizer(Owner):
         if self._launcher.whole_sets:
             room = (device.info.memory - device.allocated) // 512
             most = int(max(min(room, _PROJECTED) // self.stride, 1))
-            render_in_sets(self._preparation, composited, cameras, most, memory)
+            self._preparation.in_sets(composited, cameras, most)
             return
         for camera in cameras:
             image, _ = self.render_device(camera)

@@ -141,7 +141,7 @@ class KeptScene(Owner):
     """
 
     def __init__(self, device: Device, scene: Scene, memory: int | None = None, others: Sequence[Device] = ()) -> None:
-        self._device, self._scene, self._memory = device, scene, memory
+        self._device, self._scene, self._budget = device, scene, memory
         self._buffers: SceneBuffers | None = None
         self._buffers = self._placed(device)
         self._elsewhere: dict[Device, Future[SceneBuffers | None]] = {}
@@ -151,7 +151,7 @@ class KeptScene(Owner):
             self.bring_to(other)
 
     def _placed(self, device: Device) -> SceneBuffers | None:
-        if _PART * self._scene.nbytes <= _allowed(device, self._memory):
+        if _PART * self._scene.nbytes <= _allowed(device, self._budget):
             with suppress(DeviceMemoryError):
                 # To make a scene ready on the host takes many times as long as to copy it from device to device.
                 return uploaded(device, self._scene) if self._buffers is None else copied(device, self._buffers)
@@ -159,7 +159,7 @@ class KeptScene(Owner):
 
     def is_large_for(self, device: Device, scene: Scene | None = None) -> bool:
         """Whether the scene, or another one, had better not lie whole on a device even for a while."""
-        return large_for(device, (self._scene if scene is None else scene).nbytes, self._memory)
+        return large_for(device, (self._scene if scene is None else scene).nbytes, self._budget)
 
     @property
     def scene(self) -> Scene:

@@ -180,9 +180,6 @@ class ViewSet(Owner):
         self._geometry = ()
         self.shapes = self.colours = None
 
-    def close(self) -> None:
-        self._memory.close()
-
 
 class View(Owner):
     """One camera's part of a :class:`ViewSet`; the only view of a set stands for the set, buffers and all.

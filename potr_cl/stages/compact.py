@@ -17,7 +17,7 @@ from potr_cl.stages.compaction.ridge import ColourModel, CompactionOptions, Comp
 from potr_cl.stages.compaction.view_weights import ViewWeights
 from potr_cl.stages.pruning.helpers import Measured, measurement
 from potr_cl.stages.pruning.sweep import SweepOptions
-from potr_cl.stages.stage import Flag, Importances, Interlude, Stage, State, Workbench, option
+from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,7 @@ class Compact(Stage):
     title = "compaction of the colours"
 
     on: bool = option(
-        True,
-        Flag("--compact", "make the SH coefficients sparse, splat by splat", default="where there is no re-fit"),
+        True, Flag("--compact", "make the SH coefficients sparse, splat by splat", default="where there is no re-fit")
     )
     at: float = option(
         0.75,
@@ -107,7 +106,7 @@ class Compact(Stage):
 
 
 @contextmanager
-def _importances(state: State, bench: Workbench) -> Iterator[Importances]:
+def _importances(state: State, bench: Workbench) -> Iterator[Measured]:
     """Importances view by view: those that pruning has measured, or, without pruning, measured for this."""
     if state.importances is not None:
         yield state.importances

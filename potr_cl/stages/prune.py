@@ -19,14 +19,7 @@ from potr_cl.stages.pruning.removal import LARGEST_LIMIT, RemovalSweep
 from potr_cl.stages.pruning.schedule import Course, Pruned, PruningOptions
 from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
-from potr_cl.stages.unseen import (
-    CHOICES,
-    Unresolved,
-    Unseen,
-    as_of_whole,
-    find_unseen,
-    without_directions,
-)
+from potr_cl.stages.unseen import CHOICES, Unresolved, Unseen, as_of_whole, find_unseen, without_directions
 from potr_cl.views.reached import surely_seen
 from potr_cl.views.shares import ViewShares
 from potr_cl.views.visibility import MOST_SEEN, Visibility, groups_of_large, seen_part, visibility_of_large

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,21 +37,10 @@ from potr_cl.workers.pool import Pool, Shared
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+    from potr_cl.stages.pruning.helpers import Measured
+
 
 T = TypeVar("T")
-
-
-class Importances(Protocol):
-    """How much each splat shows in each view, as far as that has been measured."""
-
-    def view_importances(self) -> Iterator[tuple[int, NDArray[np.int64], NDArray[np.float64]]]:
-        """The importances, view by view.
-
-        Yields:
-            The number of the view, the numbers of the splats that it sees, ascending, and the mean of T α of each over
-            the view's pixels.
-        """
-        ...
 
 
 #: Called with the name of what is being done and the part of it that is done, 0 to 1.
@@ -82,7 +71,7 @@ class State:
     survivors: NDArray[np.int64]
     views: tuple[Camera, ...]
     geometry: Rounded | None = None
-    importances: Importances | None = None
+    importances: Measured | None = None
     learnt: Learnt = field(default_factory=Learnt)
     added: int = 0
     cut: Scene | None = None

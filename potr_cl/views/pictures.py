@@ -211,10 +211,6 @@ class SeenRasterizer(Owner):
                 memory = stack.enter_context(Memory(self.device))
                 yield stack.enter_context(self._picked(self.picks(memory, seen[None]), 0))
 
-    def close(self) -> None:
-        """Give all device memory back."""
-        self._owned.close()
-
 
 def rasterizer_for(
     device: Device,

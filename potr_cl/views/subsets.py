@@ -7,7 +7,7 @@ the others keep their order.
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -65,7 +65,7 @@ class Subset:
     scene: SceneBuffers | None = None
 
 
-class SplatSource(Owner):
+class SplatSource(Owner, ABC):
     """Gives groups their splats, in the colours that they have by now.
 
     Attributes:

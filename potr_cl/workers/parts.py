@@ -50,7 +50,7 @@ class Parts(Owner):
         names: Sequence[str] = (),
     ) -> None:
         self._longest = 0.0  # seconds that anything has taken
-        self._pool, self._kind, self._memory = pool, kind, memory
+        self._pool, self._kind, self._budget = pool, kind, memory
         self._given = [tuple(each) for each in given]
         self._log: list[tuple[str, tuple[Any, ...]]] = []
         self._unfit: set[str] = set()  # workers on which a part of this work has failed
@@ -252,7 +252,7 @@ class Parts(Owner):
         """Make a part on the worker that has it now, and have it do all that it has been told."""
         worker = self._by[place]
         assert worker is not None
-        held: Held = self._answer(worker.make(self._kind, self._memory, self._given[place]))
+        held: Held = self._answer(worker.make(self._kind, self._budget, self._given[place]))
         self._held[place] = held
         for command, args in self._log:
             self._answer(self._begin(place, command, args))

@@ -39,7 +39,7 @@ def tell_of_kinds(first: str, others: Iterable[str]) -> None:
         )
 
 
-class Part(Owner):
+class Part(Owner, ABC):
     """A part of a work, on one worker: its methods are the commands that the master gives.
 
     It is made on its worker as ``kind(device, memory, *given)``, where memory is the number of bytes of the device's

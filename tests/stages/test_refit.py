@@ -11,7 +11,6 @@ import pytest
 from potr_cl.errors import DataError, UsageError
 from potr_cl.model.scene import Scene
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.rules import INRIA
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.colour_map import ColourMap
@@ -390,7 +389,7 @@ def test_nobody_waits_for_a_device_that_others_read_from(case, monkeypatch):
         return download(*args)
 
     rasterizer = Rasterizer(device, case.scene)
-    sweep = RefitSweep(device, INRIA)
+    sweep = RefitSweep(device)
     layout = Layout(len(case.scene), rasterizer.stride, case.scene.sh.shape[1], sweep.lanes)
     with (
         rasterizer,

@@ -120,7 +120,7 @@ class Adam(Owner):
         self._moving = columns.count if rates.ac else columns.ac.start
         self._start = _columns_of(scene, columns, buffers.stride)
         self._memory = Memory(device)
-        try:
+        with device.all_or_nothing():
             self.values = self._memory.upload(self._start, "the parameters")
             self._kept = self._memory.upload(self._start, "the best parameters")
             nbytes = self.values.size
@@ -130,9 +130,6 @@ class Adam(Owner):
             self._averages = self._memory.upload(self._start, "the averages")
             self._steps = self._memory.upload(_steps(columns, rates, limits), "the steps")
             self._activate, self._step = (device.shared_kernel("fit/adam.cl", name) for name in ("activate", "adam"))
-        except BaseException:
-            self.close()
-            raise
 
     def step(self, gradient: cl.Buffer, part: float) -> None:
         """Take a step, and give the rasterizer its scene.
@@ -237,10 +234,6 @@ class Adam(Owner):
         sh = np.array(scene.sh, np.float32)
         sh[moved] = rows[:, 11:].reshape(len(moved), *sh.shape[1:])
         return Scene(**arrays, sh=sh, antialiased=scene.antialiased, low_pass=scene.low_pass)
-
-    def close(self) -> None:
-        """Give all device memory back."""
-        self._memory.close()
 
 
 def in_form_of_files(scene: Scene) -> Scene:

@@ -92,10 +92,6 @@ class Judges(Owner):
         camera = self._cameras[number]
         return 3 * camera.width * camera.height
 
-    def close(self) -> None:
-        """Give all device memory back."""
-        self._memory.close()
-
 
 logger = logging.getLogger("potr_cl")
 

@@ -134,10 +134,6 @@ class Descent(Owner):
     def _of(self, batch: Batch) -> list[Camera]:
         return [self._cameras[number] for number in batch.numbers]
 
-    def close(self) -> None:
-        """Give all device memory back."""
-        self._owned.close()
-
 
 class FitPart(Part):
     """A :class:`Descent` that follows another one.
@@ -178,10 +174,6 @@ class FitPart(Part):
         """Go on from another one's numbers after so many steps."""
         self._descent.adam.adopt(taken, state)
         self._descent.taken = taken
-
-    def close(self) -> None:
-        """Give all device memory back."""
-        self._owned.close()
 
 
 class Together:

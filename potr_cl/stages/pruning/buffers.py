@@ -120,10 +120,6 @@ class Survivors(Owner):
             return
         self.device.copy(self.buffer, self._states)
 
-    def close(self) -> None:
-        """Give the device's copy back."""
-        self._memory.close()
-
 
 class PreparedSet(Owner):
     """Views that are swept in one launch, and what is kept of them from sweep to sweep.
@@ -253,9 +249,6 @@ class Ledger(Owner):
         kernel = shared_kernel(self._device, name)
         kernel.bind(**given, numbers=self._own_numbers, count=self._count)
         kernel.launch((-(-self._count // _PARTS_GROUP) * _PARTS_GROUP,), (_PARTS_GROUP,))
-
-    def close(self) -> None:
-        self._memory.close()
 
 
 def shared_kernel(device: Device, name: str) -> Kernel:

@@ -152,12 +152,7 @@ class _Controller(Owner):
         return Pruned(len(left), iteration, done, course.result)
 
     def _course(
-        self,
-        done: int,
-        iteration: NDArray[np.int32],
-        removed: np.ndarray,
-        left: Indices,
-        smoothed: NDArray[np.float32],
+        self, done: int, iteration: NDArray[np.int32], removed: np.ndarray, left: Indices, smoothed: NDArray[np.float32]
     ) -> Course:
         """In which order splats went, and those that are left would go; what is known of each iteration.
 
@@ -181,6 +176,3 @@ class _Controller(Owner):
             history.append(Iteration(self._splats - gone, weight, harm, float(effect.max())))
         order[gone:] = left[ascending(smoothed[left])]
         return Course(order, tuple(history))
-
-    def close(self) -> None:
-        self._memory.close()

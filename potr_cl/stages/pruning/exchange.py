@@ -231,6 +231,3 @@ class _Runs(Owner):
         ends = np.cumsum(counts, dtype=np.uint32)
         self._device.copy(self.starts, ends - counts)
         return int(ends[-1])
-
-    def close(self) -> None:
-        self._memory.close()

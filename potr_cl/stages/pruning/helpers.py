@@ -135,10 +135,6 @@ class RemovalPart(Part):
         self._told = (place + 1, known)
         return None if found is None else (found[0], found[1].astype(np.uint32), found[2])
 
-    def close(self) -> None:
-        """Give all device memory back."""
-        self._owned.close()
-
 
 class RemovalHelpers(Owner):
     """What others measure, for the :class:`potr_cl.stages.pruning.removal.RemovalSweep` of the master's device.
@@ -242,10 +238,6 @@ class RemovalHelpers(Owner):
             number, seen, importances = found
             yield number, seen.astype(np.int64) if self._numbers is None else self._numbers[part][seen], importances
             place += 1
-
-    def close(self) -> None:
-        """Give the master's device memory back; the parts are the caller's."""
-        self._owned.close()
 
 
 @contextmanager

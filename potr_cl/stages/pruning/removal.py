@@ -339,10 +339,6 @@ class RemovalSweep(Owner):
         left = alive[splats]
         return splats[left], total[seen[left]] / view.pixels
 
-    def close(self) -> None:
-        """Give all device memory back."""
-        self._owned.close()
-
 
 def add_totals(device: Device, totals: cl.Buffer, more: cl.Buffer, splats: int, how: str = "add_totals") -> None:
     """Enqueue: totals of so many splats += others, or -= with "subtract_totals"."""

@@ -291,6 +291,3 @@ class ResidentSweep(Owner):
             stale = self._staleness()
             self._schedule.note_swept(stale, tiles)
             self._device.copy(self._stale, stale)
-
-    def close(self) -> None:
-        self._memory.close()

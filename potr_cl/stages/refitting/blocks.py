@@ -219,7 +219,3 @@ class Rounding(Owner):
                 part.run(self._round_ac)
             self._round_constant.bind(**own, steps=part[self._constant], turn=this.constant)
             part.run(self._round_constant)
-
-    def close(self) -> None:
-        """Give the device's memory back."""
-        self._memory.close()

@@ -60,13 +60,10 @@ class Coefficients(SlicedArrays):
         #: Where vectors of the host lie on the device to be read, and which they are, as often changed.
         self._operands: dict[int, cl.Buffer] = {}
         self._held: dict[int, tuple[HostArray, int]] = {}
-        try:
+        with device.all_or_nothing():
             self.active = self._memory.allocate(8 * layout.stride, "the active coefficients")
             self._parts = self._memory.allocate(12 * DOT_ITEMS, "a dot product")
             self.activate(None)
-        except BaseException:
-            self.close()
-            raise
 
     # ------------------------------------------------------------------------------------------ vectors
 

@@ -42,12 +42,7 @@ class ColourMap:
         self.total_weight = 3 * REFERENCE_PIXELS * own.count
 
     def gradient(
-        self,
-        x: Vector,
-        targets: Targets,
-        result: Vector,
-        blocks: SplatBlocks | None = None,
-        constant: bool = False,
+        self, x: Vector, targets: Targets, result: Vector, blocks: SplatBlocks | None = None, constant: bool = False
     ) -> float:
         """result += Aᵀ W (pictures(x) - targets), half the gradient of the squared error at x.
 

@@ -18,7 +18,6 @@ from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.raster.scene_buffers import stride_of
 from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.coefficients import Coefficients, Place, placed
@@ -42,7 +41,7 @@ class ColourRefit(Owner):
         scene: whose geometry, opacities and SH degree are used. If it is still to come, all is made ready meanwhile
             that its colours are enough for.
         cameras: the views that count, all the same whatever their size.
-        rules, background: of the rasterizer.
+        background: of the rasterizer.
         memory: bytes of device memory that prepared views and targets may take, together with the vectors where these
             take much; None: views take two fifths of what is free, or a quarter where that is the host's
             memory.
@@ -63,7 +62,6 @@ class ColourRefit(Owner):
         device: Device,
         scene: AnyScene,
         cameras: Sequence[Camera],
-        rules: RasterRules = INRIA,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         memory: int | None = None,
         help_from: HelpFrom | None = None,
@@ -79,17 +77,15 @@ class ColourRefit(Owner):
                 share = source.dealt if isinstance(source, ViewShares) else colour_shares(pool, len(cameras))
                 if share.others:
                     own = share.own
-                    others = owned.enter_context(
-                        colour_parts(pool, share, scene, rules, background, source, cameras, memory)
-                    )
-            sweep = RefitSweep(device, rules)
+                    others = owned.enter_context(colour_parts(pool, share, scene, background, source, cameras, memory))
+            sweep = RefitSweep(device)
             layout = Layout(len(scene), stride_of(len(scene)), scene.sh.shape[1], sweep.lanes)
             # The vectors come first: prepared views can do with less memory, and only take longer then.
             size = layout.splats, layout.sh_count
             place = Place(memory) if others is not None else placed(device, *size, memory, slices)
 
             def looked_at(room: int | None) -> tuple[Rasterizer, Reach | None]:
-                rasterizer = owned.enter_context(Rasterizer(device, colourless(arrived(scene)), rules))
+                rasterizer = owned.enter_context(Rasterizer(device, colourless(arrived(scene))))
                 return rasterizer, reached_splats(rasterizer, cameras, own, room)
 
             looked = None
@@ -197,7 +193,3 @@ class ColourRefit(Owner):
     def active(self) -> NDArray[np.bool_]:
         """(N, M, 3) in Y, Co, Cg: the coefficients that the last solution left active."""
         return self.coefficients.is_active()
-
-    def close(self) -> None:
-        """Give all device memory back."""
-        self._owned.close()

@@ -430,7 +430,3 @@ class DrawnRows(Owner):
     def add_sums(self, columns: cl.Buffer, part: int, packed: Narrowed) -> None:
         """Add the sums of one part's row to sums over views."""
         self._exchange.add_sums(columns, packed, self._rows[part])
-
-    def close(self) -> None:
-        """Give the device's memory back."""
-        self._owned.close()

@@ -22,7 +22,6 @@ from potr_cl.opencl.narrow import Narrowed
 from potr_cl.opencl.relay import Lent
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.resident import Excerpt, KeptScene, lying_on, whole_on_device
-from potr_cl.raster.rules import RasterRules
 from potr_cl.raster.scene_buffers import stride_of
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.exchange import DrawnRows, Exchange, SentVector
@@ -73,7 +72,7 @@ class ColourPart(Part):
         memory: bytes of its memory that prepared views and targets may take; None: the default.
         scene: whose geometry and opacities are used, perhaps still to come; its colours are not looked at.
         sh_count: M, coefficients of a channel.
-        rules, background: of the rasterizer.
+        background: of the rasterizer.
         source: the scene whose pictures are the targets, perhaps kept on devices, with pictures of it there, or what
             these views see of it.
         cameras: all views.
@@ -90,7 +89,6 @@ class ColourPart(Part):
         memory: int | None,
         scene: AnyScene,
         sh_count: int,
-        rules: RasterRules,
         background: tuple[float, float, float],
         source: Scene | KeptScene | PicturesAhead | Excerpt,
         cameras: Sequence[Camera],
@@ -99,7 +97,7 @@ class ColourPart(Part):
     ) -> None:
         self._device = device
         with ExitStack() as owned:
-            sweep = RefitSweep(device, rules)
+            sweep = RefitSweep(device)
             layout = Layout(len(scene), stride_of(len(scene)), sh_count, sweep.lanes)
             self._coefficients = owned.enter_context(Coefficients(device, layout))
             self._exchange = owned.enter_context(Exchange(self._coefficients))
@@ -111,7 +109,7 @@ class ColourPart(Part):
                 pictured = owned.enter_context(whole_on_device(device, pictured))
             of_source = owned.enter_context(targets_of(device, pictured, cameras, background, sights))
             here = arrived(scene)
-            rasterizer = owned.enter_context(Rasterizer(device, colourless(here), rules))
+            rasterizer = owned.enter_context(Rasterizer(device, colourless(here)))
             self._reach = reach = reached_splats(rasterizer, cameras, numbers, memory)
             self._views = owned.enter_context(
                 OwnViews(sweep, rasterizer, self._coefficients, cameras, background, memory, numbers, reach=reach)
@@ -125,12 +123,7 @@ class ColourPart(Part):
             self._owned = owned.pop_all()
 
     def gradient(
-        self,
-        x: SentVector,
-        flags: NDArray[np.uint32] | Lent,
-        blocks: bool,
-        constant: bool,
-        tell_drawn: bool = False,
+        self, x: SentVector, flags: NDArray[np.uint32] | Lent, blocks: bool, constant: bool, tell_drawn: bool = False
     ) -> Gradient:
         """What these views add to :meth:`~potr_cl.stages.refitting.colour_map.ColourMap.gradient`.
 
@@ -216,10 +209,6 @@ class ColourPart(Part):
         self._exchange.take_floats(self._direction, direction)
         self._views.add_up(Look(self._direction, None, self._x, unit, constant, part))
         return self._exchange.send_sums(self._views.sums)
-
-    def close(self) -> None:
-        """Give all device memory back."""
-        self._owned.close()
 
 
 def unpacked(bits: NDArray[np.uint8], splats: int) -> NDArray[np.bool_]:
@@ -345,7 +334,6 @@ def colour_parts(
     pool: Pool,
     share: Shares,
     scene: AnyScene,
-    rules: RasterRules,
     background: tuple[float, float, float],
     source: Scene | KeptScene | PicturesAhead | ViewShares,
     cameras: Sequence[Camera],
@@ -357,7 +345,7 @@ def colour_parts(
         pool: of their workers.
         share: who does which views.
         scene: whose colours are re-fitted.
-        rules, background: of the rasterizer.
+        background: of the rasterizer.
         source: the scene whose pictures are the targets, perhaps kept on devices, with pictures of it there, or what
             the views see of it.
         cameras: all views.
@@ -375,7 +363,7 @@ def colour_parts(
         else:
             pictured = [(stack.enter_context(pool.shared(source)), None)] * len(share.others)
         given = [
-            (shape, sh_count, rules, background, own, cameras, numbers, sights)
+            (shape, sh_count, background, own, cameras, numbers, sights)
             for (own, sights), numbers in zip(pictured, share.others, strict=True)
         ]
         with Parts(pool, ColourPart, given, memory, share.names) as parts:

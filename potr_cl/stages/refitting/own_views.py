@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,10 +73,6 @@ class ViewErrors(Owner):
             number: self._weights[number] * float(tiles[first:end].sum(dtype=np.float64))
             for number, (first, end) in zip(self._numbers, itertools.pairwise(self._ends), strict=True)
         }
-
-    def close(self) -> None:
-        """Give the device's memory back."""
-        self._memory.close()
 
 
 #: Bytes a splat and view of a sweep's own buffers: the colours' change and the sums.
@@ -163,13 +160,13 @@ class OwnViews(Owner):
         parts = [list(some) for _, some in itertools.groupby(order, lambda each: each % self.parts)]
         # To render a picture takes many times as long as to project a view, and it takes less room.
         pictures = sum(target_bytes(cameras[number]) for number in own_numbers)
-        self._cache = ViewCache(device, free_memory(device) if memory is None else memory, pictures)
-        self._memory = Memory(device)
-        self._owned: list[Owner] = [self._cache, self._memory]
-        try:
+        room = free_memory(device) if memory is None else memory
+        with ExitStack() as owned:
+            self._cache = owned.enter_context(ViewCache(device, room, pictures))
+            self._memory = owned.enter_context(Memory(device))
             plan = plans.in_launches(parts, rooms, self._cache, sweep.most_views, _CHANGE + _TOTALS)
-            self._engine: ViewEngine[_Attached] = ViewEngine(source, cameras, plan, _Attached, sweep.most_views)
-            self._owned.append(self._engine)
+            engine = ViewEngine(source, cameras, plan, _Attached, sweep.most_views)
+            self._engine: ViewEngine[_Attached] = owned.enter_context(engine)
             if memory is not None:  # pictures are kept in what streamed views leave
                 self._cache.room = max(self._cache.room - self._engine.passing, 0)
             rasterizer.rest()
@@ -198,16 +195,12 @@ class OwnViews(Owner):
             self.sums = self._memory.allocate(8 * layout.columns * layout.stride, "the sums over views")
             coefficients.zero(self.sums)
             sets = [each.numbers for each in launches]
-            self._errors = ViewErrors(device, cameras, weights, sets)
-            self._owned.append(self._errors)
+            self._errors = owned.enter_context(ViewErrors(device, cameras, weights, sets))
             ratios = [self.one * weights[each] / self._fixed_points[each] for some in sets for each in some]
             scales = self._memory.upload(np.array(ratios, np.float32), "the views' scales")
             self._kernels = ViewKernels(device, layout, rasterizer.parameters.means, scales)
-            self._targets = TargetPictures(device, cameras, self._cache, sets=sets)
-            self._owned.append(self._targets)
-        except BaseException:
-            self.close()
-            raise
+            self._targets = owned.enter_context(TargetPictures(device, cameras, self._cache, sets=sets))
+            self._owned = owned.pop_all()
 
     @property
     def room(self) -> float:
@@ -265,10 +258,8 @@ class OwnViews(Owner):
         return self._errors.found()
 
     def close(self) -> None:
-        """Give all device memory back."""
         self._slots = []  # parts of buffers, which would keep these
-        for owner in reversed(self._owned):
-            owner.close()
+        super().close()
 
 
 class _Attached(Owner):

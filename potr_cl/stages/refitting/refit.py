@@ -91,13 +91,7 @@ def refit_colours(
             progress(_BEGINNING + done, _BEGINNING + steps + more)
 
     with ColourRefit(
-        device,
-        scene,
-        cameras,
-        background=background,
-        memory=options.memory,
-        help_from=help_from,
-        slices=options.slices,
+        device, scene, cameras, background=background, memory=options.memory, help_from=help_from, slices=options.slices
     ) as refit:
         way: _Rounding
         if colour_grid is not None:

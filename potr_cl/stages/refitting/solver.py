@@ -17,7 +17,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,26 +31,6 @@ from potr_cl.views.targets import Targets
 #: Steps end where the residual's square, as the preconditioner measures it, has shrunk by this: single precision has no
 #: more digits, and what is left of them leads astray.
 _CONVERGED = 1e-14
-
-
-class Vectors(Protocol):
-    """Arithmetic of vectors; :class:`potr_cl.stages.refitting.coefficients.Coefficients` is one."""
-
-    def vector(self, rank: int) -> Vector:
-        """A new vector; the lower the rank, the more often it is used."""
-        ...
-
-    def zero(self, x: Vector) -> None:
-        """x = 0."""
-        ...
-
-    def combine(self, a: float, y: Vector, b: float, x: Vector) -> None:
-        """y = a y + b x."""
-        ...
-
-    def dot(self, x: Vector, y: Vector) -> float:
-        """x · y."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -77,7 +56,7 @@ class ConjugateGradients:
         direction, product, preconditioned: the vectors; free for other use between solutions.
     """
 
-    def __init__(self, vectors: Vectors) -> None:
+    def __init__(self, vectors: Coefficients) -> None:
         self._vectors = vectors
         self.direction, self.product, self.preconditioned = (vectors.vector(rank) for rank in (0, 1, 4))
 
@@ -318,13 +297,7 @@ class ColourSolver:
         return System(product, partial(self.blocks.precondition, ridge=how.ridge))
 
     def _choose(
-        self,
-        problem: _Problem,
-        first: _State,
-        chosen_from: NDArray[np.uint32],
-        steps: int,
-        least: float,
-        ridge: Ridge,
+        self, problem: _Problem, first: _State, chosen_from: NDArray[np.uint32], steps: int, least: float, ridge: Ridge
     ) -> tuple[_State, int]:
         """Give up what costs little where x has come to, and start anew from what is left.
 

@@ -17,7 +17,7 @@ import pyopencl as cl
 from potr_cl.model.camera import Camera
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.kernel import Kernel
-from potr_cl.raster.rules import RasterRules
+from potr_cl.raster.rules import INRIA
 from potr_cl.raster.sweep import TileSweep, fixed_point_scale, padded_area
 from potr_cl.raster.view_set import ViewSet
 from potr_cl.stages.refitting.sliced_arrays import Layout
@@ -50,7 +50,6 @@ class RefitSweep:
 
     Args:
         device: to run on.
-        rules: of the rasterizer.
 
     Attributes:
         lanes: splats a work-item, in kernels that go over splats.
@@ -61,9 +60,9 @@ class RefitSweep:
         DeviceError: the kernels cannot be built.
     """
 
-    def __init__(self, device: Device, rules: RasterRules) -> None:
+    def __init__(self, device: Device) -> None:
         self._sweeps = [
-            TileSweep(device, rules, "refit/refit", "refit_sweep", LARGEST_VALUE=LARGEST_VALUE, WEIGHTS=weights)
+            TileSweep(device, INRIA, "refit/refit", "refit_sweep", LARGEST_VALUE=LARGEST_VALUE, WEIGHTS=weights)
             for weights in (0, 1)
         ]
         self.lanes, self.most_views = self._sweeps[0].lanes, self._sweeps[0].most_views
@@ -221,11 +220,7 @@ class ViewKernels:
         kernel = self._device.shared_kernel("refit/drawn.cl", "mark_drawn")
         for number, view in enumerate(views.views):
             kernel.bind(
-                views=views.table,
-                number=number,
-                offsets=views.offsets,
-                intersections=views.intersections,
-                marks=drawn,
+                views=views.table, number=number, offsets=views.offsets, intersections=views.intersections, marks=drawn
             )
             kernel.launch((-(-view.tiles // _GROUP) * _GROUP,), (_GROUP,))
 
