@@ -369,7 +369,7 @@ def prune(
         ranks = stack.enter_context(replacing(order)) if order is not None else None
         work = _Work(scene, cameras, how, options)
         state, used = work.stage(Prune, options)
-        pruned, unseen = state.learnt.pruned, state.learnt.unseen
+        pruned, unseen = state.results.pruned, state.results.unseen
         assert pruned is not None
         assert unseen is not None
         work.write(state.scene)

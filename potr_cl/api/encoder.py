@@ -38,7 +38,7 @@ from potr_cl.pipeline.target import Target
 from potr_cl.quality.by_photographs import judge_by_photographs
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.quality.ground_truth import GroundTruth
-from potr_cl.raster.resident import KeptScene
+from potr_cl.raster.resident import ResidentScene
 from potr_cl.report.html import PicturePair, html_report, views_to_show
 from potr_cl.report.summary import decibels, encode_report, photographs_report, quality_report, search_report
 from potr_cl.stages.refit import Refit
@@ -71,7 +71,7 @@ class _Job:
     cameras: Sequence[Camera] | None
     judging: EvaluationViews | None
     workers: Workers | None
-    kept: KeptScene | None
+    kept: ResidentScene | None
     seconds: dict[str, float]
 
     @property
@@ -192,7 +192,7 @@ class Encoder:
                 workers = self.workers if looks else None
                 if workers is not None and self._target is None:
                     others = () if workers.pool is None else workers.pool.devices
-                    kept = stack.enter_context(KeptScene(workers.device, scene, options.memory, others))
+                    kept = stack.enter_context(ResidentScene(workers.device, scene, options.memory, others))
             if workers is not None:
                 if cameras is None:
                     cameras = self._placed(source, scene, options, watch, workers.device)

@@ -19,7 +19,7 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.run import Run, Stopwatch
 from potr_cl.placement.virtual import place_cameras
 from potr_cl.quality.evidence import evidence_of
-from potr_cl.raster.resident import KeptScene
+from potr_cl.raster.resident import ResidentScene
 from potr_cl.stages.stage import Progress, State
 from potr_cl.workers.pool import Pool
 
@@ -33,7 +33,7 @@ def encode(
     progress: Progress | None = None,
     device: Device | None = None,
     antialiased: bool | None = None,
-    kept: KeptScene | None = None,
+    kept: ResidentScene | None = None,
     in_frame: bool = False,
     pool: Pool | None = None,
     tell: Callable[[str], None] | None = None,
@@ -72,7 +72,7 @@ def encode(
             cameras = cameras_or_virtual(scene, cameras, options, watch, in_frame=True, device=device)
             if kept is None and cameras and device is not None and options.look_at_views(scene):
                 others = () if pool is None else pool.devices
-                kept = stack.enter_context(KeptScene(device, scene, options.memory, others))
+                kept = stack.enter_context(ResidentScene(device, scene, options.memory, others))
         run = Run(options, watch, device, kept, pool)
         encoded = run.finished(run.stages(State.of(scene, train_views(cameras) if cameras else [])))
     tell_left_out(scene, encoded)

@@ -17,7 +17,7 @@ from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.resident import KeptScene
+from potr_cl.raster.resident import ResidentScene
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.stages.fit import Fit
 from potr_cl.stages.fitting.fit import FitOptions
@@ -37,7 +37,7 @@ _PIXEL, _SUM = 12, 8
 
 
 def log_forecast(
-    device: Device, scene: Scene, cameras: Sequence[Camera], options: EncodeOptions, kept: KeptScene | None = None
+    device: Device, scene: Scene, cameras: Sequence[Camera], options: EncodeOptions, kept: ResidentScene | None = None
 ) -> None:
     """Report the device and its kernels; and where the work may take long, roughly its memory.
 
@@ -67,7 +67,7 @@ def log_forecast(
 
 
 def memory_needed(
-    scene: Scene, cameras: Sequence[Camera], options: EncodeOptions, device: Device, kept: KeptScene | None = None
+    scene: Scene, cameras: Sequence[Camera], options: EncodeOptions, device: Device, kept: ResidentScene | None = None
 ) -> float:
     """Bytes at the peak: the whole process's on a CPU, the device's on a GPU; roughly.
 

@@ -22,7 +22,7 @@ from potr_cl.pipeline.fallback import Attempt, attempts, for_views, on_device
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.placement.rays import unresolved
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.resident import KeptScene
+from potr_cl.raster.resident import ResidentScene
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.stages.fit import Fit
 from potr_cl.stages.fitting.fit import held_out_error
@@ -94,7 +94,7 @@ class Trial:
 
     def of(self, state: State) -> File:
         """The file that a state becomes, and how well it shows the views that a fit holds out."""
-        coded = self.remaining(state).learnt.coded
+        coded = self.remaining(state).results.coded
         assert coded is not None, "the last stage makes the file"
         with (
             self.output.seen(b"".join(coded.pieces), self.device, trust=True) as seen,
@@ -119,17 +119,17 @@ def only_if_it_pays(before: State, after: State, trial: Trial) -> State:
     Raises:
         As the stages.
     """
-    told = after.learnt.fitted
+    told = after.results.fitted
     if not isinstance(told, Fitted) or not told.in_doubt or told.ended_early or told.photographs is not None:
         return after
     left_out = LeftOut(_NO_SMALLER)
     try:
-        files = TwoFiles(trial.of(before.having_learnt(fitted=left_out)), trial.of(after))
+        files = TwoFiles(trial.of(before.with_results(fitted=left_out)), trial.of(after))
     except DeviceMemoryError:  # where there is no room to compare files, the fit's own judgement has to do
         return after
     if files.pays:
-        return after.having_learnt(fitted=dataclasses.replace(told, files=files))
-    return before.having_learnt(fitted=dataclasses.replace(left_out, files=files))
+        return after.with_results(fitted=dataclasses.replace(told, files=files))
+    return before.with_results(fitted=dataclasses.replace(left_out, files=files))
 
 
 class Run:
@@ -151,7 +151,7 @@ class Run:
         options: EncodeOptions,
         watch: Stopwatch,
         device: Device | None = None,
-        kept: KeptScene | None = None,
+        kept: ResidentScene | None = None,
         pool: Pool | None = None,
     ) -> None:
         self.device: Device | None = None
@@ -197,7 +197,7 @@ class Run:
         prune = next((each for each in self._options.stages if isinstance(each, Prune)), Prune())
         placed = is_virtual(state.views) and prune.keep is None and prune.count is None
         wanted = prune.unseen == "protect" or (prune.unseen == "keep" and placed)
-        known = state.learnt.unresolved is not None
+        known = state.results.unresolved is not None
         if not wanted or known or not state.views or not self._options.look_at_views(state.source):
             return state
         self._watch("place cameras", 0.0)
@@ -208,12 +208,12 @@ class Run:
         splats, _ = on_device(self.device or self._given or Device(), self._options.memory, found)
         self._watch("place cameras", 1.0)
         area = in_background(part_of_area, state.source, splats).result if splats.any() else float
-        return state.having_learnt(unresolved=Unresolved(splats, area))
+        return state.with_results(unresolved=Unresolved(splats, area))
 
     def _fit_that_pays(self, before: State, after: State) -> State:
         """The state after a fit, or the one before it if a file says so."""
         device = self.device
-        if device is None or after.learnt.fitted is None or not self._options.stage(Fit).compared:
+        if device is None or after.results.fitted is None or not self._options.stage(Fit).compared:
             return after
         names = [type(stage) for stage in self._options.stages]
         remaining = names[names.index(Fit) + 1 :]
@@ -259,18 +259,18 @@ class Run:
 
     def finished(self, state: State) -> Encoded:
         """What the stages have made, as the file that it is."""
-        coded = state.learnt.coded
+        coded = state.results.coded
         assert coded is not None, "the last stage makes the file"
         return Encoded(
             pieces=coded.pieces,
             nbytes=coded.nbytes,
             order=state.survivors[coded.order],
-            pruned=state.learnt.pruned,
-            unseen=state.learnt.unseen,
-            fitted=state.learnt.fitted,
-            refitted=state.learnt.refitted,
-            photographs=state.learnt.photographs,
-            between=state.learnt.between,
+            pruned=state.results.pruned,
+            unseen=state.results.unseen,
+            fitted=state.results.fitted,
+            refitted=state.results.refitted,
+            photographs=state.results.photographs,
+            between=state.results.between,
             device=self.device,
             seconds=self._watch.seconds,
             options=self._options,
@@ -286,7 +286,7 @@ def as_done(options: EncodeOptions, state: State) -> EncodeOptions:
 
     Whether a fit pays is known then, and not asked again where other qualities follow.
     """
-    fitted = state.learnt.fitted
+    fitted = state.results.fitted
     if isinstance(fitted, LeftOut):
         return options.changed(fit=False)
     if isinstance(fitted, Fitted):
@@ -306,7 +306,7 @@ def _metadata(state: State, options: EncodeOptions) -> bytes:
         "cameras": ("virtual" if is_virtual(views) else "given") if views else None,
         "beta": parameters.beta if views else None,
         "gamma": parameters.gamma,
-        "delta_mse_max": parameters.delta_mse_max if by_threshold and state.learnt.pruned is not None else None,
+        "delta_mse_max": parameters.delta_mse_max if by_threshold and state.results.pruned is not None else None,
         "lambda": parameters.lam if compacts else None,
         "alpha": parameters.alpha if compacts else None,
         "source_splats": len(state.source),

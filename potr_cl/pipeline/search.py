@@ -258,7 +258,7 @@ class _Search(AbstractContextManager["_Search"]):
 
     def _mind_interrupts(self, thinned: State) -> None:
         """Fit no more where someone has interrupted a fit."""
-        fitted = thinned.learnt.fitted
+        fitted = thinned.results.fitted
         if fitted is not None and fitted.ended_early:
             self._options = self._options.changed(fit=False)
 

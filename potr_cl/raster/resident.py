@@ -1,4 +1,9 @@
-"""Scenes that lie on devices, or go there."""
+"""Scenes that lie on devices, or are on their way there: :class:`SceneHandle` is one, :func:`scene_on` gets it.
+
+:class:`ResidentScene` stays on devices while one after another renders it, and :class:`ResidentSubset` is some of its
+splats; :class:`HostScene` and :class:`DeviceScene` go from where they are to other devices of this process, and
+:class:`SceneSubset` to another process.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +11,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -23,13 +28,13 @@ from potr_cl.opencl.relay import Lent, Relay
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers, copied, gathered, uploaded
 
 
-class Carried(ABC):
+class SceneHandle(ABC):
     """A scene that goes to several devices, each of which makes its own of it."""
 
     @property
-    @abstractmethod
     def nbytes(self) -> int:
         """Bytes that travel."""
+        return 0
 
     @abstractmethod
     def on(self, device: Device) -> AbstractContextManager[Drawable]:
@@ -40,8 +45,17 @@ class Carried(ABC):
         """
 
 
+def scene_on(device: Device, scene: Drawable | SceneHandle) -> AbstractContextManager[Drawable]:
+    """What to give to a rasterizer on a device for a scene, as long as the context lasts.
+
+    Raises:
+        DeviceError: the device failed, or has no room for a part of what it keeps.
+    """
+    return scene.on(device) if isinstance(scene, SceneHandle) else nullcontext(scene)
+
+
 @dataclass(frozen=True)
-class HostScene(Carried):
+class HostScene(SceneHandle):
     """A scene of this process's host.
 
     Attributes:
@@ -61,7 +75,7 @@ class HostScene(Carried):
         yield self.scene
 
 
-class LentScene(Carried):
+class DeviceScene(SceneHandle):
     """A scene that lies on one device, for others of this process to copy; it stays as it is meanwhile.
 
     Args:
@@ -90,7 +104,7 @@ class LentScene(Carried):
 
 
 @dataclass(frozen=True)
-class Excerpt:
+class SceneSubset(SceneHandle):
     """Some splats of a scene. They are gathered on their way to another process, where they arrive as a scene.
 
     Attributes:
@@ -106,12 +120,12 @@ class Excerpt:
         """Bytes of these splats."""
         return self.scene.nbytes * len(self.splats) // max(len(self.scene), 1)
 
-    def gathered(self) -> Scene:
-        """A scene of them."""
-        return self.scene.subset(self.splats)
+    @contextmanager
+    def on(self, device: Device) -> Iterator[Drawable]:
+        yield self.scene.subset(self.splats)
 
     def __reduce__(self) -> tuple[Callable[[Scene], Scene], tuple[Scene]]:
-        return _as_it_is, (self.gathered(),)
+        return _as_it_is, (self.scene.subset(self.splats),)
 
 
 def _as_it_is(scene: Scene) -> Scene:
@@ -126,7 +140,7 @@ _AWHILE = 3
 _WHOLE = 3
 
 
-class KeptScene(Owner):
+class ResidentScene(Owner, SceneHandle):
     """Uploads a scene once for several rasterizers, where the device has much more memory than it takes.
 
     Args:
@@ -184,7 +198,7 @@ class KeptScene(Owner):
                 self._elsewhere[device] = in_background(self._placed, device)
             return self._elsewhere[device]
 
-    def on(self, device: Device) -> Drawable:
+    def found_on(self, device: Device) -> Drawable:
         """What to give to a rasterizer for the scene, on this device or another one.
 
         Raises:
@@ -192,6 +206,10 @@ class KeptScene(Owner):
         """
         buffers = self._buffers if device is self._device else self.bring_to(device).result()
         return self._scene if buffers is None else buffers
+
+    @contextmanager
+    def on(self, device: Device) -> Iterator[Drawable]:
+        yield self.found_on(device)
 
     def close(self) -> None:
         kept = [self._buffers]
@@ -223,7 +241,7 @@ def _allowed(device: Device, memory: int | None) -> int:
 
 
 @dataclass(frozen=True)
-class PartOfKept:
+class ResidentSubset(SceneHandle):
     """Some splats of a scene that is kept on devices.
 
     Attributes:
@@ -231,7 +249,7 @@ class PartOfKept:
         splats: (n,) int64, their numbers there.
     """
 
-    kept: KeptScene
+    kept: ResidentScene
     splats: NDArray[np.int64]
 
     @cached_property
@@ -239,31 +257,15 @@ class PartOfKept:
         """The same splats on the host, copied when somebody asks for them."""
         return self.kept.scene.subset(self.splats)
 
-
-@contextmanager
-def lying_on(device: Device, scene: Drawable | KeptScene | PartOfKept | Excerpt | Carried) -> Iterator[Drawable]:
-    """What to give to a rasterizer on a device for a scene, as long as the context lasts.
-
-    Raises:
-        DeviceError: the device failed, or has no room for a part of what it keeps.
-    """
-    if isinstance(scene, PartOfKept):
-        whole = scene.kept.on(device)
+    @contextmanager
+    def on(self, device: Device) -> Iterator[Drawable]:
+        whole = self.kept.found_on(device)
         if isinstance(whole, SceneBuffers):
             # To gather them takes no time; to make ready and upload the splats of the host does.
-            with gathered(whole, scene.splats) as part:
+            with gathered(whole, self.splats) as part:
                 yield part
         else:
-            yield scene.scene
-    elif isinstance(scene, KeptScene):
-        yield scene.on(device)
-    elif isinstance(scene, Excerpt):
-        yield scene.gathered()
-    elif isinstance(scene, Carried):
-        with scene.on(device) as carried:
-            yield carried
-    else:
-        yield scene
+            yield self.scene
 
 
 def fits_whole(device: Device, scene: Drawable) -> bool:

@@ -86,7 +86,7 @@ class Compact(Stage):
 
     def run(self, state: State, bench: Workbench) -> State:
         """Make the colours of the state's scene sparse, unless that has been done while splats were removed."""
-        if state.learnt.compacted or state.scene.sh_degree == 0:
+        if state.results.compacted or state.scene.sh_degree == 0:
             return state
         options = CompactionOptions(
             lam=bench.parameters.lam,
@@ -102,7 +102,7 @@ class Compact(Stage):
             places = standpoints(state.views, state.source.means)
             sh = Compactor(bench.opened).compact(state.scene, places, weights, options).sh
             bench.progress("compact", 1.0)
-        return state.recoloured(sh).having_learnt(compacted=True)
+        return state.recoloured(sh).with_results(compacted=True)
 
 
 @contextmanager

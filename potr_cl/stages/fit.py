@@ -175,13 +175,13 @@ class Fit(Stage):
         return price * min(max(further, 1.0), _MOST_FURTHER)
 
     def run(self, state: State, bench: Workbench) -> State:
-        """Remove splats, fit, and leave a :class:`potr_cl.stages.fitting.fitted.Fitted` in ``learnt``.
+        """Remove splats, fit, and leave a :class:`potr_cl.stages.fitting.fitted.Fitted` in ``results``.
 
         Or, where the state stays as it was, a :class:`LeftOut`: too few views are given for any to be held out, or
         those say that the fit does not pay.
         """
         if len(state.views) - state.added < 2:
-            return state.having_learnt(fitted=LeftOut(_TOO_FEW_VIEWS))
+            return state.with_results(fitted=LeftOut(_TOO_FEW_VIEWS))
         bench.progress("fit", 0.0)
         with ExitStack() as stack:
             stack.callback(bench.progress, "fit", 1.0)
@@ -197,7 +197,7 @@ class Fit(Stage):
             found = dataclasses.replace(found, views=state.views, added=state.added)
             if bench.photographs is not None and self.photograph_steps != 0 and not asked:
                 found = self._to_photographs(found, bench, asked)
-            told = found.learnt.fitted
+            told = found.results.fitted
             # Others do not round as finely then as is known here.
             if asked or not (isinstance(told, Fitted) and told.spared):
                 return found
@@ -221,7 +221,7 @@ class Fit(Stage):
         help_from: HelpFrom | None,
     ) -> State:  # fmt: skip
         """Remove splats and fit by turns, each time up to a higher threshold, and keep what costs least."""
-        price = state.learnt.price
+        price = state.results.price
         worth = 0.0 if price is None else _WORTH * price
         without = held_out_error(bench.opened, state.scene, state.views, targets, state.added, bench.background)
         least = plain = without + worth * len(state.scene)
@@ -252,8 +252,8 @@ class Fit(Stage):
                 break
         if taken is None:
             why = _INTERRUPTED if asked else _NO_GAIN if len(steps_of) > 1 else _LITTLE_GAIN
-            return state.having_learnt(fitted=LeftOut(why, bool(asked)))
-        return best.having_learnt(fitted=taken)
+            return state.with_results(fitted=LeftOut(why, bool(asked)))
+        return best.with_results(fitted=taken)
 
     def _settled(self, state: State, bench: Workbench, looking: Looking, asked: SupportsBool) -> State:
         """Choose coefficients and round geometry, with what is left fitted once more in between."""
@@ -267,9 +267,9 @@ class Fit(Stage):
             bench.progress("fit", min(done / total, 1.0) * 0.99)
 
         then, errors = settle(state, bench, looking, settling, options, asked, progress)
-        told = state.learnt.fitted
+        told = state.results.fitted
         assert isinstance(told, Fitted)
-        return then.having_learnt(fitted=dataclasses.replace(told, settled=errors))
+        return then.with_results(fitted=dataclasses.replace(told, settled=errors))
 
     def _steps_of_cycles(self, family: Family, removing: bool) -> list[int]:
         """The steps of the fit in each cycle."""
@@ -295,23 +295,23 @@ class Fit(Stage):
             asked, lambda done, steps: bench.progress("fit to photographs", done / steps),
         )  # fmt: skip
         bench.progress("fit to photographs", 1.0)
-        told = state.learnt.fitted
+        told = state.results.fitted
         assert told is not None
-        then = state.having_learnt(fitted=dataclasses.replace(told, photographs=found))
+        then = state.with_results(fitted=dataclasses.replace(told, photographs=found))
         if found.scene is None:
             return then
         return dataclasses.replace(then, scene=found.scene, truth=found.scene, geometry=None)
 
     def _sparse(self, rates: Rates, state: State) -> Rates:
         """The rates, without those that would change coefficients which compaction has chosen."""
-        return dataclasses.replace(rates, ac=0.0) if state.learnt.compacted else rates
+        return dataclasses.replace(rates, ac=0.0) if state.results.compacted else rates
 
     def _pruned(self, state: State, limit: float, bench: Workbench) -> State:
         """The state without the splats that a fit will make up for."""
         parameters = dataclasses.replace(bench.parameters, delta_mse_max=limit)
         alone = dataclasses.replace(bench, parameters=parameters, interludes=(), progress=lambda what, done: None)
         left = Prune(iterations=ITERATIONS).run(state, alone)
-        return dataclasses.replace(left, learnt=state.learnt)
+        return dataclasses.replace(left, results=state.results)
 
     def _fitted(
         self,

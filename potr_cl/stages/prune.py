@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from potr_cl.errors import UsageError
 from potr_cl.host.threads import in_background, thread_pool
 from potr_cl.model.scene import FloatArray
-from potr_cl.raster.resident import lying_on
+from potr_cl.raster.resident import scene_on
 from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.stages.pruning.controller import prune_scene
 from potr_cl.stages.pruning.helpers import Measured, measurement
@@ -143,14 +143,14 @@ class Prune(Stage):
         return PruningOptions(delta_mse_max, self.iterations, a=self.mapping_a, count=count, decay=self.decay)
 
     def run(self, state: State, bench: Workbench) -> State:
-        """Remove splats, and leave a :class:`potr_cl.stages.pruning.schedule.Pruned` in ``learnt``.
+        """Remove splats, and leave a :class:`potr_cl.stages.pruning.schedule.Pruned` in ``results``.
 
         And what no view sees; the price of a splat, where the number of splats is not given; and the shares, where
         workers elsewhere get what their views see.
         """
-        if state.learnt.unresolved is not None:
-            return self._guarded(state, bench, state.learnt.unresolved)
-        with thread_pool(bench.threads) as pool, lying_on(bench.opened, bench.placed(state)) as placed:
+        if state.results.unresolved is not None:
+            return self._guarded(state, bench, state.results.unresolved)
+        with thread_pool(bench.threads) as pool, scene_on(bench.opened, bench.placed(state)) as placed:
             quick = partial(surely_seen, placed) if isinstance(placed, SceneBuffers) else None
             part = in_background(seen_part, state.scene, state.views)  # while a device finds the unseen ones
             unseen = find_unseen(state, None, pool.map, quick) if quick else None
@@ -163,7 +163,7 @@ class Prune(Stage):
                 sights = sights.lasting()
         splats = int(np.count_nonzero(hidden))
         kept = self.unseen == "keep" and self.keep is None and self.count is None
-        told = state.having_learnt(unseen=Unseen(splats, len(state.scene), kept, area))
+        told = state.with_results(unseen=Unseen(splats, len(state.scene), kept, area))
         told = self._told(told, bench, sights)
         if not (kept and splats):
             return self._pruned(told, bench, sights)
@@ -178,7 +178,7 @@ class Prune(Stage):
         seen = np.flatnonzero(~hidden)
         if not len(seen):
             everything = np.arange(splats)
-            return told.having_learnt(
+            return told.with_results(
                 pruned=Pruned(splats, np.full(splats, -1, np.int32), 0, lambda: Course(everything))
             )
         if sights is not None:
@@ -204,7 +204,7 @@ class Prune(Stage):
             sights = visibility_of_large(state.scene, state.views, groups, pool.map)
             if sights is not None and (bench.pool is None or bench.pool.in_process):
                 sights = sights.lasting()
-        told = self._told(state, bench, sights).having_learnt(unseen=unresolved)
+        told = self._told(state, bench, sights).with_results(unseen=unresolved)
         return self._pruned(told, bench, sights)
 
     def _told(self, state: State, bench: Workbench, sights: Visibility | None) -> State:
@@ -214,7 +214,7 @@ class Prune(Stage):
             if sights is not None and bench.kept is not None and bench.kept.is_of(state.source):
                 bench.kept.groups = sights.groups  # for who judges by pictures later
         if self.keep is None and self.count is None:
-            state = state.having_learnt(price=bench.parameters.delta_mse_max)
+            state = state.with_results(price=bench.parameters.delta_mse_max)
         return state
 
     def _pruned(
@@ -238,8 +238,8 @@ class Prune(Stage):
         dealt = None
         if sights is not None and bench.pool is not None and not bench.pool.in_process:
             dealt = _dealt(state, seen, bench.pool, sights)
-            state = state.having_learnt(shares=dealt)
-        unresolved = state.learnt.unresolved
+            state = state.with_results(shares=dealt)
+        unresolved = state.results.unresolved
         stays = None if unresolved is None else unresolved.among(state.survivors)
         waiting = sorted(bench.interludes, key=lambda interlude: interlude.after)
         schedule = self._schedule(bench.parameters.delta_mse_max, len(state.scene) if seen is None else len(seen))
@@ -275,7 +275,7 @@ class Prune(Stage):
         """The state after pruning; ``seen`` and ``hidden`` as of :meth:`_pruned`."""
         survivors = pruned.survivors
         if hidden is None or seen is None:
-            left = course.left(survivors).having_learnt(pruned=pruned)
+            left = course.left(survivors).with_results(pruned=pruned)
             return left if hidden is None else without_directions(left, hidden[survivors])
         of_whole = in_background(as_of_whole, seen, hidden, pruned)
         kept = hidden.copy()
@@ -283,7 +283,7 @@ class Prune(Stage):
         numbers = np.flatnonzero(kept)
         # Nobody looked at the hidden ones from any direction.
         left = without_directions(course.having(numbers), hidden[numbers])
-        return left.having_learnt(pruned=of_whole.result())
+        return left.with_results(pruned=of_whole.result())
 
 
 def part_of_time(iterations: float, stays: bool) -> float:
@@ -350,4 +350,4 @@ class _Course:
         if self.sh is self._state.scene.sh:  # the array of the state before, which must not change
             self.sh = self.sh.copy()
         self.sh[self._numbers(splats)] = then.scene.sh
-        self._state = replace(self._state, learnt=then.learnt)
+        self._state = replace(self._state, results=then.results)

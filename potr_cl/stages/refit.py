@@ -130,15 +130,15 @@ class Refit(Stage):
         return [Interlude(after, RefitOnTheWay(steps=self.at_steps)) for after in times]
 
     def run(self, state: State, bench: Workbench) -> State:
-        """Re-fit the colours, and leave a :class:`potr_cl.stages.refitting.refit_options.Refitted` in ``learnt``.
+        """Re-fit the colours, and leave a :class:`potr_cl.stages.refitting.refit_options.Refitted` in ``results``.
 
         With photographs, also a :class:`potr_cl.stages.held_out.PhotographChoice` as "photographs".
         """
         bench.progress("refit", 0.0)
         parameters = bench.parameters
-        compacted = state.learnt.compacted
+        compacted = state.results.compacted
         active = active_coefficients(state.scene.sh, parameters.sf_sh) if compacted else None
-        if state.learnt.chosen == parameters:
+        if state.results.chosen == parameters:
             active = chosen_coefficients(state.scene.sh)
         options = RefitOptions(steps=self.steps, drop=parameters.drop, memory=bench.memory)
         on_grid = bench.output.on_grid(bench.request(state))
@@ -189,8 +189,8 @@ class Refit(Stage):
                 choice = PhotographChoice(len(judging), *psnrs)
                 if choice.kept:
                     refitted, geometry = found[1]
-        then = replace(state.recoloured(refitted.sh), geometry=geometry).having_learnt(refitted=refitted)
-        return then if choice is None else then.having_learnt(photographs=choice)
+        then = replace(state.recoloured(refitted.sh), geometry=geometry).with_results(refitted=refitted)
+        return then if choice is None else then.with_results(photographs=choice)
 
 
 @dataclass

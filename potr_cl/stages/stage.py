@@ -27,9 +27,8 @@ from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import Output, Request, Rounded
 from potr_cl.outputs.potr import Potr
-from potr_cl.raster.resident import KeptScene, PartOfKept
+from potr_cl.raster.resident import ResidentScene, ResidentSubset
 from potr_cl.raster.scene_buffers import Drawable
-from potr_cl.stages.learnt import Learnt
 from potr_cl.views.shares import ViewShares
 from potr_cl.views.visibility import Visibility
 from potr_cl.workers.pool import Pool, Shared
@@ -37,10 +36,54 @@ from potr_cl.workers.pool import Pool, Shared
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+    from potr_cl.codec.encoder import Coded
+    from potr_cl.codec.quantize import HyperParameters
+    from potr_cl.stages.fitting.fitted import Fitted, LeftOut
+    from potr_cl.stages.held_out import PhotographChoice
     from potr_cl.stages.pruning.helpers import Measured
+    from potr_cl.stages.pruning.schedule import Pruned
+    from potr_cl.stages.refitting.refit_options import Refitted
+    from potr_cl.stages.unseen import Unresolved, Unseen
+    from potr_cl.stages.views_between import Added
+    from potr_cl.views.shares import ViewShares
 
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Results:
+    """What stages have found out; None where nobody has.
+
+    Attributes:
+        unresolved: splats that no view shows from near enough, which all stages leave alone.
+        between: the views that were added.
+        shown: which part of the views shows a splat, on the average, where that is known.
+        unseen: splats that no view sees, or that stay though none resolves them.
+        price: ΔMSE below which a splat has gone.
+        shares: who of the workers elsewhere does which views, with what these see.
+        pruned: the order in which splats went.
+        fitted: the fit, or why there is none.
+        chosen: the parameters that a fit chose coefficients with.
+        compacted: whether colours are sparse already.
+        refitted: the re-fit of the colours.
+        photographs: the choice between re-fits to photographs.
+        coded: the file.
+    """
+
+    unresolved: Unresolved | None = None
+    between: Added | None = None
+    shown: float = 1.0
+    unseen: Unseen | Unresolved | None = None
+    price: float | None = None
+    shares: ViewShares | None = None
+    pruned: Pruned | None = None
+    fitted: Fitted | LeftOut | None = None
+    chosen: HyperParameters | None = None
+    compacted: bool = False
+    refitted: Refitted | None = None
+    photographs: PhotographChoice | None = None
+    coded: Coded | None = None
 
 
 #: Called with the name of what is being done and the part of it that is done, 0 to 1.
@@ -63,7 +106,7 @@ class State:
         geometry: of ``scene`` as the file's readers will see it, once a stage has had it rounded. A stage that then
             changes anything but colours makes it None again.
         importances: of the splats in each view, for stages that work while splats are being removed; else None.
-        learnt: what stages have found out.
+        results: what stages have found out.
     """
 
     source: Scene
@@ -72,7 +115,7 @@ class State:
     views: tuple[Camera, ...]
     geometry: Rounded | None = None
     importances: Measured | None = None
-    learnt: Learnt = field(default_factory=Learnt)
+    results: Results = field(default_factory=Results)
     added: int = 0
     cut: Scene | None = None
     truth: Scene | None = None
@@ -103,9 +146,9 @@ class State:
         """Whether ``scene`` is known to be some splats of ``source`` as they are there."""
         return self.scene is self.source or self.scene is self.cut
 
-    def having_learnt(self, **found: Any) -> State:
-        """This state with what a stage has found out, by the fields of :class:`Learnt`."""
-        return dataclasses.replace(self, learnt=dataclasses.replace(self.learnt, **found))
+    def with_results(self, **found: Any) -> State:
+        """This state with what a stage has found out, by the fields of :class:`Results`."""
+        return dataclasses.replace(self, results=dataclasses.replace(self.results, **found))
 
 
 @dataclass(frozen=True)
@@ -138,7 +181,7 @@ class Workbench:
     progress: Progress = lambda what, done: None
     tell: Callable[[str], None] = lambda line: None
     output: Output = field(default_factory=Potr)
-    kept: KeptScene | None = None
+    kept: ResidentScene | None = None
     photographs: Path | None = None
     pool: Pool | None = None
 
@@ -146,8 +189,8 @@ class Workbench:
         """What to give to a rasterizer for a scene: it may lie on the device already."""
         return scene if self.kept is None else self.kept.drawable(self.opened, scene)
 
-    def placed(self, state: State, some: NDArray[np.int64] | None = None) -> Scene | KeptScene | PartOfKept:
-        """A state's scene, or where devices have it, for :func:`potr_cl.raster.resident.lying_on`.
+    def placed(self, state: State, some: NDArray[np.int64] | None = None) -> Scene | ResidentScene | ResidentSubset:
+        """A state's scene, or where devices have it, for :func:`potr_cl.raster.resident.scene_on`.
 
         Args:
             state: whose scene.
@@ -157,8 +200,8 @@ class Workbench:
         if kept is None or not state.is_cut or kept.drawable(self.opened, state.source) is state.source:
             return state.scene if some is None else state.scene.subset(some)
         if state.scene is state.source:
-            return kept if some is None else PartOfKept(kept, some)
-        return PartOfKept(kept, state.survivors if some is None else state.survivors[some])
+            return kept if some is None else ResidentSubset(kept, some)
+        return ResidentSubset(kept, state.survivors if some is None else state.survivors[some])
 
     @contextmanager
     def shared(self, pool: Pool, state: State, some: NDArray[np.int64] | None = None) -> Iterator[Shared]:
@@ -177,10 +220,10 @@ class Workbench:
         with pool.shared(state.source if state.is_cut else state.scene) as whole:
             yield whole if numbers is None else Shared(whole.handle, numbers.astype(np.uint32))
 
-    def shared_source(self, state: State) -> Scene | KeptScene | ViewShares:
+    def shared_source(self, state: State) -> Scene | ResidentScene | ViewShares:
         """A state's source for the pool's workers; where they have what their views see already, that."""
         in_process = self.pool is not None and self.pool.in_process
-        dealt = state.learnt.shares
+        dealt = state.results.shares
         if dealt is not None and dealt.views is state.views and not in_process:
             return dealt
         return self.kept if self.kept is not None and in_process and self.kept.is_of(state.source) else state.source

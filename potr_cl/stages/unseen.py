@@ -52,8 +52,9 @@ class Unresolved:
         """Their part of the scene's opacity-weighted area, 0 to 1."""
         return self.find_area()
 
-    def told(self) -> dict[str, Any]:
-        """For programs."""
+    @property
+    def facts(self) -> dict[str, Any]:
+        """All by name."""
         return {"splats": self.splats, "of": self.of, "area": self.area, "kept": True}
 
     def __str__(self) -> str:
@@ -65,7 +66,7 @@ class Unresolved:
 
 def as_they_were(state: State) -> State:
     """A state in which stages have not changed what no view has resolved."""
-    unresolved = state.learnt.unresolved
+    unresolved = state.results.unresolved
     if unresolved is None or state.scene is state.source:
         return state
     rows = np.flatnonzero(unresolved.among(state.survivors))
@@ -85,7 +86,7 @@ def as_they_were(state: State) -> State:
 
 def as_important(effects: FloatArray, state: State) -> FloatArray:
     """What errors of splats cost, (n,), where what no view has resolved counts as the middle of the others at least."""
-    unresolved = state.learnt.unresolved
+    unresolved = state.results.unresolved
     if unresolved is None:
         return effects
     rows = unresolved.among(state.survivors)
@@ -121,8 +122,9 @@ class Unseen:
         """Their part of the scene's opacity-weighted area, 0 to 1."""
         return self.find_area()
 
-    def told(self) -> dict[str, Any]:
-        """For programs."""
+    @property
+    def facts(self) -> dict[str, Any]:
+        """All by name."""
         return {"splats": self.splats, "of": self.of, "area": self.area, "kept": self.kept}
 
     def __str__(self) -> str:

@@ -172,7 +172,7 @@ def priced(parameters: HyperParameters, state: State) -> HyperParameters:
         parameters: of a scene that is seen whole.
         state: knows which part of the views shows a splat, if anyone has found out.
     """
-    part = min(state.learnt.shown / _WHOLE, 1.0)
+    part = min(state.results.shown / _WHOLE, 1.0)
     return replace(parameters, delta_mse_max=part * parameters.delta_mse_max, drop=part * parameters.drop)
 
 
@@ -259,7 +259,7 @@ class Between(Stage):
         return self.asked_for
 
     def run(self, state: State, bench: Workbench) -> State:
-        """Add them; ``learnt`` gets an :class:`Added`, if any are asked for.
+        """Add them; ``results`` gets an :class:`Added`, if any are asked for.
 
         And as "shown" which part of the given views shows a splat on the average.
         """
@@ -274,7 +274,7 @@ class Between(Stage):
             known = GivenViews(state.source, state.views, pool.map)
             parts = known.views_of_parts()
             if self.weigh and (shown := known.part_of_views()) is not None:
-                state = state.having_learnt(shown=shown)
+                state = state.with_results(shown=shown)
             each, shown_by = 0.0 if virtual and self.views == "auto" else self.views, None
             if each == "auto":
                 each = 0.0
@@ -288,7 +288,7 @@ class Between(Stage):
         if self.views == 0 or (virtual and not added):
             return state
         then = replace(state, views=(*state.views, *added), added=len(added))
-        return then.having_learnt(between=Added(given, len(added), shown_by))
+        return then.with_results(between=Added(given, len(added), shown_by))
 
 
 def _evenly(views: Sequence[Camera], count: int) -> list[Camera]:

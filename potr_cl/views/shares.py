@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.model.splat_groups import Indices
-from potr_cl.raster.resident import Excerpt
+from potr_cl.raster.resident import SceneSubset
 from potr_cl.views.visibility import Visibility
 from potr_cl.workers.pool import Pool, Shares
 
 if TYPE_CHECKING:
-    from potr_cl.raster.resident import KeptScene
+    from potr_cl.raster.resident import ResidentScene
     from potr_cl.views.targets import PicturesAhead
 
 
@@ -29,13 +29,13 @@ class ViewShare:
     Attributes:
         numbers: of its views, ascending.
         splats: (n,) int64, the numbers of the splats that these may draw, ascending, in the scene that is worked on.
-        excerpt: these splats, whose places are their numbers from now on.
+        subset: these splats, whose places are their numbers from now on.
         sights: what all views may draw of them.
     """
 
     numbers: list[int]
     splats: Indices
-    excerpt: Excerpt
+    subset: SceneSubset
     sights: Visibility
 
 
@@ -83,7 +83,7 @@ class ViewShares:
             if own:
                 busy += names[place : place + 1]
                 splats, of_these = sights.of_views(own)
-                shares.append(ViewShare(own, splats, Excerpt(source, numbers[splats]), of_these))
+                shares.append(ViewShare(own, splats, SceneSubset(source, numbers[splats]), of_these))
         return ViewShares(views, tuple(shares), tuple(busy))
 
 
@@ -98,4 +98,4 @@ class HelpFrom:
     """
 
     pool: Pool
-    source: Scene | KeptScene | PicturesAhead | ViewShares
+    source: Scene | ResidentScene | PicturesAhead | ViewShares

@@ -32,7 +32,7 @@ from potr_cl.opencl.ferry import Cargo, Ferry
 from potr_cl.opencl.memory import Memory, Owner, Scratch
 from potr_cl.raster.picked_splats import IndexSubsets
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.resident import KeptScene
+from potr_cl.raster.resident import ResidentScene
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
 from potr_cl.views.budget import ViewCache, target_bytes
 from potr_cl.views.pictures import SeenRasterizer
@@ -215,7 +215,7 @@ class PicturesAhead(Owner):
 
     def __init__(
         self,
-        source: KeptScene,
+        source: ResidentScene,
         background: tuple[float, float, float],
         cameras: Sequence[Camera],
         numbers: Mapping[Device, Sequence[int]],
@@ -289,7 +289,7 @@ class _Rendered(Owner):
 
 def _rendered(
     device: Device,
-    source: KeptScene,
+    source: ResidentScene,
     background: tuple[float, float, float],
     cameras: Sequence[Camera],
     numbers: Sequence[int],
@@ -298,7 +298,7 @@ def _rendered(
     """Some views' pictures on a device; None: it has not much room, or the scene does not lie there."""
     if sum(target_bytes(cameras[number]) for number in numbers) > AHEAD * device.info.memory:
         return None
-    scene = source.on(device)
+    scene = source.found_on(device)
     if not isinstance(scene, SceneBuffers):
         return None
     with suppress(DeviceMemoryError), device.all_or_nothing():

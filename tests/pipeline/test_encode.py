@@ -49,7 +49,7 @@ def reduced(scene, cameras, options, device):
     """The scene after pruning and compaction, and what pruning did."""
     run = Run(options, Stopwatch(), device)
     state = run.stages(State.of(scene, train_views(cameras)), [Prune, Compact])
-    return state.scene, state.learnt.pruned
+    return state.scene, state.results.pruned
 
 
 def same(a, b):

@@ -133,7 +133,7 @@ def test_what_files_said_of_one_quality_is_not_asked_of_another(device, plush_ex
     taken = encode(plush_excerpt, plush_excerpt_cameras, HALF.changed(fit={"steps": 60}), device=device).fitted
     assert isinstance(taken, Fitted)
     assert taken.files is not None
-    known = as_done(coarse, State.of(plush_excerpt).having_learnt(fitted=taken))
+    known = as_done(coarse, State.of(plush_excerpt).with_results(fitted=taken))
     assert isinstance(encode(plush_excerpt, plush_excerpt_cameras, known, device=device).fitted, Fitted)
 
 

@@ -93,7 +93,7 @@ def test_no_stage_touches_what_no_view_resolved(device, preset):
     for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
         assert np.array_equal(getattr(state.scene, name)[rows], getattr(scene, name)[found]), name
     assert len(state.survivors) < len(scene), "others go"
-    assert state.learnt.unresolved.splats == state.learnt.unseen.splats == np.count_nonzero(found)
+    assert state.results.unresolved.splats == state.results.unseen.splats == np.count_nonzero(found)
 
 
 @pytest.mark.slow
@@ -101,7 +101,7 @@ def test_without_the_guard_they_are_lost(device):
     dropped = kept(device, "drop")
     assert np.count_nonzero(dropped.survivors >= _EACH) < 50
     plain = kept(device, "keep")
-    assert plain.learnt.unresolved is None, "given cameras say where people look"
+    assert plain.results.unresolved is None, "given cameras say where people look"
     assert np.count_nonzero(plain.survivors >= _EACH) < _EACH / 2
 
 

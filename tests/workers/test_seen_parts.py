@@ -14,7 +14,7 @@ from potr_cl.errors import DeviceMemoryError
 from potr_cl.model import splat_groups
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.raster.resident import Excerpt
+from potr_cl.raster.resident import SceneSubset
 from potr_cl.raster.rules import INRIA
 from potr_cl.stages.pruning import helpers
 from potr_cl.stages.refitting.exchange import DrawnRows
@@ -257,7 +257,7 @@ def test_views_that_see_nothing_have_a_share_too():
 
 def test_an_excerpt_arrives_as_a_scene():
     scene, _ = street(across=True)
-    sent = Excerpt(scene, np.array([3, 5, 900]))
+    sent = SceneSubset(scene, np.array([3, 5, 900]))
     there = pickle.loads(pickle.dumps(sent))
     assert type(there) is type(scene)
     assert np.array_equal(there.sh, scene.sh[[3, 5, 900]])

@@ -120,9 +120,9 @@ def settle(
         return found.scene
 
     still = ("ac",)
-    if settling.choosing and bench.parameters.drop and not state.learnt.compacted:
+    if settling.choosing and bench.parameters.drop and not state.results.compacted:
         scene = fitted(_with_chosen(state, bench, looking), settling.choosing, settling.gentle, still)
-        state = dataclasses.replace(state, scene=scene, geometry=None).having_learnt(chosen=bench.parameters)
+        state = dataclasses.replace(state, scene=scene, geometry=None).with_results(chosen=bench.parameters)
     rounded = bench.output.geometry(state.scene, bench.request(state)) if settling.rounding else None
     if not isinstance(rounded, Geometry) or not isinstance(QUANTISERS[rounded.parameters.quantiser], Balanced):
         return state, tuple(errors)

@@ -21,7 +21,7 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
 from potr_cl.opencl.narrow import Narrowed
-from potr_cl.raster.resident import KeptScene, lying_on
+from potr_cl.raster.resident import ResidentScene, scene_on
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.stages.fitting.adam import UNROUNDED, Adam, Factors, Limits, Rates
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
@@ -145,9 +145,9 @@ class FitPart(Part):
         source: the scene whose pictures are the targets.
     """
 
-    def __init__(self, device: Device, memory: int | None, ground: Ground, source: Drawable | KeptScene) -> None:
+    def __init__(self, device: Device, memory: int | None, ground: Ground, source: Drawable | ResidentScene) -> None:
         with ExitStack() as owned:
-            scene = owned.enter_context(lying_on(device, source))
+            scene = owned.enter_context(scene_on(device, source))
             targets = owned.enter_context(targets_of(device, scene, ground.cameras, ground.background))
             room = room_for_pictures(device, memory)
             pictures = owned.enter_context(TargetPictures(device, ground.cameras, room, targets))

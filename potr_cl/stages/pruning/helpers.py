@@ -16,7 +16,7 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner, Scratch
 from potr_cl.opencl.relay import Lent, Relay
-from potr_cl.raster.resident import Excerpt, KeptScene, PartOfKept, lying_on, whole_on_device
+from potr_cl.raster.resident import ResidentScene, ResidentSubset, SceneSubset, scene_on, whole_on_device
 from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.stages.pruning.buffers import Bits
 from potr_cl.stages.pruning.exchange import AddedChanges, AlivePacking, ChangedTotals, Changes
@@ -53,7 +53,7 @@ class RemovalPart(Part):
         self,
         device: Device,
         memory: int | None,
-        scene: Scene | KeptScene | PartOfKept | Excerpt,
+        scene: Scene | ResidentScene | ResidentSubset | SceneSubset,
         cameras: Sequence[Camera],
         options: SweepOptions,
         background: tuple[float, float, float],
@@ -62,7 +62,7 @@ class RemovalPart(Part):
     ) -> None:
         options = SweepOptions(**{**vars(options), "memory": memory})
         with ExitStack() as owned:
-            drawable = owned.enter_context(lying_on(device, scene))
+            drawable = owned.enter_context(scene_on(device, scene))
             if sights is not None:
                 drawable = owned.enter_context(whole_on_device(device, drawable))
             sweep = planned_sweep(device, drawable, cameras, options, background, sights, numbers)
@@ -276,7 +276,7 @@ def measurement(
                 scene = state.scene if seen is None else state.scene.subset(seen)
                 drawable = stack.enter_context(whole_on_device(device, bench.drawable(scene)))
             else:
-                drawable = stack.enter_context(lying_on(device, bench.placed(state, seen)))
+                drawable = stack.enter_context(scene_on(device, bench.placed(state, seen)))
             given_all = (device, drawable, views, options, bench.background, sights, None, progress, scene, spared)
             yield stack.enter_context(planned_sweep(*given_all))
             return
@@ -284,8 +284,8 @@ def measurement(
         if dealt is not None:
             share = dealt.dealt
             for part in dealt.shares:
-                excerpt = stack.enter_context(pool.shared(part.excerpt))
-                given.append((excerpt, views, options, bench.background, part.numbers, part.sights))
+                subset = stack.enter_context(pool.shared(part.subset))
+                given.append((subset, views, options, bench.background, part.numbers, part.sights))
         else:
             sent = stack.enter_context(bench.shared(pool, state, seen))
             sights = sights if pool.in_process else None
@@ -294,7 +294,7 @@ def measurement(
         numbers = None if dealt is None else [each.splats for each in dealt.shares]
         helpers = stack.enter_context(RemovalHelpers(device, splats, parts, pool, numbers))
         if share.own:
-            drawable = stack.enter_context(lying_on(device, bench.placed(state, seen)))
+            drawable = stack.enter_context(scene_on(device, bench.placed(state, seen)))
             # Only what lies on the device already is looked at in parts.
             own_sights = sights if isinstance(drawable, SceneBuffers) else None
             own = (device, drawable, views, options, bench.background, own_sights, share.own, progress)

@@ -21,7 +21,7 @@ from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.opencl.narrow import Narrowed
 from potr_cl.opencl.relay import Lent
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.resident import Excerpt, KeptScene, lying_on, whole_on_device
+from potr_cl.raster.resident import ResidentScene, SceneSubset, scene_on, whole_on_device
 from potr_cl.raster.scene_buffers import stride_of
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.exchange import DrawnRows, Exchange, SentVector
@@ -90,7 +90,7 @@ class ColourPart(Part):
         scene: AnyScene,
         sh_count: int,
         background: tuple[float, float, float],
-        source: Scene | KeptScene | PicturesAhead | Excerpt,
+        source: Scene | ResidentScene | PicturesAhead | SceneSubset,
         cameras: Sequence[Camera],
         numbers: Sequence[int],
         sights: Visibility | None = None,
@@ -104,7 +104,7 @@ class ColourPart(Part):
             self._x, self._direction = self._coefficients.vector(), self._coefficients.vector()
             self._coefficients.zero(self._x)
             ahead, kept = (source, source.source) if isinstance(source, PicturesAhead) else (None, source)
-            pictured = owned.enter_context(lying_on(device, kept))
+            pictured = owned.enter_context(scene_on(device, kept))
             if sights is not None:
                 pictured = owned.enter_context(whole_on_device(device, pictured))
             of_source = owned.enter_context(targets_of(device, pictured, cameras, background, sights))
@@ -335,7 +335,7 @@ def colour_parts(
     share: Shares,
     scene: AnyScene,
     background: tuple[float, float, float],
-    source: Scene | KeptScene | PicturesAhead | ViewShares,
+    source: Scene | ResidentScene | PicturesAhead | ViewShares,
     cameras: Sequence[Camera],
     memory: int | None,
 ) -> Iterator[Parts]:
@@ -359,7 +359,7 @@ def colour_parts(
         shape = stack.enter_context(pool.shared(scene))
         pictured: list[tuple[Shared, Visibility | None]]
         if isinstance(source, ViewShares):
-            pictured = [(stack.enter_context(pool.shared(each.excerpt)), each.sights) for each in source.shares]
+            pictured = [(stack.enter_context(pool.shared(each.subset)), each.sights) for each in source.shares]
         else:
             pictured = [(stack.enter_context(pool.shared(source)), None)] * len(share.others)
         given = [
