@@ -111,11 +111,7 @@ class NearestLauncher:
 
 
 def launcher_for(device: Device, width: int) -> NearestLauncher:
-    """The launcher of the device's kernel family, for rows of so many floats.
-
-    Raises:
-        DeviceError: the kernels cannot be built.
-    """
+    """The launcher of the device's kernel family, for rows of so many floats."""
     if device.family == "gpu":
         kernel = device.shared_kernel("clustering/nearest_gpu.cl", "nearest", WIDTH=width, GROUP=_GROUP)
         return NearestLauncher(kernel, _GROUP, _GROUP)
@@ -153,9 +149,6 @@ class Points(Owner):
     Args:
         device: to compute on.
         rows: (N, width) float32 (:mod:`potr_cl.clustering.comparison`).
-
-    Raises:
-        DeviceError: the device has too little memory, or the kernels cannot be built.
     """
 
     def __init__(self, device: Device, rows: FloatArray) -> None:

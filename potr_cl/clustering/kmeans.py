@@ -88,9 +88,6 @@ def cluster(
         weights: (N, G) float32, 0 or more.
         entries: K, the most centres there may be, 1 or more.
         rate: what entries and labels take; None: nothing.
-
-    Raises:
-        DeviceError: the device failed, or has too little memory.
     """
     with _Finder(device, points, weights, entries, rate) as finder:
         for step in range(STEPS):
@@ -107,9 +104,6 @@ def assigned(
         device, points, weights: as of :func:`cluster`.
         centres: (K, G, C).
         bits: (K,) what each label takes; None: nothing.
-
-    Raises:
-        DeviceError: the device failed, or has too little memory.
     """
     cells = _cells(device, centres, np.ones(centres.shape[:2], np.float32), len(centres))
     return _in_parts(device, points, weights, _Homed.of(device, centres, bits, cells))

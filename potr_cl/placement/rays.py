@@ -40,9 +40,6 @@ def shown_from(
     Returns:
         The numbers of the places, ascending, and of the targets of all pairs that see each other; and how well, 0 to
         1: the square of the part of its size that a target has, of that at which it is resolved.
-
-    Raises:
-        DeviceError: the device has no room, or failed.
     """
     count, at_once = len(targets), max(_PAIRS // max(len(targets), 1), 1)
     kernel = device.shared_kernel(_SOURCE, "shown")
@@ -132,9 +129,6 @@ def unresolved(device: Device, scene: Scene, cameras: Sequence[Camera]) -> NDArr
         device: finds what is seen.
         scene: clean, at least one splat.
         cameras: the views.
-
-    Raises:
-        DeviceError: the device has no room, or failed.
     """
     space = Space.of(scene)
     exposed = space.near_free(_CLEAR, _DEEP)

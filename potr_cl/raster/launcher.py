@@ -44,9 +44,6 @@ class RasterLauncher:
         key_bytes: bytes of sort keys for each intersection.
         counter_bytes: bytes of counters for each tile.
         subtile_bytes: bytes of the mask of sub-tiles for each intersection.
-
-    Raises:
-        DeviceError: a kernel cannot be built.
     """
 
     def __init__(self, device: Device, rules: RasterRules) -> None:

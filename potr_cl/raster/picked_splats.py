@@ -68,9 +68,6 @@ class Picker(Owner):
     Attributes:
         device: as given. splats: N.
         groups: as given, in the device's memory. count, write: the kernels.
-
-    Raises:
-        DeviceError: the device has no room.
     """
 
     def __init__(self, device: Device, groups: NDArray[np.uint32]) -> None:
@@ -94,9 +91,6 @@ class Picker(Owner):
 
         Returns:
             The numbers, uint32, ascending, and how many they are.
-
-        Raises:
-            DeviceError: the device has no room.
         """
         with Memory(self.device) as own:
             picks = IndexSubsets(own, self, wanted[None], states, state)
@@ -117,9 +111,6 @@ class IndexSubsets:
 
     Attributes:
         counts: of each choice's splats.
-
-    Raises:
-        DeviceError: the device has no room.
     """
 
     def __init__(
@@ -151,9 +142,6 @@ class IndexSubsets:
         Args:
             memory: that owns them.
             choice: its number.
-
-        Raises:
-            DeviceError: the device has no room.
         """
         found = memory.allocate(4 * self.counts[choice], "the numbers of a view's splats")
         self.numbers_into(found, 0, choice)

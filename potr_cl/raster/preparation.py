@@ -31,9 +31,6 @@ class Projection(Owner):
     Attributes:
         filter_macros: macros that a kernel needs which goes through the projection again; none unless the scene is
             antialiased.
-
-    Raises:
-        DeviceError: the kernel cannot be built.
     """
 
     def __init__(self, device: Device, scene: SceneBuffers, rules: RasterRules, lanes: int) -> None:
@@ -180,11 +177,7 @@ class Preparation(Owner):
         self._enqueue_lists(views, for_frame=True)
 
     def counted(self, views: ViewSet) -> list[int]:
-        """How many intersections each view has, once the device has found them.
-
-        Raises:
-            DeviceError: one has too many.
-        """
+        """How many intersections each view has, once the device has found them."""
         return _accepted(views, views.read_counts())
 
     @contextmanager
@@ -244,9 +237,6 @@ class Preparation(Owner):
             composite: enqueues the pictures of a set, and what becomes of them.
             cameras: of the views.
             most: how many a set has at most; fewer, where the device has no room.
-
-        Raises:
-            DeviceMemoryError: a view alone does not fit the device.
         """
         number = 0
         views: ViewSet | None = None

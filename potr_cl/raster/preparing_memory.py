@@ -36,9 +36,6 @@ class LongLists(Owner):
 
         Returns:
             Whether there are any, and room to sort them here. Without room they are sorted as others are, only slower.
-
-        Raises:
-            DeviceError: the device failed.
         """
         keys: list[NDArray[np.int64]] = []
         lengths: list[NDArray[np.int64]] = []

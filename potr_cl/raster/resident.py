@@ -38,19 +38,11 @@ class SceneHandle(ABC):
 
     @abstractmethod
     def on(self, device: Device) -> AbstractContextManager[Drawable]:
-        """What to give to a rasterizer on a device, as long as the context lasts.
-
-        Raises:
-            DeviceError: the scene does not fit the device, or the device failed.
-        """
+        """What to give to a rasterizer on a device, as long as the context lasts."""
 
 
 def scene_on(device: Device, scene: Drawable | SceneHandle) -> AbstractContextManager[Drawable]:
-    """What to give to a rasterizer on a device for a scene, as long as the context lasts.
-
-    Raises:
-        DeviceError: the device failed, or has no room for a part of what it keeps.
-    """
+    """What to give to a rasterizer on a device for a scene, as long as the context lasts."""
     return scene.on(device) if isinstance(scene, SceneHandle) else nullcontext(scene)
 
 
@@ -199,11 +191,7 @@ class ResidentScene(Owner, SceneHandle):
             return self._elsewhere[device]
 
     def found_on(self, device: Device) -> Drawable:
-        """What to give to a rasterizer for the scene, on this device or another one.
-
-        Raises:
-            DeviceError: the other device failed.
-        """
+        """What to give to a rasterizer for the scene, on this device or another one."""
         buffers = self._buffers if device is self._device else self.bring_to(device).result()
         return self._scene if buffers is None else buffers
 

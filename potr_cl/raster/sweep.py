@@ -59,9 +59,6 @@ class TileSweep:
     Attributes:
         lanes: splats a work-item, in kernels that go over splats.
         most_views: that a launch can do.
-
-    Raises:
-        DeviceError: the kernel cannot be built.
     """
 
     def __init__(self, device: Device, rules: RasterRules, source: str, kernel: str, **macros: float) -> None:
@@ -92,9 +89,6 @@ class TileSweep:
             colours: (views, stride, 4) float32, R, G, B of each splat in each view.
             background: R, G, B behind the splats.
             arguments: what else the kernel takes.
-
-        Raises:
-            DeviceError: the device refused it.
         """
         of_family: dict[str, Any] = {"views": views.table, "stride": views.stride}
         if not self._gpu:

@@ -133,11 +133,7 @@ class ViewSet(Owner):
         return True
 
     def make_room(self, counts: Sequence[int]) -> None:
-        """Make room for this many intersections of each view. Earlier intersections are lost.
-
-        Raises:
-            DeviceMemoryError: the device has not that much, or not all in one buffer.
-        """
+        """Make room for this many intersections of each view. Earlier intersections are lost."""
         if self.capacity:
             self._memory.free(self.intersections, self.subtiles)
             self.capacity = 0

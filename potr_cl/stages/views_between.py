@@ -92,9 +92,6 @@ def room_for(added: Sequence[Camera], state: State, bench: Workbench) -> int:
         added: the views that might be added.
         state: its views come first.
         bench: of the stage that asks; its memory is what there is.
-
-    Raises:
-        DeviceError: the device fails, or has too little memory for one view.
     """
     if not added:
         return 0

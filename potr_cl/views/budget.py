@@ -69,9 +69,6 @@ class ViewCache(Owner):
 
         Returns:
             Whether they are kept. If not, the caller closes them.
-
-        Raises:
-            DeviceMemoryError: the device has no room for what views share.
         """
         to_spare = [*self._whole, views]
         shared = 0 if self.shared else max(GEOMETRY * self.largest, *map(self._geometry, to_spare))

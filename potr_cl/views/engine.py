@@ -114,9 +114,6 @@ class ViewEngine(Owner, Generic[W]):
         idle: numbers of views that draw nothing.
         passing: bytes that a set of streamed views takes while it is there, at most, where they take turns in the same
             memory. Others may have what that leaves.
-
-    Raises:
-        DeviceError: a view does not fit the device.
     """
 
     def __init__(
@@ -286,11 +283,7 @@ class ViewEngine(Owner, Generic[W]):
 
     @contextmanager
     def ready(self, launch: Launch[W]) -> Iterator[Ready[W]]:
-        """Views with their geometry, inside the block; the numbers of streamed ones' splats stay until the next ones'.
-
-        Raises:
-            DeviceError: they do not fit the device.
-        """
+        """Views with their geometry, inside the block; the numbers of streamed ones' splats stay until the next ones'."""
         if launch.resident is not None:
             self.project(launch.resident)
             yield launch.resident

@@ -49,9 +49,6 @@ class SeenRasterizer(Owner):
 
     Attributes:
         device, rules, background: as given.
-
-    Raises:
-        DeviceError: the device has no room for the numbers of the splats' groups.
     """
 
     def __init__(
@@ -96,9 +93,6 @@ class SeenRasterizer(Owner):
             numbers: of the views among them.
             cameras: the views.
             target, start: as of :meth:`render_into`.
-
-        Raises:
-            DeviceError: a view does not fit the device, or the device failed.
         """
         first = 0
         while first < len(numbers):
@@ -172,9 +166,6 @@ class SeenRasterizer(Owner):
             cameras: of the views.
             target: takes (pixels, 3) float32.
             start: byte where they begin.
-
-        Raises:
-            DeviceError: a view does not fit the device, or the device failed.
         """
         seen = self._groups.visible_by(cameras, self.rules.near)
         with Memory(self.device) as memory:
@@ -236,9 +227,6 @@ def rasterizer_of(
     Args:
         device, scene, rules, background: as of :class:`~potr_cl.raster.rasterizer.Rasterizer`.
         groups: of the scene's splats, where views see little of it (:func:`groups_worth_it`).
-
-    Raises:
-        DeviceError: the scene does not fit the device.
     """
     if groups is None:
         return Rasterizer(device, scene, rules, background)

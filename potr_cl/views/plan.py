@@ -195,9 +195,6 @@ def as_drawn(
         clusters: of those that are meant.
         memory: bytes of the device's that they may take.
         progress: called with the views whose splats are found, and their number.
-
-    Raises:
-        DeviceError: a piece of the scene does not fit the device.
     """
     found: list[ViewGroup] = []
     for cluster in clusters:

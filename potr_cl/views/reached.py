@@ -83,9 +83,6 @@ def reached_splats(
 
     Returns:
         None where views had better share all splats: there are few, or views reach many of them.
-
-    Raises:
-        DeviceError: a view with all splats does not fit the device.
     """
     if rasterizer.splats < LEAST_SPLATS or not numbers:
         return None
@@ -204,9 +201,6 @@ def surely_seen(scene: SceneBuffers, cameras: Sequence[Camera]) -> NDArray[np.ui
 
     Returns:
         (N,) :class:`Seen` of each splat; undecided where rounding could decide it.
-
-    Raises:
-        DeviceError: the device has no room, or failed.
     """
     device = scene.device
     seers = np.zeros(len(cameras), struct_dtype(_SOURCE, "Seer"))

@@ -99,9 +99,6 @@ class SplatSource(Owner, ABC):
             stack, memory: own what is taken.
             group: the group.
             left: take only these; None: all.
-
-        Raises:
-            DeviceError: the device has no room.
         """
 
     @abstractmethod

@@ -56,9 +56,6 @@ class Targets(Protocol):
             numbers: of the views.
             buffer: takes (H, W, 3) float32 of each, one behind the other.
             start: byte where they begin.
-
-        Raises:
-            DeviceError: the device failed, or a view does not fit it.
         """
         ...
 
@@ -96,11 +93,7 @@ def targets_of(
     background: tuple[float, float, float],
     sights: Visibility | None = None,
 ) -> Iterator[RenderedTargets]:
-    """A scene's pictures, with what each view may draw where that is known and the scene lies on a GPU: the same bits.
-
-    Raises:
-        DeviceError: the scene, or the numbers of its splats' groups, do not fit the device.
-    """
+    """A scene's pictures, with what each view may draw where that is known and the scene lies on a GPU: the same bits."""
     with ExitStack() as stack:
         if sights is not None and isinstance(scene, SceneBuffers) and device.family == "gpu":
             seen = stack.enter_context(SeenRasterizer(device, scene, sights.groups, background=background))
@@ -326,9 +319,6 @@ class TargetPictures(Owner):
         targets: give them, until others are named (:meth:`fill`, :meth:`of`).
         sets: of views that will be asked for, always together: there is room for the largest in any case. None: views
             are asked for in any order, and kept one by one.
-
-    Raises:
-        DeviceMemoryError: the device has no room for these.
     """
 
     def __init__(

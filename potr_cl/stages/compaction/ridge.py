@@ -38,9 +38,6 @@ class Slot(Owner):
 
     Attributes:
         buffers: by name. queue: that fills them and fetches the first one.
-
-    Raises:
-        DeviceError: the device has no room.
     """
 
     def __init__(self, device: Device, sizes: Mapping[str, tuple[int, str]], pinned: bool) -> None:

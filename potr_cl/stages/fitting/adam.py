@@ -99,9 +99,6 @@ class Adam(Owner):
     Attributes:
         buffers, columns: as given.
         values: (columns, stride) float32, the parameters; quaternions of length 1 at first.
-
-    Raises:
-        DeviceError: it does not fit the device, or the kernels cannot be built.
     """
 
     def __init__(

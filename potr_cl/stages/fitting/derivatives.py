@@ -80,9 +80,6 @@ class PictureDerivatives(Owner):
         rasterizer: of the scene.
         columns: which parameter is in which column of the gradient.
         gradient: (columns, stride) float32, what :meth:`add` adds to; zero at first.
-
-    Raises:
-        DeviceError: the scene does not fit the device, or the kernels cannot be built.
     """
 
     def __init__(
@@ -133,9 +130,6 @@ class PictureDerivatives(Owner):
             given: whether ``target`` holds v; if not, v is the views' difference to these pictures.
             unit: by what v is multiplied while it is summed up: with large numbers small differences keep their digits,
                 but what exceeds ``_LARGEST_VALUE`` then is cut.
-
-        Raises:
-            DeviceError: a view does not fit the device, or the device failed.
         """
         pixels = 0
         at_a_time = self._sweep.most_views
@@ -204,11 +198,7 @@ class PictureDerivatives(Owner):
         return found
 
     def add_sums(self, cameras: Sequence[Camera], sums: Sequence[tuple[int, Narrowed]], unit: float) -> None:
-        """:meth:`add` views of which all sums are known: the same bits.
-
-        Raises:
-            DeviceError: the views' projections and sums do not fit the device, or the device failed.
-        """
+        """:meth:`add` views of which all sums are known: the same bits."""
         known = dict(sums)
         for group in self._launches(cameras):
             some = [cameras[place] for place in group]

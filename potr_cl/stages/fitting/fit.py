@@ -47,9 +47,6 @@ class Judges(Owner):
         cameras: all views.
         pictures: what they should show.
         held_out: the numbers of those that judge.
-
-    Raises:
-        DeviceError: the sums do not fit the device, or the kernel cannot be built.
     """
 
     def __init__(
@@ -70,11 +67,7 @@ class Judges(Owner):
         return len(self._held_out)
 
     def error(self) -> float:
-        """The mean squared error of the scene as it is now, all views the same.
-
-        Raises:
-            DeviceError: a view does not fit the device, or the device failed.
-        """
+        """The mean squared error of the scene as it is now, all views the same."""
         for place, number in enumerate(self._held_out):
             image, _ = self._rasterizer.render_device(self._cameras[number])
             self._kernel.bind(

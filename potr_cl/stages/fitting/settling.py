@@ -99,9 +99,6 @@ def settle(
         the steps of now, if the output is a .potr file in one block of version 2 or later: what others hold is not
         known here. What is learnt are the parameters that coefficients were chosen with. And the mean squared
         error of the held-out views after each fit.
-
-    Raises:
-        DeviceError: it does not fit the device.
     """
     errors: list[float] = []
 

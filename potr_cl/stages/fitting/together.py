@@ -90,9 +90,6 @@ class Descent(Owner):
     Attributes:
         derivatives, adam: of the scene.
         taken: steps, so far.
-
-    Raises:
-        DeviceError: the scene does not fit the device.
     """
 
     def __init__(self, device: Device, ground: Ground, pictures: TargetPictures) -> None:
@@ -192,11 +189,7 @@ class Together:
         self._since, self._seconds = 0.0, list[float]()
 
     def step(self, batch: Batch) -> None:
-        """Take a step.
-
-        Raises:
-            DeviceError: the first device failed.
-        """
+        """Take a step."""
         self._look_at_the_time()
         if self._helping.parts is None or _FIRST + _TRIED <= self._steps < _FIRST + 2 * _TRIED:
             self._descent.step(batch)

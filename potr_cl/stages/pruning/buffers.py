@@ -48,9 +48,6 @@ class Survivors(Owner):
 
     Attributes:
         buffer: (stride,) uint8 in the device's memory, :class:`SplatState`.
-
-    Raises:
-        DeviceMemoryError: the device has no room.
     """
 
     def __init__(self, device: Device, splats: int, stride: int, wait: Callable[[], None]) -> None:
@@ -138,9 +135,6 @@ class PreparedSet(Owner):
         sums: (intersections, 2) float32, ΔMSE and I of an intersection, summed over its tile's pixels.
         target: (pixels, 3) float32, the pictures before any removal.
         first_tile: where the tiles begin among those of all resident views.
-
-    Raises:
-        DeviceMemoryError: the device has no room.
     """
 
     def __init__(
@@ -182,9 +176,6 @@ class PreparedSet(Owner):
         Returns:
             The view, the splat of each of its intersections, (intersections,) uint32, and their sums, (intersections,
             2) float32.
-
-        Raises:
-            DeviceError: the device failed.
         """
         view, start = self.views.views[place], self.views.intersection_starts[place]
         intersections = np.empty(view.intersection_count, np.uint32)
@@ -216,9 +207,6 @@ class Ledger(Owner):
     Attributes:
         marks, totals, numbers: for the kernels; no numbers: they know places only.
         is_local: whether :meth:`add_to` has anything to do.
-
-    Raises:
-        DeviceError: the device has no room.
     """
 
     def __init__(self, survivors: Survivors, totals: cl.Buffer, subset: Subset) -> None:

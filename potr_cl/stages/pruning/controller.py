@@ -50,11 +50,7 @@ def prune_scene(
 
 
 class _Controller(Owner):
-    """The schedule with its state in the device's memory.
-
-    Raises:
-        DeviceError: the device has no room for the state.
-    """
+    """The schedule with its state in the device's memory."""
 
     def __init__(self, removal: RemovalSweep, options: PruningOptions, spared: NDArray[np.bool_] | None) -> None:
         self._removal, self._options = removal, options

@@ -38,9 +38,6 @@ class AlivePacking(Owner):
         device: that has the totals.
         splats: N.
         states: (N,) uint8 in its memory, :class:`potr_cl.stages.pruning.buffers.SplatState`.
-
-    Raises:
-        DeviceError: the device has no room.
     """
 
     def __init__(self, device: Device, splats: int, states: cl.Buffer) -> None:
@@ -102,9 +99,6 @@ class ChangedTotals(Owner):
         splats: N.
         states: (N,) uint8 in its memory, :class:`potr_cl.stages.pruning.buffers.SplatState`. Nobody asks for the
             totals of splats that are not alive.
-
-    Raises:
-        DeviceError: the device has no room.
     """
 
     def __init__(self, device: Device, splats: int, states: cl.Buffer) -> None:
@@ -147,9 +141,6 @@ class AddedChanges(Owner):
 
     Args:
         device: that has the totals.
-
-    Raises:
-        DeviceError: the kernels cannot be built.
     """
 
     def __init__(self, device: Device) -> None:

@@ -44,9 +44,6 @@ class RemovalPart(Part):
         background: R, G, B behind the scene.
         numbers: of the views of this part, ascending.
         sights: what all views see of it, where each had better be looked at with what it sees; None: with all splats.
-
-    Raises:
-        DeviceError: the scene or a view does not fit the device.
     """
 
     def __init__(
@@ -146,9 +143,6 @@ class RemovalHelpers(Owner):
         pool: of their workers.
         numbers: of each part's splats, (n,) int64, ascending, where it has no others and knows them by their places;
             None: all parts have all.
-
-    Raises:
-        DeviceError: the device has no room.
     """
 
     def __init__(
@@ -258,9 +252,6 @@ def measurement(
         spared: as of :class:`~potr_cl.stages.pruning.removal.RemovalSweep`; only with ``sights``.
         dealt: the views, for a pool whose workers get what these see and no more of the scene.
         seen: (n,) numbers of the splats that the sweep is to have, ascending, which it numbers from 0 on; None: all.
-
-    Raises:
-        DeviceError: the scene or a view does not fit the device.
     """
 
     def progress(done: int, count: int) -> None:

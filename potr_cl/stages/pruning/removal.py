@@ -370,9 +370,6 @@ def planned_sweep(
         background: R, G, B behind the scene.
         visibility: what the views may draw, where each had better be looked at with that; None: with all splats.
         scene: the uncompressed scene on the host; None: it is there only if ``drawable`` is.
-
-    Raises:
-        DeviceError: the scene or a view does not fit the device.
     """
     scene = drawable if isinstance(drawable, Scene) else scene
     memory = default_memory(device) if options.memory is None else options.memory

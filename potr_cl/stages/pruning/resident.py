@@ -51,11 +51,7 @@ class Queues:
                 queue.flush()
 
     def wait(self) -> None:
-        """Return once all is done.
-
-        Raises:
-            DeviceError: the device failed.
-        """
+        """Return once all is done."""
         with self._device.errors("failed while computing"):
             for queue in self._queues:
                 queue.finish()

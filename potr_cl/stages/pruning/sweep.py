@@ -222,9 +222,6 @@ class SweepLauncher:
         rasterizer: of the views.
         options: where pixels end.
         fixed_point: the totals' units.
-
-    Raises:
-        DeviceError: the kernels cannot be built.
     """
 
     def __init__(self, rasterizer: Rasterizer, options: SweepOptions, fixed_point: FixedPoint) -> None:

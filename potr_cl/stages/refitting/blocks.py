@@ -176,9 +176,6 @@ class Rounding(Owner):
     Args:
         coefficients: whose vectors are rounded.
         steps: of the splats.
-
-    Raises:
-        DeviceError: the device has no room, or the kernels cannot be built.
     """
 
     def __init__(self, coefficients: Coefficients, steps: Steps) -> None:

@@ -44,9 +44,6 @@ class Coefficients(SlicedArrays):
     Attributes:
         device, layout: as given.
         active: device buffer of the flags, (2, stride) uint32, a bit a coefficient; all are set at first.
-
-    Raises:
-        DeviceError: the device has no room, or the kernels cannot be built.
     """
 
     def __init__(self, device: Device, layout: Layout, splats: int | None = None, resident: int = 0) -> None:

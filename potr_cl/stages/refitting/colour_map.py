@@ -57,9 +57,6 @@ class ColourMap:
 
         Returns:
             The squared error |pictures(x) - targets|² by W.
-
-        Raises:
-            DeviceError: the device failed. What the targets raise.
         """
         own, coefficients, unit = self.own, self._coefficients, 1 / self.own.one
         ranges = [] if blocks is None else blocks.ranges
@@ -103,9 +100,6 @@ class ColourMap:
             ridge: of the coefficients that may change; the result's others become 0.
             constant: the direction's AC coefficients are all 0, and the pictures' part of the result's is left out.
             part: number of the part of the views that stands for all of them, modulo their number. None: all.
-
-        Raises:
-            DeviceError: the device failed.
         """
         own, coefficients = self.own, self._coefficients
         part = None if part is None else part % own.parts

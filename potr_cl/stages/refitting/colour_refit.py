@@ -131,9 +131,6 @@ class ColourRefit(Owner):
             active: (N, M, 3) in Y, Co, Cg: the coefficients that may change; all by default.
             hold: whether the other coefficients keep their values; if not, they become 0.
             progress: called with the steps done and their greatest number.
-
-        Raises:
-            DeviceError: the device failed.
         """
         self.start_from(sh, active, hold)
 
@@ -161,9 +158,6 @@ class ColourRefit(Owner):
         Args:
             targets, options: as :meth:`solve` takes them; none are given up.
             sh: (N, M, 3) R, G, B, the start; None: the solution before, perhaps rounded. AC coefficients stay.
-
-        Raises:
-            DeviceError: the device failed.
         """
         coefficients, solver = self.coefficients, self.solver
         if sh is not None:

@@ -41,9 +41,6 @@ class PackedRow(Owner):
     Attributes:
         flags: as given.
         count: coefficients whose flags were set when :meth:`settle` was called last.
-
-    Raises:
-        DeviceError: the kernels cannot be built.
     """
 
     def __init__(self, coefficients: Coefficients, flags: cl.Buffer) -> None:
@@ -131,11 +128,7 @@ class PackedRow(Owner):
 
 
 def packing_kernel(coefficients: Coefficients, name: str) -> Kernel:
-    """A kernel of the program that packs a scene's coefficients, which is built once.
-
-    Raises:
-        DeviceError: it cannot be built.
-    """
+    """A kernel of the program that packs a scene's coefficients, which is built once."""
     return coefficients.device.kernel(_SOURCE, name, LANES=1, SH_COUNT=coefficients.layout.sh_count, RUN=_RUN)
 
 
@@ -175,9 +168,6 @@ class Exchange(Owner):
 
     Attributes:
         lends: as given, until flags are taken: who is lent something lends its own.
-
-    Raises:
-        DeviceError: the kernels cannot be built.
     """
 
     def __init__(self, coefficients: Coefficients, lends: bool = False) -> None:
@@ -392,9 +382,6 @@ class DrawnRows(Owner):
         coefficients: whose vectors are packed, by their flags as they are now until :meth:`take_flags`.
         exchange: of the same.
         drawn: (N,) which splats the views of each part draw, by the part's number.
-
-    Raises:
-        DeviceMemoryError: the device has no room.
     """
 
     def __init__(self, coefficients: Coefficients, exchange: Exchange, drawn: Mapping[int, NDArray[np.bool_]]) -> None:

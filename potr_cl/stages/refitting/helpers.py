@@ -78,9 +78,6 @@ class ColourPart(Part):
         cameras: all views.
         numbers: of the views of this part, ascending.
         sights: what all views may draw of the source, where no view sees much of it.
-
-    Raises:
-        DeviceError: the scenes or a view do not fit the device.
     """
 
     def __init__(
@@ -230,9 +227,6 @@ class ColourHelpers(Owner):
         coefficients: the master's, whose vectors are sent.
         others: parts, each a :class:`ColourPart`.
         in_process: whether they are threads of this process, which read what lies on the master's device themselves.
-
-    Raises:
-        DeviceError: the kernels cannot be built.
     """
 
     def __init__(self, coefficients: Coefficients, others: Parts, in_process: bool) -> None:

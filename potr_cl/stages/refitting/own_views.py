@@ -44,9 +44,6 @@ class ViewErrors(Owner):
 
     Attributes:
         latest: (tiles,) float32 on the device, where a sweep writes what it finds.
-
-    Raises:
-        DeviceError: the device has no room.
     """
 
     def __init__(
@@ -128,9 +125,6 @@ class OwnViews(Owner):
             they are few.
         one: what is 1 in :attr:`sums`, and in those of the splats' own blocks.
         sums: (3 M, stride) int64 in the device's memory, what the views have added to coefficients.
-
-    Raises:
-        DeviceError: a view does not fit the device, or the kernels cannot be built.
     """
 
     def __init__(
@@ -208,11 +202,7 @@ class OwnViews(Owner):
         return self._cache.room
 
     def prepare(self, targets: Targets) -> None:
-        """Have the pictures of this device's views that are kept there, before the first gradient asks for them.
-
-        Raises:
-            DeviceError: the device failed. What the targets raise.
-        """
+        """Have the pictures of this device's views that are kept there, before the first gradient asks for them."""
         self._targets.fill([each.launch.numbers for each in self._launches], targets)
 
     def add_up(self, look: Look) -> None:

@@ -159,9 +159,6 @@ class SlicedArrays(Owner):
 
     Attributes:
         device, layout: as given.
-
-    Raises:
-        DeviceError: the device has no room for what the arrays need besides.
     """
 
     def __init__(self, device: Device, layout: Layout, splats: int | None = None) -> None:

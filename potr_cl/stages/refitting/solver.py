@@ -83,9 +83,6 @@ class ConjugateGradients:
 
         Returns:
             The number of steps done.
-
-        Raises:
-            DeviceError: the device failed.
         """
         vectors, direction, product, preconditioned = self._vectors, self.direction, self.product, self.preconditioned
         vectors.zero(direction)
@@ -164,9 +161,6 @@ class ColourSolver:
     Attributes:
         x: the coefficients: set them to the start before :meth:`solve`, which leaves the solution in them.
         blocks: the splats' own blocks, as they were at the last start.
-
-    Raises:
-        DeviceError: the device has no room, or the kernels cannot be built.
     """
 
     def __init__(self, coefficients: Coefficients, blocks: SplatBlocks) -> None:
@@ -200,9 +194,6 @@ class ColourSolver:
             check: measure the true error of the result, and go back if the start was better. If not, the error after
                 the solution is not a number.
             after_start: called when the blocks are those of the start.
-
-        Raises:
-            DeviceError: the device failed.
         """
         problem = _Problem(colour_map, targets, constant)
         vectors, gradients, ridge, whole = self._coefficients, self._gradients, descent.ridge, colour_map.total_weight
@@ -241,11 +232,7 @@ class ColourSolver:
         return Solved((first.error / whole, last.error / whole), steps + more, start)
 
     def error(self, colour_map: ColourMap, targets: Targets) -> float:
-        """Mean squared error at ``x``.
-
-        Raises:
-            DeviceError: the device failed.
-        """
+        """Mean squared error at ``x``."""
         self._coefficients.zero(self._residual)
         return colour_map.gradient(self.x, targets, self._residual) / colour_map.total_weight
 
@@ -254,9 +241,6 @@ class ColourSolver:
 
         Returns:
             What it did; the error after it is not a number.
-
-        Raises:
-            DeviceError: the device failed.
         """
         problem = _Problem(colour_map, targets, constant=False)
         self._coefficients.copy(self._start, self.x)

@@ -55,9 +55,6 @@ class RefitSweep:
         lanes: splats a work-item, in kernels that go over splats.
         most_views: that a launch can do.
         gathered: launches whose sums are gathered together, where each does one view.
-
-    Raises:
-        DeviceError: the kernels cannot be built.
     """
 
     def __init__(self, device: Device) -> None:
@@ -101,9 +98,6 @@ class RefitSweep:
             errors: (tiles,) float32, becomes each tile's sum of squared pixel values.
             totals: (views, stride, 4) int64: weight times value, three channels, and the squared weights are added.
             weights: sum up the squared weights too.
-
-        Raises:
-            DeviceError: the device refused it.
         """
         self._sweeps[weights].run(
             views,
@@ -166,9 +160,6 @@ class ViewKernels:
         layout: of the coefficients.
         means: (3, stride) float32, the splats' centres on the device.
         scales: float32, by what each view's sums are multiplied on their way to the coefficients.
-
-    Raises:
-        DeviceError: the kernels cannot be built.
     """
 
     def __init__(self, device: Device, layout: Layout, means: cl.Buffer, scales: cl.Buffer) -> None:
