@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +10,6 @@ from numpy.typing import NDArray
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
-from potr_cl.opencl.kernel import Kernel
 from potr_cl.opencl.memory import Memory, Owner
 
 #: Floats in a row are a multiple of this.
@@ -88,36 +86,8 @@ def errors_at_zero(points: FloatArray, weights: FloatArray) -> NDArray[np.float6
     return errors
 
 
-#: Work-items of a GPU's work-group, a point each.
+#: Work-items of a GPU's work-group, a point each; and points that are compared with the same centres.
 _GROUP = 128
-
-
-@dataclass(frozen=True)
-class NearestLauncher:
-    """Runs the kernel "nearest" in one family's way.
-
-    Attributes:
-        block: points that are compared with the same centres.
-        group: work-items of a work-group, and for a block.
-    """
-
-    kernel: Kernel
-    block: int
-    group: int
-
-    def enqueue(self, blocks: int, **arguments: Any) -> None:
-        """Enqueue it for so many blocks, with the arguments that cl/clustering/nearest_*.cl declare."""
-        self.kernel.bind(**arguments).launch((blocks * self.group,), (self.group,))
-
-
-def launcher_for(device: Device, width: int) -> NearestLauncher:
-    """The launcher of the device's kernel family, for rows of so many floats."""
-    if device.family == "gpu":
-        kernel = device.shared_kernel("clustering/nearest_gpu.cl", "nearest", WIDTH=width, GROUP=_GROUP)
-        return NearestLauncher(kernel, _GROUP, _GROUP)
-    lanes = device.vector_width
-    kernel = device.shared_kernel("clustering/nearest_cpu.cl", "nearest", WIDTH=width, LANES=lanes)
-    return NearestLauncher(kernel, lanes, 1)
 
 
 U32 = NDArray[np.uint32]
@@ -154,7 +124,12 @@ class Points(Owner):
     def __init__(self, device: Device, rows: FloatArray) -> None:
         self._device = device
         self._count, self._width = rows.shape
-        self._launcher = launcher_for(device, self._width)
+        gpu = device.family == "gpu"
+        # Points that are compared with the same centres, and the work-items of their work-group.
+        self._block, self._group = (_GROUP, _GROUP) if gpu else (device.vector_width, 1)
+        macros = {"GROUP": _GROUP} if gpu else {"LANES": self._block}
+        source = f"clustering/nearest_{device.family}.cl"
+        self._nearest = device.shared_kernel(source, "nearest", WIDTH=self._width, **macros)
         self._sums = device.shared_kernel("clustering/sums.cl", "sums", WIDTH=self._width)
         self._memory = Memory(device)
         with device.all_or_nothing():
@@ -178,10 +153,9 @@ class Points(Owner):
             lists: which centres the points of a cell are compared with; None: one cell's points with all.
         """
         lists = lists or Lists.of_all(len(centres))
-        order, block_cells = _blocks(self._count, cells, len(lists.runs_of) - 1, self._launcher.block)
+        order, block_cells = _blocks(self._count, cells, len(lists.runs_of) - 1, self._block)
         with Memory(self._device) as memory:
-            self._launcher.enqueue(
-                len(block_cells),
+            self._nearest.bind(
                 points=self._rows,
                 order=memory.upload(order, "the order of vectors"),
                 cells=memory.upload(block_cells, "the cells of vectors"),
@@ -191,7 +165,7 @@ class Points(Owner):
                 biases=memory.upload(np.zeros(len(centres), np.float32) if biases is None else biases, "their biases"),
                 labels=self._labels,
                 scores=self._scores,
-            )
+            ).launch((len(block_cells) * self._group,), (self._group,))
             labels: U32 = self._device.download(self._labels, (self._count,), np.uint32)
         return labels, self._device.download(self._scores, (self._count,), np.float32)
 

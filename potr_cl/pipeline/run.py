@@ -18,7 +18,7 @@ from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import Output
 from potr_cl.pipeline.encoded import Encoded, SharedOut
-from potr_cl.pipeline.fallback import Attempt, attempts, for_views, on_device
+from potr_cl.pipeline.fallback import for_views, on_device
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.placement.rays import unresolved
 from potr_cl.raster.rasterizer import Rasterizer
@@ -172,14 +172,7 @@ class Run:
         for stage in self._options.stages:
             if (only is not None and type(stage) not in only) or not self._is_wanted(stage, state):
                 continue
-            bench = self._bench(stage, state)
-            if stage.needs_views:
-                for attempt in attempts(self.device or self._given or Device(), self._options.memory):
-                    with attempt.made():
-                        after = stage.run(state, self._on(attempt, bench, state))
-                self.device = attempt.device
-            else:
-                after = stage.run(state, bench)
+            after = self._done(stage, state)
             after = as_they_were(after)
             # What is before it is kept no longer than this: colours of a large scene take gigabytes.
             state = self._fit_that_pays(state, after) if isinstance(stage, Fit) else after
@@ -244,11 +237,20 @@ class Run:
             photographs=next((each.ground_truth for each in options.stages if isinstance(each, Refit)), None),
         )
 
-    def _on(self, attempt: Attempt, bench: Workbench, state: State) -> Workbench:
-        device = attempt.device
-        pool = self._pool if self._pool is not None and device is self._pool.first else None
-        room = for_views(device, attempt.memory, len(state.source))
-        return dataclasses.replace(bench, device=device, memory=room, pool=pool)
+    def _done(self, stage: Stage, state: State) -> State:
+        """The state after a stage."""
+        bench = self._bench(stage, state)
+        if not stage.needs_views:
+            return stage.run(state, bench)
+
+        def work(device: Device, memory: int | None) -> State:
+            pool = self._pool if self._pool is not None and device is self._pool.first else None
+            room = for_views(device, memory, len(state.source))
+            return stage.run(state, dataclasses.replace(bench, device=device, memory=room, pool=pool))
+
+        given = self.device or self._given or Device()
+        after, self.device = on_device(given, self._options.memory, work)
+        return after
 
     def _interludes(self, stage: Stage, state: State) -> tuple[Interlude, ...]:
         """What other stages want done while this one removes splats."""

@@ -15,9 +15,9 @@ from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import standpoints
 from potr_cl.stages.compaction.ridge import ColourModel, CompactionOptions, Compactor, Weighting
 from potr_cl.stages.compaction.view_weights import ViewWeights
-from potr_cl.stages.pruning.helpers import Measured, measurement
+from potr_cl.stages.pruning.helpers import importances_of, measurement
 from potr_cl.stages.pruning.sweep import SweepOptions
-from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
+from potr_cl.stages.stage import Flag, Importances, Interlude, Stage, State, Workbench, option
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Compact(Stage):
         )
         with _importances(state, bench) as measured:
             bench.progress("compact", 0.0)
-            weights = ViewWeights.from_importances(len(state.scene), measured.view_importances())
+            weights = ViewWeights.from_importances(len(state.scene), measured)
             places = standpoints(state.views, state.source.means)
             sh = Compactor(bench.opened).compact(state.scene, places, weights, options).sh
             bench.progress("compact", 1.0)
@@ -106,7 +106,7 @@ class Compact(Stage):
 
 
 @contextmanager
-def _importances(state: State, bench: Workbench) -> Iterator[Measured]:
+def _importances(state: State, bench: Workbench) -> Iterator[Importances]:
     """Importances view by view: those that pruning has measured, or, without pruning, measured for this."""
     if state.importances is not None:
         yield state.importances
@@ -114,4 +114,4 @@ def _importances(state: State, bench: Workbench) -> Iterator[Measured]:
     bench.progress("prepare views", 0.0)
     with measurement(state, bench, SweepOptions(memory=bench.memory)) as removal:
         removal.measure()
-        yield Measured(removal, np.arange(len(state.scene)))
+        yield importances_of(removal, np.arange(len(state.scene)))

@@ -14,7 +14,7 @@ from potr_cl.model.scene import FloatArray
 from potr_cl.raster.resident import scene_on
 from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.stages.pruning.controller import prune_scene
-from potr_cl.stages.pruning.helpers import Measured, measurement
+from potr_cl.stages.pruning.helpers import importances_of, measurement
 from potr_cl.stages.pruning.removal import LARGEST_LIMIT, RemovalSweep
 from potr_cl.stages.pruning.schedule import Course, Pruned, PruningOptions
 from potr_cl.stages.pruning.sweep import SweepOptions
@@ -343,7 +343,7 @@ class _Course:
 
     def visit(self, interlude: Interlude, splats: NDArray[np.int64], bench: Workbench) -> None:
         """Have another stage work on these of the removal's splats, and go on with the colours that it gives them."""
-        given = replace(self.left(splats, interlude.afresh), importances=Measured(self._removal, splats))
+        given = replace(self.left(splats, interlude.afresh), importances=importances_of(self._removal, splats))
         then = interlude.stage.run(given, bench)
         if then is given:
             return

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from potr_cl.codec.quantize import HyperParameters
     from potr_cl.stages.fitting.fitted import Fitted, LeftOut
     from potr_cl.stages.held_out import PhotographChoice
-    from potr_cl.stages.pruning.helpers import Measured
     from potr_cl.stages.pruning.schedule import Pruned
     from potr_cl.stages.refitting.refit_options import Refitted
     from potr_cl.stages.unseen import Unresolved, Unseen
@@ -86,6 +85,8 @@ class Results:
     coded: Coded | None = None
 
 
+#: The number of a view, the numbers of the splats that it sees, ascending, and the mean of T α of each over its pixels.
+Importances: TypeAlias = Iterator[tuple[int, NDArray[np.int64], NDArray[np.float64]]]
 #: Called with the name of what is being done and the part of it that is done, 0 to 1.
 Progress = Callable[[str, float], None]
 
@@ -114,7 +115,7 @@ class State:
     survivors: NDArray[np.int64]
     views: tuple[Camera, ...]
     geometry: Rounded | None = None
-    importances: Measured | None = None
+    importances: Importances | None = None
     results: Results = field(default_factory=Results)
     added: int = 0
     cut: Scene | None = None

@@ -283,7 +283,7 @@ class ViewEngine(Owner, Generic[W]):
 
     @contextmanager
     def ready(self, launch: Launch[W]) -> Iterator[Ready[W]]:
-        """Views with their geometry, inside the block; the numbers of streamed ones' splats stay until the next ones'."""
+        """Views with their geometry, inside the block; streamed ones' splats' numbers stay until the next ones'."""
         if launch.resident is not None:
             self.project(launch.resident)
             yield launch.resident

@@ -74,7 +74,7 @@ class Parts(Owner):
             DeviceError: no worker can make them.
         """
         making, self._making = self._making, {}
-        self._collect(making, self._take_made, None)
+        self._collect(making, self._held.__setitem__, None)
 
     def __len__(self) -> int:
         return len(self._given)
@@ -174,9 +174,6 @@ class Parts(Owner):
         self._pool.traffic.add(sent=nbytes(args), what=command)
         return held.begin(command, args)
 
-    def _take_made(self, place: int, held: Held) -> None:
-        self._held[place] = held
-
     def _able(self) -> list[Worker]:
         """Workers that have neither been lost nor failed with a part of this work; without any, the reserve."""
         for workers in (self._pool.workers, self._pool.reserve):
@@ -270,9 +267,6 @@ class Parts(Owner):
         except NotInTime:
             raise WorkerLost("it does not answer") from None
 
-    def _note(self, command: str, args: tuple[Any, ...]) -> None:
-        self._log.append((command, args))
-
 
 #: A method of the parts, and what it is given.
 _Command: TypeAlias = "tuple[str, Sequence[Any]]"
@@ -341,7 +335,7 @@ class Pending:
             parts._pending = None  # it is over
             raise
         if self._logged:
-            parts._note(self._command, self._args)
+            parts._log.append((self._command, self._args))
         self._found = [found[place] for place in range(len(found))]
         return self._found
 

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from potr_cl.errors import UsageError
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
-from potr_cl.opencl.kernel import Kernel
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.stages.compaction.view_weights import ViewWeights
 
@@ -117,31 +116,6 @@ class Slot(Owner):
             mapped.release(self.queue)
         self._maps.clear()
         self._memory.close()
-
-
-@dataclass(frozen=True)
-class LaunchShape:
-    """How a kernel family runs the compaction.
-
-    Attributes:
-        lanes: splats that a work-item takes.
-        block: rows of the basis matrix that are reduced at a time.
-        group: work-items of a work-group.
-        pinned: whether data go to the device by way of pinned memory.
-    """
-
-    lanes: int
-    block: int
-    group: int
-    pinned: bool
-
-
-def launch_shape(device: Device) -> LaunchShape:
-    """The shape for a device's kernel family."""
-    if device.family == "gpu":
-        return LaunchShape(lanes=1, block=4, group=64, pinned=True)
-    # Work-groups of one work-item: these kernels keep kilobytes of private memory each.
-    return LaunchShape(lanes=device.vector_width, block=8, group=1, pinned=False)
 
 
 ColourModel = Literal["ycocg", "rgb"]
@@ -244,8 +218,17 @@ class Compactor:
         _check(splats, camera_centres, weights)
         if count == 1:
             return scene
-        shape = launch_shape(self.device)
-        kernel = self._kernel(count, options, shape)
+        gpu = self.device.family == "gpu"
+        # A CPU's work-groups have one work-item: these kernels keep kilobytes of private memory each.
+        lanes, group = (1, 64) if gpu else (self.device.vector_width, 1)
+        kernel = self.device.kernel(
+            "compact/ridge.cl",
+            "compact",
+            ORTHOGONAL=int(options.precision == "orthogonal"),
+            LANES=lanes,
+            SH_COUNT=count,
+            BLOCK=4 if gpu else 8,  # rows of the basis matrix that are reduced at a time
+        )
 
         share = camera_centres.shape[1] if camera_centres.ndim == 3 else 1
         camera_centres = camera_centres.reshape(-1, 3)
@@ -268,7 +251,7 @@ class Compactor:
         with contextlib.ExitStack() as stack:
             memory = stack.enter_context(Memory(self.device))
             device_centres = memory.upload(centres, "the cameras")
-            slots = [stack.enter_context(Slot(self.device, sizes, shape.pinned)) for _ in range(min(len(batches), 2))]
+            slots = [stack.enter_context(Slot(self.device, sizes, gpu)) for _ in range(min(len(batches), 2))]
             pool = stack.enter_context(ThreadPoolExecutor(_COPIERS))
             for number, (start, stop) in enumerate(batches):
                 slot = slots[number % len(slots)]
@@ -286,20 +269,14 @@ class Compactor:
                         scale_factor=options.sf_sh if options.two_pass else 0,
                         ycocg=options.colour_model == "ycocg",
                     )
-                    groups = -(-seen // (shape.lanes * shape.group))
-                    kernel.launch((groups * shape.group,), (shape.group,), slot.queue)
+                    groups = -(-seen // (lanes * group))
+                    kernel.launch((groups * group,), (group,), slot.queue)
                 slot.download(result[start:stop])
             for slot in slots:
                 slot.collect(pool)
         # These came back as they were.
         result[np.diff(offsets) == 0, 1:] = 0
         return replace(scene, sh=result)
-
-    def _kernel(self, sh_count: int, options: CompactionOptions, shape: LaunchShape) -> Kernel:
-        macros = {"LANES": shape.lanes, "SH_COUNT": sh_count, "BLOCK": shape.block}
-        return self.device.kernel(
-            "compact/ridge.cl", "compact", ORTHOGONAL=int(options.precision == "orthogonal"), **macros
-        )
 
     def _batches(self, offsets: NDArray[np.int64], sh_count: int) -> list[tuple[int, int]]:
         """Runs of splats of which two fit the memory budget, and one each of the device's buffers."""

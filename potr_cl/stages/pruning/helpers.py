@@ -297,25 +297,20 @@ def measurement(
         yield sweep
 
 
-class Measured:
-    """What a sweep measured of the splats that are left.
+def importances_of(
+    removal: RemovalSweep, left: NDArray[np.int64]
+) -> Iterator[tuple[int, NDArray[np.int64], NDArray[np.float64]]]:
+    """I_k(s) of the splats that are left, view by view.
 
     Args:
         removal: the sweep, which has measured.
         left: (n,) the sweep's numbers of the splats that are left, ascending.
+
+    Yields:
+        The number of the view, the numbers among those left of the splats that it sees, ascending, and the mean of T α
+        of each over the view's pixels.
     """
-
-    def __init__(self, removal: RemovalSweep, left: NDArray[np.int64]) -> None:
-        self._removal = removal
-        self._places = np.full(removal.splats, -1, np.int64)
-        self._places[left] = np.arange(len(left))
-
-    def view_importances(self) -> Iterator[tuple[int, NDArray[np.int64], NDArray[np.float64]]]:
-        """I_k(s) of the splats that are left, view by view.
-
-        Yields:
-            The number of the view, the numbers among those left of the splats that it sees, ascending, and the mean of
-            T α of each over the view's pixels.
-        """
-        for view, seen, importances in self._removal.view_importances():
-            yield view, self._places[seen], importances
+    places = np.full(removal.splats, -1, np.int64)
+    places[left] = np.arange(len(left))
+    for view, seen, importances in removal.view_importances():
+        yield view, places[seen], importances
