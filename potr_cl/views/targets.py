@@ -93,7 +93,7 @@ def targets_of(
     background: tuple[float, float, float],
     sights: Visibility | None = None,
 ) -> Iterator[RenderedTargets]:
-    """A scene's pictures; by what each view may draw, where that is known and the scene lies on a GPU: the same bits."""
+    """A scene's pictures; by what views may draw, where that is known and the scene lies on a GPU: the same bits."""
     with ExitStack() as stack:
         if sights is not None and isinstance(scene, SceneBuffers) and device.family == "gpu":
             seen = stack.enter_context(SeenRasterizer(device, scene, sights.groups, background=background))
