@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from potr_cl.codec.body import Body
 from potr_cl.codec.decoder import PotrFile
-from potr_cl.codec.destination import BundleTaker
+from potr_cl.codec.dequantizer import BundleTaker
 from potr_cl.codec.native.values import BUNDLE, PACKED, PackedValues
 from potr_cl.errors import DataError
 from potr_cl.model.scene import LOW_PASS, most_coefficients
@@ -110,7 +110,7 @@ _WORTH_PINNING = 1 << 18
 
 
 class Activated:
-    """Values as the projection takes them (:class:`potr_cl.codec.destination.Activation`)."""
+    """Values as the projection takes them (:class:`potr_cl.codec.dequantizer.Activation`)."""
 
     def scales(self, log_scales: F32) -> F32:
         return activated_scales(log_scales).astype(np.float32)

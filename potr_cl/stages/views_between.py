@@ -14,7 +14,7 @@ from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import UsageError
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
-from potr_cl.model.placement.given_views import GivenViews
+from potr_cl.model.given_views import GivenViews
 from potr_cl.model.scene import Scene
 from potr_cl.model.views_between import SPREAD, views_between
 from potr_cl.model.virtual_cameras import is_virtual
@@ -62,7 +62,7 @@ def views_where_few(views_of_parts: NDArray[np.int64]) -> float:
 
     Args:
         views_of_parts: (K,) how many training views show each part of the scene
-            (:meth:`potr_cl.model.placement.given_views.GivenViews.views_of_parts`), at least one.
+            (:meth:`potr_cl.model.given_views.GivenViews.views_of_parts`), at least one.
     """
     return float(np.quantile(views_of_parts, _PART))
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from potr_cl.errors import DeviceMemoryError
 from potr_cl.model.camera import Camera
-from potr_cl.model.unseen import NEAR, REACH, bounds, views_in_turn
+from potr_cl.model.splat_groups import NEAR, REACH, bounds, views_in_turn
 from potr_cl.opencl.memory import Memory, Reused
 from potr_cl.opencl.structs import struct_dtype
 from potr_cl.raster.picked_splats import Picker

@@ -11,7 +11,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from potr_cl.errors import UsageError
-from potr_cl.host.installation import install_command
+from potr_cl.host.libraries import install_command
 
 if TYPE_CHECKING:
     from dask.distributed import Client

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from potr_cl.model.unseen import unseen_splats
+from potr_cl.model.splat_groups import unseen_splats
 from potr_cl.raster.scene_buffers import uploaded
 from potr_cl.stages.stage import State
 from potr_cl.stages.unseen import find_unseen

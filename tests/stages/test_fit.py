@@ -17,8 +17,7 @@ from potr_cl.stages.fitting.fit import FitOptions, batches, fit_scene, held_out_
 from potr_cl.stages.fitting.fitted import Fitted, LeftOut
 from potr_cl.stages.held_out import share_out
 from potr_cl.stages.prune import Prune
-from potr_cl.stages.results import Results
-from potr_cl.stages.stage import State, Workbench
+from potr_cl.stages.stage import Results, State, Workbench
 from potr_cl.views.targets import RenderedTargets
 from tests.devices import FAMILIES, KERNELS, open_device
 from tests.reference.refit_cases import Pictures
