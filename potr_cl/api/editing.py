@@ -43,7 +43,7 @@ from potr_cl.model.views_between import views_between as place_between
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import check_frame
-from potr_cl.pipeline.fallback import on_device
+from potr_cl.pipeline.fallback import with_fallback
 from potr_cl.pipeline.forecast import log_forecast
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.run import Run, Stopwatch
@@ -306,7 +306,7 @@ class _Work:
     def done(self, name: str, work: Callable[[Device, int | None], _T]) -> tuple[_T, Device]:
         """What a function makes on a device, with how much of its memory; again where that is too much."""
         self.progress(name, 0.0)
-        made = on_device(self.opened, self.memory, work)
+        made = with_fallback(self.opened, self.memory, work)
         self.progress(name, 1.0)
         return made
 

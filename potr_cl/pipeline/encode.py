@@ -14,7 +14,7 @@ from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encoded import Encoded
-from potr_cl.pipeline.fallback import on_device
+from potr_cl.pipeline.fallback import with_fallback
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.run import Run, Stopwatch
 from potr_cl.placement.virtual import place_cameras
@@ -118,7 +118,7 @@ def cameras_or_virtual(
     check_frame(scene, cameras, options.cameras_anyway or in_frame)
     if cameras is None and options.look_at_views(scene):
         watch("place cameras", 0.0)
-        cameras, _ = on_device(
+        cameras, _ = with_fallback(
             device or Device(), options.memory, lambda opened, _: place_cameras(scene, count, device=opened)
         )
         watch("place cameras", 1.0)

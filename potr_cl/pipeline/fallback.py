@@ -1,4 +1,4 @@
-"""If a scene does not fit a device (:func:`on_device`): keep less in its memory, then let a CPU do the work."""
+"""If a scene does not fit a device (:func:`with_fallback`): keep less in its memory, then let a CPU do the work."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ T = TypeVar("T")
 _LESS = 8
 
 
-def on_device(device: Device, memory: int | None, work: Callable[[Device, int | None], T]) -> tuple[T, Device]:
+def with_fallback(device: Device, memory: int | None, work: Callable[[Device, int | None], T]) -> tuple[T, Device]:
     """Do work that may not fit a device: if it does not, with less memory, and in the end on a CPU.
 
     A warning says so each time.

@@ -18,7 +18,7 @@ from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import Output
 from potr_cl.pipeline.encoded import Encoded, SharedOut
-from potr_cl.pipeline.fallback import for_views, on_device
+from potr_cl.pipeline.fallback import for_views, with_fallback
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.placement.rays import unresolved
 from potr_cl.raster.rasterizer import Rasterizer
@@ -198,7 +198,7 @@ class Run:
         def found(device: Device, memory: int | None) -> NDArray[np.bool_]:
             return unresolved(device, state.source, state.views)
 
-        splats, _ = on_device(self.device or self._given or Device(), self._options.memory, found)
+        splats, _ = with_fallback(self.device or self._given or Device(), self._options.memory, found)
         self._watch("place cameras", 1.0)
         area = in_background(part_of_area, state.source, splats).result if splats.any() else float
         return state.with_results(unresolved=Unresolved(splats, area))
@@ -249,7 +249,7 @@ class Run:
             return stage.run(state, dataclasses.replace(bench, device=device, memory=room, pool=pool))
 
         given = self.device or self._given or Device()
-        after, self.device = on_device(given, self._options.memory, work)
+        after, self.device = with_fallback(given, self._options.memory, work)
         return after
 
     def _interludes(self, stage: Stage, state: State) -> tuple[Interlude, ...]:

@@ -151,40 +151,40 @@ class Prune(Stage):
         """
         if state.results.unresolved is not None:
             return self._guarded(state, bench, state.results.unresolved)
-        with thread_pool(bench.threads) as pool, scene_on(bench.opened, bench.placed(state)) as placed:
+        with thread_pool(bench.threads) as pool, scene_on(bench.opened, bench.scene_of(state)) as placed:
             quick = partial(surely_seen, placed) if isinstance(placed, SceneBuffers) else None
             part = in_background(seen_part, state.scene, state.views)  # while a device finds the unseen ones
             unseen = find_unseen(state, None, pool.map, quick) if quick else None
             likely = part.result() <= MOST_SEEN
             groups = groups_of_large(state.scene, pool.map) if likely or not unseen else None
             hidden, area = unseen or find_unseen(state, groups, pool.map)
-            sights = visibility_of_large(state.scene, state.views, groups, pool.map) if likely else None
+            visibility = visibility_of_large(state.scene, state.views, groups, pool.map) if likely else None
             groups = None
-            if sights is not None and (bench.pool is None or bench.pool.in_process):
-                sights = sights.lasting()
+            if visibility is not None and (bench.pool is None or bench.pool.in_process):
+                visibility = visibility.lasting()
         splats = int(np.count_nonzero(hidden))
         kept = self.unseen == "keep" and self.keep is None and self.count is None
         told = state.with_results(unseen=Unseen(splats, len(state.scene), kept, area))
-        told = self._told(told, bench, sights)
+        told = self._told(told, bench, visibility)
         if not (kept and splats):
-            return self._pruned(told, bench, sights)
+            return self._pruned(told, bench, visibility)
         # A copy of a large scene without them would take as much memory as the scene.
         if (
-            sights is not None
+            visibility is not None
             and not bench.pool
             and not bench.interludes
             and bench.parameters.delta_mse_max < LARGEST_LIMIT
         ):
-            return self._pruned(told, bench, sights, hidden=hidden)
+            return self._pruned(told, bench, visibility, hidden=hidden)
         seen = np.flatnonzero(~hidden)
         if not len(seen):
             everything = np.arange(splats)
             return told.with_results(
                 pruned=Pruned(splats, np.full(splats, -1, np.int32), 0, lambda: Course(everything))
             )
-        if sights is not None:
-            sights = visibility_of_large(state.scene.uncoloured().subset(seen), state.views)
-        return self._pruned(told, bench, sights, seen, hidden)
+        if visibility is not None:
+            visibility = visibility_of_large(state.scene.uncoloured().subset(seen), state.views)
+        return self._pruned(told, bench, visibility, seen, hidden)
 
     def _guarded(self, state: State, bench: Workbench, unresolved: Unresolved) -> State:
         """Prune, but for what no view has resolved.
@@ -202,18 +202,18 @@ class Prune(Stage):
         with thread_pool(bench.threads) as pool:
             likely = seen_part(state.scene, state.views) <= MOST_SEEN
             groups = groups_of_large(state.scene, pool.map) if likely else None
-            sights = visibility_of_large(state.scene, state.views, groups, pool.map)
-            if sights is not None and (bench.pool is None or bench.pool.in_process):
-                sights = sights.lasting()
-        told = self._told(state, bench, sights).with_results(unseen=unresolved)
-        return self._pruned(told, bench, sights)
+            visibility = visibility_of_large(state.scene, state.views, groups, pool.map)
+            if visibility is not None and (bench.pool is None or bench.pool.in_process):
+                visibility = visibility.lasting()
+        told = self._told(state, bench, visibility).with_results(unseen=unresolved)
+        return self._pruned(told, bench, visibility)
 
-    def _told(self, state: State, bench: Workbench, sights: Visibility | None) -> State:
+    def _told(self, state: State, bench: Workbench, visibility: Visibility | None) -> State:
         """The state that knows what the views see, and what a splat may cost."""
         if state.scene is state.source:
-            state = replace(state, sights=sights)
-            if sights is not None and bench.kept is not None and bench.kept.is_of(state.source):
-                bench.kept.groups = sights.groups  # for who judges by pictures later
+            state = replace(state, visibility=visibility)
+            if visibility is not None and bench.kept is not None and bench.kept.is_of(state.source):
+                bench.kept.groups = visibility.groups  # for who judges by pictures later
         if self.keep is None and self.count is None:
             state = state.with_results(price=bench.parameters.delta_mse_max)
         return state
@@ -222,7 +222,7 @@ class Prune(Stage):
         self,
         state: State,
         bench: Workbench,
-        sights: Visibility | None = None,
+        visibility: Visibility | None = None,
         seen: NDArray[np.int64] | None = None,
         hidden: NDArray[np.bool_] | None = None,
     ) -> State:
@@ -230,22 +230,22 @@ class Prune(Stage):
 
         Args:
             state, bench: of the stage.
-            sights: what the views see of the splats that are pruned.
+            visibility: what the views see of the splats that are pruned.
             seen: (n,) numbers of these, ascending; None: all of the state's scene, where the measurement spares hidden
                 ones.
             hidden: (N,) which splats are kept in any case, without what of their colours depends on the direction.
         """
         spared = hidden if seen is None else None
         dealt = None
-        if sights is not None and bench.pool is not None and not bench.pool.in_process:
-            dealt = _dealt(state, seen, bench.pool, sights)
+        if visibility is not None and bench.pool is not None and not bench.pool.in_process:
+            dealt = _dealt(state, seen, bench.pool, visibility)
             state = state.with_results(shares=dealt)
         unresolved = state.results.unresolved
         stays = None if unresolved is None else unresolved.among(state.survivors)
         waiting = sorted(bench.interludes, key=lambda interlude: interlude.after)
         schedule = self._schedule(bench.parameters.delta_mse_max, len(state.scene) if seen is None else len(seen))
         bench.progress("prepare views", 0.0)
-        with measurement(state, bench, self._sweep_options(bench.memory), sights, spared, dealt, seen) as removal:
+        with measurement(state, bench, self._sweep_options(bench.memory), visibility, spared, dealt, seen) as removal:
             course = _Course(state, removal, seen)
             ready = removal.resident_views >= (1 - _MADE_AGAIN) * len(state.views)
 
@@ -297,13 +297,13 @@ def part_of_time(iterations: float, stays: bool) -> float:
     return _FIRST + (1 - _FIRST) * (1 - (1 - iterations) ** _FEWER) if stays else iterations
 
 
-def _dealt(state: State, seen: NDArray[np.int64] | None, pool: Pool, sights: Visibility) -> ViewShares:
+def _dealt(state: State, seen: NDArray[np.int64] | None, pool: Pool, visibility: Visibility) -> ViewShares:
     """The views for a pool's workers, and which of the source's splats each gets, for this stage and others."""
     workers = pool.workers()
     source, numbers = (state.source, state.survivors) if state.is_cut else (state.scene, np.arange(len(state.scene)))
     names = [worker.name for worker in workers]
     splats = numbers if seen is None else numbers[seen]
-    return ViewShares.of(state.views, sights, [1.0] * len(workers), source, splats, names)
+    return ViewShares.of(state.views, visibility, [1.0] * len(workers), source, splats, names)
 
 
 class _Course:

@@ -21,7 +21,7 @@ from potr_cl.outputs.output import Rounded
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.held_out import PhotographChoice, hold_out
-from potr_cl.stages.refitting.coefficients import placed
+from potr_cl.stages.refitting.coefficients import residency_of
 from potr_cl.stages.refitting.colour_refit import ColourRefit
 from potr_cl.stages.refitting.helpers import colour_shares
 from potr_cl.stages.refitting.refit import active_coefficients, chosen_coefficients, refit_colours
@@ -236,7 +236,7 @@ def _pictures_ahead(state: State, bench: Workbench) -> Iterator[PicturesAhead | 
     numbers: dict[Device, Sequence[int]] = {device: range(len(state.views))}
     if pool is not None and (share := colour_shares(pool, len(state.views))).others:
         numbers = {device: share.own, **dict(zip(pool.devices, share.others, strict=False))}
-    with PicturesAhead(kept, bench.background, state.views, numbers, state.sights) as ahead:
+    with PicturesAhead(kept, bench.background, state.views, numbers, state.visibility) as ahead:
         yield ahead
 
 
@@ -244,7 +244,7 @@ def _pictures_ahead(state: State, bench: Workbench) -> Iterator[PicturesAhead | 
 def _pictures_of_goal(state: State, bench: Workbench, ahead: PicturesAhead | None) -> Iterator[Targets]:
     """The pictures that colours are re-fitted to; where the re-fit needs its room, they are rendered before."""
     device, views = bench.opened, state.views
-    little = placed(device, len(state.scene), state.scene.sh.shape[1], bench.memory).slice is not None
+    little = residency_of(device, len(state.scene), state.scene.sh.shape[1], bench.memory).slice is not None
     little = little or (bench.memory is not None and state.source.nbytes > _LARGE * bench.memory)
     with _rendered(state, state.goal, bench) as targets:
         if ahead is not None:
@@ -259,8 +259,8 @@ def _pictures_of_goal(state: State, bench: Workbench, ahead: PicturesAhead | Non
 
 def _rendered(state: State, scene: Scene, bench: Workbench) -> AbstractContextManager[Targets]:
     """The pictures of a scene in a state's views, which are rendered when they are asked for."""
-    sights = state.sights if scene is state.source else None
-    return targets_of(bench.opened, bench.drawable(scene), state.views, bench.background, sights)
+    visibility = state.visibility if scene is state.source else None
+    return targets_of(bench.opened, bench.drawable(scene), state.views, bench.background, visibility)
 
 
 @dataclass(frozen=True)

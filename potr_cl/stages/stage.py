@@ -102,7 +102,7 @@ class State:
         views: the training views; empty if there are no cameras.
         added: how many of them, the last ones, a stage has put between those that were given.
         truth: what a stage has fitted to photographs, where it did; it may have fewer splats than ``source``.
-        sights: what each view may draw of ``source``, where a stage has found that this is little.
+        visibility: what each view may draw of ``source``, where a stage has found that this is little.
         cut: a scene that is these survivors of ``source`` as they are there; None: none is known to be.
         geometry: of ``scene`` as the file's readers will see it, once a stage has had it rounded. A stage that then
             changes anything but colours makes it None again.
@@ -120,7 +120,7 @@ class State:
     added: int = 0
     cut: Scene | None = None
     truth: Scene | None = None
-    sights: Visibility | None = None
+    visibility: Visibility | None = None
 
     @property
     def goal(self) -> Scene:
@@ -190,7 +190,7 @@ class Workbench:
         """What to give to a rasterizer for a scene: it may lie on the device already."""
         return scene if self.kept is None else self.kept.drawable(self.opened, scene)
 
-    def placed(self, state: State, some: NDArray[np.int64] | None = None) -> Scene | ResidentScene | ResidentSubset:
+    def scene_of(self, state: State, some: NDArray[np.int64] | None = None) -> Scene | ResidentScene | ResidentSubset:
         """A state's scene, or where devices have it, for :func:`potr_cl.raster.resident.scene_on`.
 
         Args:
@@ -212,7 +212,7 @@ class Workbench:
         stages need too, and numbers.
         """
         if pool.in_process:
-            with pool.shared(self.placed(state, some)) as placed:
+            with pool.shared(self.scene_of(state, some)) as placed:
                 yield placed
             return
         numbers = some

@@ -136,10 +136,10 @@ def _nbytes_of_parts(state: State, bench: Workbench, views: Sequence[Camera]) ->
     """Bytes that is kept of a view where it is looked at with what it may draw and no more: the mean of some."""
     source = state.source
     with thread_pool(bench.threads) as pool:
-        sights = Visibility.of(source, views, INRIA.near, groups_of_large(source, pool.map), pool.map)
+        visibility = Visibility.of(source, views, INRIA.near, groups_of_large(source, pool.map), pool.map)
     held = [
-        _nbytes(bench, source.subset(sights.groups.splats(seen)), [view])
-        for view, seen in zip(views, sights.seen, strict=True)
+        _nbytes(bench, source.subset(visibility.groups.splats(seen)), [view])
+        for view, seen in zip(views, visibility.seen, strict=True)
         if seen.any()
     ]
     return float(np.mean(held)) if held else 1.0

@@ -30,13 +30,13 @@ class ViewShare:
         numbers: of its views, ascending.
         splats: (n,) int64, the numbers of the splats that these may draw, ascending, in the scene that is worked on.
         subset: these splats, whose places are their numbers from now on.
-        sights: what all views may draw of them.
+        visibility: what all views may draw of them.
     """
 
     numbers: list[int]
     splats: Indices
     subset: SceneSubset
-    sights: Visibility
+    visibility: Visibility
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class ViewShares:
     @staticmethod
     def of(
         views: Sequence[Camera],
-        sights: Visibility,
+        visibility: Visibility,
         speeds: Sequence[float],
         source: Scene,
         numbers: Indices,
@@ -71,7 +71,7 @@ class ViewShares:
 
         Args:
             views: at least one.
-            sights: what they see of the scene that is worked on.
+            visibility: what they see of the scene that is worked on.
             speeds: of those that are to do them.
             source: a scene that has that one's splats as they are.
             numbers: (N,) of these there, ascending.
@@ -79,10 +79,10 @@ class ViewShares:
         """
         shares: list[ViewShare] = []
         busy: list[str] = []
-        for place, own in enumerate(sights.dealt(speeds)):
+        for place, own in enumerate(visibility.dealt(speeds)):
             if own:
                 busy += names[place : place + 1]
-                splats, of_these = sights.of_views(own)
+                splats, of_these = visibility.of_views(own)
                 shares.append(ViewShare(own, splats, SceneSubset(source, numbers[splats]), of_these))
         return ViewShares(views, tuple(shares), tuple(busy))
 

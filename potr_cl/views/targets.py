@@ -91,13 +91,13 @@ def targets_of(
     scene: Drawable,
     cameras: Sequence[Camera],
     background: tuple[float, float, float],
-    sights: Visibility | None = None,
+    visibility: Visibility | None = None,
 ) -> Iterator[RenderedTargets]:
     """A scene's pictures; by what views may draw, where that is known and the scene lies on a GPU: the same bits."""
     with ExitStack() as stack:
-        if sights is not None and isinstance(scene, SceneBuffers) and device.family == "gpu":
-            seen = stack.enter_context(SeenRasterizer(device, scene, sights.groups, background=background))
-            yield RenderedTargets(seen, cameras, seen.picks(stack.enter_context(Memory(device)), sights.seen))
+        if visibility is not None and isinstance(scene, SceneBuffers) and device.family == "gpu":
+            seen = stack.enter_context(SeenRasterizer(device, scene, visibility.groups, background=background))
+            yield RenderedTargets(seen, cameras, seen.picks(stack.enter_context(Memory(device)), visibility.seen))
         else:
             whole = stack.enter_context(Rasterizer(device, scene, background=background))
             yield RenderedTargets(whole, cameras)
@@ -200,7 +200,7 @@ class PicturesAhead(Owner):
         background: R, G, B behind it.
         cameras: all views.
         numbers: of the views whose pictures each device will be asked for.
-        sights: what each view may draw, where no view sees much of the scene.
+        visibility: what each view may draw, where no view sees much of the scene.
 
     Attributes:
         source: as given.
@@ -212,11 +212,11 @@ class PicturesAhead(Owner):
         background: tuple[float, float, float],
         cameras: Sequence[Camera],
         numbers: Mapping[Device, Sequence[int]],
-        sights: Visibility | None = None,
+        visibility: Visibility | None = None,
     ) -> None:
         self.source = source
         self._begun: dict[Device, Future[_Rendered | None]] = {
-            device: in_background(_rendered, device, source, background, cameras, some, sights)
+            device: in_background(_rendered, device, source, background, cameras, some, visibility)
             for device, some in numbers.items()
             if device.family == "gpu" and some
         }
@@ -286,7 +286,7 @@ def _rendered(
     background: tuple[float, float, float],
     cameras: Sequence[Camera],
     numbers: Sequence[int],
-    sights: Visibility | None,
+    visibility: Visibility | None,
 ) -> _Rendered | None:
     """Some views' pictures on a device; None: it has not much room, or the scene does not lie there."""
     if sum(target_bytes(cameras[number]) for number in numbers) > AHEAD * device.info.memory:
@@ -296,7 +296,7 @@ def _rendered(
         return None
     with suppress(DeviceMemoryError), device.all_or_nothing():
         rendered = _Rendered(device, cameras, numbers)
-        with targets_of(device, scene, cameras, background, sights) as targets:
+        with targets_of(device, scene, cameras, background, visibility) as targets:
             targets.into(numbers, rendered.buffer)
         return rendered
     return None

@@ -217,42 +217,42 @@ def test_workers_with_gpus_look_at_each_view_with_what_it_may_draw(keep, monkeyp
 
 def test_neighbours_go_to_the_same():
     scene, cameras = street(across=True)
-    sights = Visibility.of(scene, cameras, INRIA.near)
-    dealt = ViewShares.of(cameras, sights, [1.0, 1.0], scene, np.arange(len(scene)))
+    visibility = Visibility.of(scene, cameras, INRIA.near)
+    dealt = ViewShares.of(cameras, visibility, [1.0, 1.0], scene, np.arange(len(scene)))
     numbers = [share.numbers for share in dealt.shares]
     assert sorted(chain(*numbers)) == list(range(len(cameras)))
     assert all(own == sorted(own) for own in numbers)
     least = min(len(share.splats) for share in dealt.shares)
     assert least < 0.75 * len(scene)
-    in_turn = [sights.of_views(range(first, len(cameras), 2))[0] for first in range(2)]
+    in_turn = [visibility.of_views(range(first, len(cameras), 2))[0] for first in range(2)]
     assert sum(len(share.splats) for share in dealt.shares) < 0.9 * sum(map(len, in_turn))
 
 
 def test_twice_as_fast_gets_twice_as_much():
     scene, cameras = street(8, across=True)
-    sights = Visibility.of(scene, cameras, INRIA.near)
-    work = [int(sights.totals[own].sum()) for own in sights.dealt([2.0, 1.0])]
+    visibility = Visibility.of(scene, cameras, INRIA.near)
+    work = [int(visibility.totals[own].sum()) for own in visibility.dealt([2.0, 1.0])]
     assert 1.4 < work[0] / work[1] < 2.8
 
 
 def test_a_share_names_its_splats_by_their_places():
     scene, cameras = street(across=True)
-    sights = Visibility.of(scene, cameras, INRIA.near)
-    splats, own = sights.of_views([3, 4])
-    assert np.array_equal(splats, sights.groups.splats(sights.seen[3] | sights.seen[4]))
-    assert own.totals[3] == sights.totals[3]
-    assert own.totals[4] == sights.totals[4]
-    assert np.array_equal(splats[own.groups.splats(own.seen[3])], sights.groups.splats(sights.seen[3]))
+    visibility = Visibility.of(scene, cameras, INRIA.near)
+    splats, own = visibility.of_views([3, 4])
+    assert np.array_equal(splats, visibility.groups.splats(visibility.seen[3] | visibility.seen[4]))
+    assert own.totals[3] == visibility.totals[3]
+    assert own.totals[4] == visibility.totals[4]
+    assert np.array_equal(splats[own.groups.splats(own.seen[3])], visibility.groups.splats(visibility.seen[3]))
 
 
 def test_views_that_see_nothing_have_a_share_too():
     scene, cameras = street(across=True)
     away = dataclasses.replace(cameras[0], translation=cameras[0].translation + np.array([0, 0, -500.0]))
-    sights = Visibility.of(scene, [*cameras, away, away], INRIA.near)
-    assert sights.totals[-1] == 0
-    splats, _ = sights.of_views([len(cameras)])
+    visibility = Visibility.of(scene, [*cameras, away, away], INRIA.near)
+    assert visibility.totals[-1] == 0
+    splats, _ = visibility.of_views([len(cameras)])
     assert len(splats) > 0
-    assert all(len(each.splats) for each in sights.clusters([len(cameras), len(cameras) + 1]))
+    assert all(len(each.splats) for each in visibility.clusters([len(cameras), len(cameras) + 1]))
 
 
 def test_an_excerpt_arrives_as_a_scene():

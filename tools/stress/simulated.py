@@ -148,13 +148,17 @@ def view_by_view(device: Device) -> None:
         return
     scene, views = _apart()
     with patch.object(splat_groups, "LARGEST", 8), uploaded(device, scene) as whole:
-        sights = Visibility.of(scene, views, INRIA.near)
+        visibility = Visibility.of(scene, views, INRIA.near)
         for memory in (None, 0):
-            with planned_sweep(device, whole, views, SweepOptions(0.0, memory=memory), visibility=sights) as removal:
+            with planned_sweep(
+                device, whole, views, SweepOptions(0.0, memory=memory), visibility=visibility
+            ) as removal:
                 removal.measure()
                 removal.remove(np.arange(0, len(scene), 5))
                 removal.measure()
-            with planned_sweep(device, whole, views, SweepOptions(0.05, memory=memory), visibility=sights) as removal:
+            with planned_sweep(
+                device, whole, views, SweepOptions(0.05, memory=memory), visibility=visibility
+            ) as removal:
                 prune_scene(removal, PruningOptions(1e-2, 3))
 
 
@@ -162,9 +166,9 @@ def part_by_part(device: Device) -> None:
     """The same scene in parts that see much of the same."""
     scene, views = _apart()
     with patch.object(splat_groups, "LARGEST", 8):
-        sights = Visibility.of(scene, views)
-        assert len(sights.clusters()) > 1
-        with planned_sweep(device, scene, views, SweepOptions(0.0), visibility=sights) as removal:
+        visibility = Visibility.of(scene, views)
+        assert len(visibility.clusters()) > 1
+        with planned_sweep(device, scene, views, SweepOptions(0.0), visibility=visibility) as removal:
             removal.measure()
             prune_scene(removal, PruningOptions(1e-2, 3))
 

@@ -43,7 +43,7 @@ class RemovalPart(Part):
         options: speed/accuracy trade-offs.
         background: R, G, B behind the scene.
         numbers: of the views of this part, ascending.
-        sights: what all views see of it, where each had better be looked at with what it sees; None: with all splats.
+        visibility: of all views, where each had better be looked at with what it sees; None: with all splats.
     """
 
     def __init__(
@@ -55,14 +55,14 @@ class RemovalPart(Part):
         options: SweepOptions,
         background: tuple[float, float, float],
         numbers: Sequence[int],
-        sights: Visibility | None = None,
+        visibility: Visibility | None = None,
     ) -> None:
         options = SweepOptions(**{**vars(options), "memory": memory})
         with ExitStack() as owned:
             drawable = owned.enter_context(scene_on(device, scene))
-            if sights is not None:
+            if visibility is not None:
                 drawable = owned.enter_context(whole_on_device(device, drawable))
-            sweep = planned_sweep(device, drawable, cameras, options, background, sights, numbers)
+            sweep = planned_sweep(device, drawable, cameras, options, background, visibility, numbers)
             self._sweep = owned.enter_context(sweep)
             self._alive = owned.enter_context(AlivePacking(device, self._sweep.splats, self._sweep.marks))
             self._changed: ChangedTotals | None = None
@@ -239,7 +239,7 @@ def measurement(
     state: State,
     bench: Workbench,
     options: SweepOptions,
-    sights: Visibility | None = None,
+    visibility: Visibility | None = None,
     spared: NDArray[np.bool_] | None = None,
     dealt: ViewShares | None = None,
     seen: NDArray[np.int64] | None = None,
@@ -248,8 +248,8 @@ def measurement(
 
     Args:
         state, bench, options: of the stage.
-        sights: what the views see, where each had better be looked at with what it sees.
-        spared: as of :class:`~potr_cl.stages.pruning.removal.RemovalSweep`; only with ``sights``.
+        visibility: what the views see, where each had better be looked at with what it sees.
+        spared: as of :class:`~potr_cl.stages.pruning.removal.RemovalSweep`; only with ``visibility``.
         dealt: the views, for a pool whose workers get what these see and no more of the scene.
         seen: (n,) numbers of the splats that the sweep is to have, ascending, which it numbers from 0 on; None: all.
     """
@@ -263,12 +263,12 @@ def measurement(
     with ExitStack() as stack:
         if pool is None or share is None or not share.others:
             scene = None
-            if sights is not None:
+            if visibility is not None:
                 scene = state.scene if seen is None else state.scene.subset(seen)
                 drawable = stack.enter_context(whole_on_device(device, bench.drawable(scene)))
             else:
-                drawable = stack.enter_context(scene_on(device, bench.placed(state, seen)))
-            given_all = (device, drawable, views, options, bench.background, sights, None, progress, scene, spared)
+                drawable = stack.enter_context(scene_on(device, bench.scene_of(state, seen)))
+            given_all = (device, drawable, views, options, bench.background, visibility, None, progress, scene, spared)
             yield stack.enter_context(planned_sweep(*given_all))
             return
         given: list[tuple[Any, ...]] = []
@@ -276,19 +276,19 @@ def measurement(
             share = dealt.dealt
             for part in dealt.shares:
                 subset = stack.enter_context(pool.shared(part.subset))
-                given.append((subset, views, options, bench.background, part.numbers, part.sights))
+                given.append((subset, views, options, bench.background, part.numbers, part.visibility))
         else:
             sent = stack.enter_context(bench.shared(pool, state, seen))
-            sights = sights if pool.in_process else None
-            given = [(sent, views, options, bench.background, numbers, sights) for numbers in share.others]
+            visibility = visibility if pool.in_process else None
+            given = [(sent, views, options, bench.background, numbers, visibility) for numbers in share.others]
         parts = stack.enter_context(Parts(pool, RemovalPart, given, options.memory, share.names))
         numbers = None if dealt is None else [each.splats for each in dealt.shares]
         helpers = stack.enter_context(RemovalHelpers(device, splats, parts, pool, numbers))
         if share.own:
-            drawable = stack.enter_context(scene_on(device, bench.placed(state, seen)))
+            drawable = stack.enter_context(scene_on(device, bench.scene_of(state, seen)))
             # Only what lies on the device already is looked at in parts.
-            own_sights = sights if isinstance(drawable, SceneBuffers) else None
-            own = (device, drawable, views, options, bench.background, own_sights, share.own, progress)
+            own_visibility = visibility if isinstance(drawable, SceneBuffers) else None
+            own = (device, drawable, views, options, bench.background, own_visibility, share.own, progress)
             sweep = stack.enter_context(planned_sweep(*own, helpers=helpers))
         else:
             source = NoSplats(device, splats)

@@ -255,7 +255,7 @@ _COEFFICIENTS = 3
 
 
 @dataclass(frozen=True)
-class Place:
+class Residency:
     """How a re-fit does with the device's memory.
 
     Attributes:
@@ -271,14 +271,14 @@ class Place:
     resident: int = 0
 
 
-def placed(
+def residency_of(
     device: Device,
     splats: int,
     sh_count: int,
     memory: int | None,
     slices: int | None = None,
     reach: Reach | None = None,
-) -> Place:
+) -> Residency:
     """Where a re-fit's vectors lie.
 
     Args:
@@ -294,7 +294,7 @@ def placed(
     free = max(device.info.memory - device.allocated, 0)
     fits = one_piece <= max(_OF_FREE * free if memory is None else min(_OF_GIVEN * memory, _OF_FREE * free), _ANYWAY)
     if slices is None and fits:
-        return Place(memory if memory is None or one_piece <= _ANYWAY else max(memory - one_piece, 0))
+        return Residency(memory if memory is None or one_piece <= _ANYWAY else max(memory - one_piece, 0))
     total = free if memory is None else min(memory, free)
     of_slice = 2 * vector + 4 * triangle + 8
     some = slices or min(max(int(_SLICE * total / of_slice), _LEAST_SLICE), _MOST_SLICE)
@@ -311,10 +311,10 @@ def placed(
         others = 0
         if resident <= _COEFFICIENTS:
             resident, others = max(resident - 1, _FEWEST), 1
-        return Place(max(int(left - (resident + others) * splats * vector), 0), some, blocks, resident)
+        return Residency(max(int(left - (resident + others) * splats * vector), 0), some, blocks, resident)
     room = int(((_OF_HOST if of_host else _OF_VECTORS) * total / max(splats, 1) - _SWEEP) / vector) - 3
     besides = splats * (3 * vector + _SWEEP) + some * of_slice + 8 * triangle * min(blocks, splats)
     # Of few splats a slice, which has so many at least, takes more than its share.
     room = min(room, int((total - besides) / max(splats * vector, 1)))
     resident = min(max(room, _FEWEST), _MOST) if slices is None else _FEWEST
-    return Place(max(int(total - besides - splats * resident * vector), 0), some, blocks, resident)
+    return Residency(max(int(total - besides - splats * resident * vector), 0), some, blocks, resident)

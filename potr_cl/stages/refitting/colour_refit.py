@@ -20,7 +20,7 @@ from potr_cl.opencl.memory import Owner
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import stride_of
 from potr_cl.stages.refitting.blocks import SplatBlocks
-from potr_cl.stages.refitting.coefficients import Coefficients, Place, placed
+from potr_cl.stages.refitting.coefficients import Coefficients, Residency, residency_of
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.helpers import ColourHelpers, colour_parts, colour_shares
 from potr_cl.stages.refitting.own_views import OwnViews
@@ -82,7 +82,7 @@ class ColourRefit(Owner):
             layout = Layout(len(scene), stride_of(len(scene)), scene.sh.shape[1], sweep.lanes)
             # The vectors come first: prepared views can do with less memory, and only take longer then.
             size = layout.splats, layout.sh_count
-            place = Place(memory) if others is not None else placed(device, *size, memory, slices)
+            place = Residency(memory) if others is not None else residency_of(device, *size, memory, slices)
 
             def looked_at(room: int | None) -> tuple[Rasterizer, Reach | None]:
                 rasterizer = owned.enter_context(Rasterizer(device, colourless(arrived(scene))))
@@ -93,7 +93,7 @@ class ColourRefit(Owner):
                 looked = looked_at(memory)
                 scene = arrived(scene)
                 if looked[1] is not None:
-                    place = placed(device, *size, memory, slices, looked[1])
+                    place = residency_of(device, *size, memory, slices, looked[1])
             self.coefficients = owned.enter_context(Coefficients(device, layout, place.slice, place.resident))
             blocks = SplatBlocks(self.coefficients, place.blocks)
             self.solver = ColourSolver(self.coefficients, blocks)

@@ -77,7 +77,7 @@ class ColourPart(Part):
             these views see of it.
         cameras: all views.
         numbers: of the views of this part, ascending.
-        sights: what all views may draw of the source, where no view sees much of it.
+        visibility: what all views may draw of the source, where no view sees much of it.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class ColourPart(Part):
         source: Scene | ResidentScene | PicturesAhead | SceneSubset,
         cameras: Sequence[Camera],
         numbers: Sequence[int],
-        sights: Visibility | None = None,
+        visibility: Visibility | None = None,
     ) -> None:
         self._device = device
         with ExitStack() as owned:
@@ -102,9 +102,9 @@ class ColourPart(Part):
             self._coefficients.zero(self._x)
             ahead, kept = (source, source.source) if isinstance(source, PicturesAhead) else (None, source)
             pictured = owned.enter_context(scene_on(device, kept))
-            if sights is not None:
+            if visibility is not None:
                 pictured = owned.enter_context(whole_on_device(device, pictured))
-            of_source = owned.enter_context(targets_of(device, pictured, cameras, background, sights))
+            of_source = owned.enter_context(targets_of(device, pictured, cameras, background, visibility))
             here = arrived(scene)
             rasterizer = owned.enter_context(Rasterizer(device, colourless(here)))
             self._reach = reach = reached_splats(rasterizer, cameras, numbers, memory)
@@ -353,12 +353,12 @@ def colour_parts(
         shape = stack.enter_context(pool.shared(scene))
         pictured: list[tuple[Shared, Visibility | None]]
         if isinstance(source, ViewShares):
-            pictured = [(stack.enter_context(pool.shared(each.subset)), each.sights) for each in source.shares]
+            pictured = [(stack.enter_context(pool.shared(each.subset)), each.visibility) for each in source.shares]
         else:
             pictured = [(stack.enter_context(pool.shared(source)), None)] * len(share.others)
         given = [
-            (shape, sh_count, background, own, cameras, numbers, sights)
-            for (own, sights), numbers in zip(pictured, share.others, strict=True)
+            (shape, sh_count, background, own, cameras, numbers, visibility)
+            for (own, visibility), numbers in zip(pictured, share.others, strict=True)
         ]
         with Parts(pool, ColourPart, given, memory, share.names) as parts:
             yield parts

@@ -61,7 +61,7 @@ class RefitOptions:
         prior: the same for every coefficient's distance to its start, so that what no view shows stays as it was.
         memory: bytes of device memory that prepared views and targets may take; None: two fifths
             of what is free, or a quarter where that is the host's memory.
-        slices: splats of a slice, with the vectors on the host (:func:`placed`); None: only
+        slices: splats of a slice, with the vectors on the host (:func:`residency_of`); None: only
             where they do not fit.
 
     Raises:
