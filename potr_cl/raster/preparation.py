@@ -158,7 +158,7 @@ class Preparation(Owner):
 
     def prepare_again(self, views: ViewSet, cameras: Sequence[Camera]) -> bool:
         """See :meth:`potr_cl.raster.rasterizer.Rasterizer.prepare_again`."""
-        if not views.aim_all(cameras):
+        if not views.aim(cameras):
             return False
         with self.counting():
             self._enqueue_offsets(views)

@@ -34,7 +34,7 @@ from potr_cl.raster.preparation import Preparation, Projection
 from potr_cl.raster.preparing_memory import PreparingMemory
 from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers, uploaded
-from potr_cl.raster.view_set import View, ViewSet
+from potr_cl.raster.view_set import ViewSet
 
 #: Least room for intersections before anything is known of a view, and as a multiple of the splats.
 _FIRST_CAPACITY, _FIRST_CAPACITY_A_SPLAT = 1 << 16, 4
@@ -182,17 +182,6 @@ class Rasterizer(Owner):
         self._enqueue_composite(views)
         cl.enqueue_copy(self.device.queue, target, self._image.buffer, byte_count=12 * views.pixels, dst_offset=start)
 
-    def prepare(self, camera: Camera) -> View:
-        """Find projection, tile lists and depth order of a view, which :meth:`composite` can use any number of times.
-
-        Returns:
-            The view, with buffers of its own, which are no larger than needed; the caller closes it.
-
-        Raises:
-            DeviceError: it does not fit the device.
-        """
-        return self.prepare_set([camera]).views[0]
-
     @contextmanager
     def preparing_many(self) -> Iterator[None]:
         """Inside the block, memory that sets are prepared in is kept for the next one: drivers take long to give it."""
@@ -200,7 +189,9 @@ class Rasterizer(Owner):
             yield
 
     def prepare_set(self, cameras: Sequence[Camera], memory: Memory | None = None) -> ViewSet:
-        """:meth:`prepare` several views, and wait for the device only once. CPU kernels take one view at a time.
+        """Find projection, tile lists and depth order of views, which :meth:`composite` can use any number of times.
+
+        The device is waited for only once, and buffers are no larger than needed. CPU kernels take one view at a time.
 
         Args:
             cameras: of the views.
@@ -245,17 +236,17 @@ class Rasterizer(Owner):
             DeviceMemoryError: they do not fit the device.
         """
         views = former
-        if views is None or not views.aim_all(cameras):
+        if views is None or not views.aim(cameras):
             if views is not None:
                 views.close()
             views = self._preparation.new_views(cameras)
         self.project(views)
         return views
 
-    def composite(self, view: View) -> tuple[FloatArray, FloatArray]:
-        """The picture of a prepared view; returns what :meth:`render` returns."""
-        self._enqueue_composite(view.owner)
-        return self._pictures(view.camera)
+    def composite(self, views: ViewSet) -> tuple[FloatArray, FloatArray]:
+        """The picture of a prepared set's only view; returns what :meth:`render` returns."""
+        self._enqueue_composite(views)
+        return self._pictures(views.views[0].camera)
 
     def project(
         self,
@@ -302,7 +293,7 @@ class Rasterizer(Owner):
         old = self._frame
         capacity = max(_FIRST_CAPACITY_A_SPLAT * self.splats, _FIRST_CAPACITY)
         if old is not None:
-            if old.aim(camera):
+            if old.views[0].camera is camera or old.aim([camera]):
                 return old
             capacity = max(capacity, old.capacity)
             old.close()

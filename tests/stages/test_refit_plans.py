@@ -273,13 +273,13 @@ def test_which_splats_are_reached(device, monkeypatch):
         for camera, numbers in zip(cameras, found, strict=True):
             with rasterizer.prepare_set([camera]) as views:
                 listed = device.download(views.intersections, (views.capacity,), np.uint32)
-                wanted, _ = rasterizer.composite(views.views[0])
+                wanted, _ = rasterizer.composite(views)
             drawn.append(np.unique(listed))
             assert np.all(np.diff(numbers.astype(np.int64)) > 0)
             assert np.isin(numbers, drawn[-1]).all()
             subset = scene.subset(numbers.astype(np.int64))
             with Rasterizer(device, subset) as alone, alone.prepare_set([camera]) as views:
-                got, _ = alone.composite(views.views[0])
+                got, _ = alone.composite(views)
             assert np.array_equal(got, wanted)
         assert sum(map(len, found)) < 0.9 * sum(map(len, drawn)) < 0.5 * len(scene) * len(cameras)
 
