@@ -142,7 +142,7 @@ def test_tile_lists_are_tight_and_sorted(device: Device, rules: RasterRules) -> 
         log_alpha = np.where(inside, np.log(projected.opacity[k]) - q / 2, -np.inf)
         for found, threshold in ((touched, 1e-5), (nearly, -0.1)):
             rows, columns = np.nonzero(log_alpha >= np.log(1 / 255) + threshold)
-            found |= {(tile, int(splat)) for tile in set(rows // TILE * prepared.columns + columns // TILE)}
+            found |= {(tile, int(splat)) for tile in set(rows // TILE * prepared.views[0].columns + columns // TILE)}
     listed = set()
     for tile in range(prepared.tiles):
         run = intersections[offsets[tile] : offsets[tile + 1]]
