@@ -45,7 +45,7 @@ class PackedRow(Owner):
 
     def __init__(self, coefficients: Coefficients, flags: cl.Buffer) -> None:
         self._device, self._layout, self.flags = coefficients.device, coefficients.layout, flags
-        names = (
+        names = [
             "mark_nonzero",
             "count_active",
             "place_active",
@@ -53,7 +53,7 @@ class PackedRow(Owner):
             "unpack_floats",
             "pack_sums",
             "add_sums",
-        )
+        ]
         self._kernels = {name: packing_kernel(coefficients, name) for name in names}
         self._places, self._starts = Scratch(self._device, _WHAT), Scratch(self._device, _WHAT)
         self.count = 0
@@ -88,29 +88,22 @@ class PackedRow(Owner):
         kernel.launch((-(-splats // GROUP) * GROUP,), (GROUP,))
         self.settle()
 
-    def pack_floats(self, x: cl.Buffer, packed: cl.Buffer) -> None:
-        """Enqueue: a vector's coefficients to the row, (count,) float32."""
-        self._launch("pack_floats", x, packed)
-
-    def unpack_floats(self, x: cl.Buffer, packed: cl.Buffer) -> None:
-        """Enqueue: from the row to a vector, in which all others become 0."""
-        self._launch("unpack_floats", x, packed)
-
-    def pack_sums(self, columns: cl.Buffer, packed: cl.Buffer) -> None:
-        """Enqueue: sums over views to the row, (count,) int64. All sums become 0."""
-        self._launch("pack_sums", columns, packed)
-
-    def add_sums(self, columns: cl.Buffer, packed: cl.Buffer) -> None:
-        """Enqueue: the row is added to sums over views."""
-        self._launch("add_sums", columns, packed)
-
     def _launch_runs(self, name: str, **buffers: cl.Buffer) -> None:
         kernel, splats = self._kernels[name], self._layout.splats
         kernel.bind(active=self.flags, stride=self._layout.stride, splats=splats, **buffers)
         kernel.launch((-(-splats // (_RUN * GROUP)) * GROUP,), (GROUP,))
 
-    def _launch(self, name: str, columns: cl.Buffer, packed: cl.Buffer) -> None:
-        kernel, splats = self._kernels[name], self._layout.splats
+    def move(self, how: str, columns: cl.Buffer, packed: cl.Buffer) -> None:
+        """Enqueue a kernel of cl/refit/packing.cl.
+
+        Args:
+            how: "pack_floats": a vector's coefficients to the row, (count,) float32. "unpack_floats": from the row to a
+                vector, in which all others become 0. "pack_sums": sums over views to the row, (count,) int64, after
+                which all sums are 0. "add_sums": the row is added to sums over views.
+            columns: the vector or the sums.
+            packed: the row.
+        """
+        kernel, splats = self._kernels[how], self._layout.splats
         kernel.bind(
             columns=columns,
             active=self.flags,
@@ -260,7 +253,7 @@ class Exchange(Owner):
         """
         row = row or self._row
         self._packed.reserve(max(4 * row.count, 1))
-        row.pack_floats(x, self._packed.buffer)
+        row.move("pack_floats", x, self._packed.buffer)
         if self.lends:
             return self._lent(self._packed.buffer, 4 * row.count)
         packed: FloatArray = (staging or self._staging).download(self._packed.buffer, (row.count,), np.float32)
@@ -274,7 +267,7 @@ class Exchange(Owner):
         """
         row = row or self._row
         self._take(packed, 4, row.count)
-        row.unpack_floats(x, self._arrived.buffer)
+        row.move("unpack_floats", x, self._arrived.buffer)
         self._looked_at(packed)
 
     # ------------------------------------------------------------------------------------------ sums
@@ -286,7 +279,7 @@ class Exchange(Owner):
         """
         count = self._row.count
         self._packed.reserve(max(8 * count, 1))
-        self._row.pack_sums(columns, self._packed.buffer)
+        self._row.move("pack_sums", columns, self._packed.buffer)
         if self.lends:
             return self._lent(self._packed.buffer, 8 * count)
         return self._narrowing.download(self._packed.buffer, (count,))
@@ -295,7 +288,7 @@ class Exchange(Owner):
         """Add to sums over views; those of another row than that of all active coefficients."""
         row = row or self._row
         self._take(packed, 8, row.count)
-        row.add_sums(columns, self._arrived.buffer)
+        row.move("add_sums", columns, self._arrived.buffer)
         self._looked_at(packed)
 
     def rows(self, sums: cl.Buffer, row: int, rows: int) -> Narrowed:
