@@ -152,7 +152,7 @@ def test_tile_lists_are_tight_and_sorted(device: Device, rules: RasterRules) -> 
     # The ellipse is tested, not the pixels in it: where it touches a tile between pixel centres it is listed too.
     assert len(listed - nearly) <= 0.02 * len(listed)
     assert offsets[0] == 0
-    assert offsets[-1] == len(intersections) == prepared.intersection_count
+    assert offsets[-1] == len(intersections) == prepared.capacity
 
 
 def test_one_tile_of_any_length_is_sorted(device: Device) -> None:
