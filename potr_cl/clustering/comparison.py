@@ -1,4 +1,9 @@
-"""Points on a device, each of which is compared with the centres of some cells: :class:`Points`."""
+"""Points on a device, each of which is compared with the centres of some cells: :class:`Points`.
+
+Vectors are rows of floats in which a weighted distance is a product of two rows. A point x has a weight w_g for each
+group g of coordinates (an SH coefficient: its R, G and B). Its distance to a centre, the sum over groups of
+w_g |x_g − c_g|², is a constant of the point plus the product of [w, −2 w x] and [|c|², c].
+"""
 
 from __future__ import annotations
 
@@ -118,7 +123,7 @@ class Points(Owner):
 
     Args:
         device: to compute on.
-        rows: (N, width) float32 (:mod:`potr_cl.clustering.comparison`).
+        rows: (N, width) float32, of :func:`rows_of_points`.
     """
 
     def __init__(self, device: Device, rows: FloatArray) -> None:

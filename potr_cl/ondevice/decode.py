@@ -1,7 +1,7 @@
 """From the bytes of a .potr file to a scene on a device: :func:`decode_to_device`.
 
 The host undoes the entropy coding and makes values while they are in a cache, and uploads them without the AC
-coefficients that are 0 (:mod:`potr_cl.ondevice.decode`).
+coefficients that are 0.
 """
 
 from __future__ import annotations
@@ -31,6 +31,9 @@ _SOURCE = "ondevice/spread.cl"
 
 class StagedBundles(Owner):
     """Uploads the packed values of bundles into a scene's buffers.
+
+    On the device a kernel spreads them over the scene's columns, while the host decodes others. So neither the host nor
+    the bus handles the AC coefficients that are 0, which most are.
 
     Args:
         buffers: to be filled; their SH coefficients are 0.
@@ -123,7 +126,7 @@ class Activated:
 
 
 class DeviceBundles(BundleTaker):
-    """Takes a block's splats into a device's buffers.
+    """Takes a block's splats into a device's buffers: the bits that an upload of the scene has.
 
     Args:
         buffers: to be filled.

@@ -1,4 +1,4 @@
-"""Stages run one after the other on a device, each again if memory is short: :class:`Run`."""
+"""Stages run one after the other on a device (:class:`Run`), each again if memory is short, and are timed."""
 
 from __future__ import annotations
 
@@ -107,6 +107,12 @@ class Trial:
 
 def only_if_it_pays(before: State, after: State, trial: Trial) -> State:
     """The state after a fit, or that before it where a file with the fit would be no better.
+
+    The fit judges itself before anything is rounded. What it gains can be lost again when the file is made:
+    coefficients that were 0 are not any more, the re-fit of the colours would have mended most of what it mends, and
+    errors far below those of rounding count for nothing. So where the gain is small, the remaining stages are run with
+    the fit and without it. The views that the fit held out compare the two files: the re-fit has looked at them in
+    both.
 
     Args:
         before, after: the fit. ``after`` is returned as it is where the fit was left out, was interrupted, gained much,

@@ -33,7 +33,11 @@ _BEST = 0.95
 
 @dataclass(frozen=True)
 class ColourMemory:
-    """The colours of some points, and places to compare with.
+    """What the colours of some points remember of where they were trained from, and places to compare with.
+
+    Training moves the coefficients of a splat along the basis functions of its views' directions, so the squared
+    deviation of its colour, averaged over many splats, follows the density of the views (``energy`` in
+    :mod:`potr_cl.model.spherical_harmonics`).
 
     Attributes:
         points: (K, 3) world units.

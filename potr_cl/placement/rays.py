@@ -1,4 +1,4 @@
-"""What is seen from where, found on a device: :func:`shown_from` and :func:`resolved_by`."""
+"""What is seen from where, found on a device: :func:`shown_from`, :func:`resolved_by`, and :func:`unresolved`."""
 
 from __future__ import annotations
 
@@ -123,7 +123,11 @@ _BLOCK = 1 << 20
 
 
 def unresolved(device: Device, scene: Scene, cameras: Sequence[Camera]) -> NDArray[np.bool_]:
-    """(N,) which splats of a scene no two views have resolved.
+    """(N,) which splats of a scene no two views have resolved: nobody knows what these are worth, so they stay.
+
+    Where views were placed and not given, "nobody saw it" is no evidence: the view from which it is seen may be
+    missing. A splat is resolved if two views show the place where it is from near enough, with nothing in between. What
+    is buried in matter, so deep that nobody could stand anywhere near, needs no view.
 
     Args:
         device: finds what is seen.

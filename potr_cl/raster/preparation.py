@@ -1,4 +1,4 @@
-"""Views are made ready to be composited: projection, tile lists and depth order (:class:`Preparation`)."""
+"""Views are made ready to be composited: :class:`Projection`, tile lists and depth order (:class:`Preparation`)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Memory in which views are prepared: :class:`PreparingMemory`."""
+"""Memory in which views are prepared (:class:`PreparingMemory`), who sorts long lists there (:class:`LongLists`)."""
 
 from __future__ import annotations
 

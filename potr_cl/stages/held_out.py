@@ -1,4 +1,9 @@
-"""Views and photographs that no fit looks at: they judge."""
+"""Views and photographs that no fit looks at, so that they can judge it: :func:`share_out`, :func:`hold_out`.
+
+Photographs know more than the scene does, but also noise, exposure and whatever moved between them. A fit to few of
+them follows that too, and other photographs are then matched worse than before. So photographs held out decide
+(:class:`PhotographChoice`).
+"""
 
 from __future__ import annotations
 

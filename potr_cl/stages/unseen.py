@@ -1,4 +1,6 @@
-"""What becomes of splats that no view sees, or none from near enough."""
+"""Splats that no training view sees (:class:`Unseen`): they are kept, while the others are pruned without them. And
+those that no view has resolved (:class:`Unresolved`), which stages leave alone.
+"""
 
 from __future__ import annotations
 

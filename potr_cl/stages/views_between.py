@@ -1,4 +1,8 @@
-"""The stage "between": look at the scene from between the training views, too."""
+"""The stage "between": look at the scene from between the training views, too.
+
+How many views a scene needs (:func:`needed`), how many of these fit the memory (:func:`room_for`), and what a splat may
+cost where views show a part of the scene (:func:`priced`).
+"""
 
 from __future__ import annotations
 
@@ -86,7 +90,11 @@ _MARGIN, _MARGIN_OF_PARTS = 1.1, 1.6
 
 
 def room_for(added: Sequence[Camera], state: State, bench: Workbench) -> int:
-    """How many of some views fit, on the average, beside those of a state.
+    """How many of some views fit the memory, on the average, beside those of a state.
+
+    A view that does not fit is made again for each measurement. So added views that take the room of others cost many
+    times what they should, and only as many are added as there is room for. Where views are made again in batches, each
+    with what it may draw (:func:`potr_cl.views.plan.by_view`), they cost less: half as many as were given are added.
 
     Args:
         added: the views that might be added.
@@ -164,6 +172,12 @@ _WHOLE = 0.25
 
 def priced(parameters: HyperParameters, state: State) -> HyperParameters:
     """What q gives, with the thresholds on the mean squared error as they are right for a state's views.
+
+    Errors are means over all views. Where each view shows the whole scene, a splat that makes every picture a little
+    worse counts as much as one that makes one picture much worse. Where each view shows a part, in a city or in a flat
+    of many rooms, no splat can make more than a few pictures worse. With the same threshold the more would go, the
+    larger the scene is, and each picture would be matched the worse. So the threshold is a part of that for a scene
+    that is seen whole.
 
     Args:
         parameters: of a scene that is seen whole.

@@ -2,8 +2,8 @@
 
 A :class:`Budget` is asked for each group, in the plan's order, how many bytes it may take (:meth:`Budget.room`), and is
 told what it has taken (:meth:`Budget.took`). A group with less room than it takes is streamed: made again whenever it
-is looked at. Views of which only a part fits (:class:`Shared`) keep their lists first, see
-:mod:`potr_cl.views.budget`.
+is looked at. Views of which only a part fits (:class:`Shared`) keep their lists first, in a
+:class:`ViewCache`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,11 @@ GEOMETRY = _SHAPE + _COLOUR
 
 
 class ViewCache(Owner):
-    """What is kept of views.
+    """Prepared views that are kept for more than one sweep, within a budget of device memory.
+
+    Tile lists and depth orders take longer to make again than projections. So the lists of as many views as possible
+    are kept first, and then the projections of as many of these as there is room for. The other views share room for
+    one projection, which is made again whenever it is needed.
 
     Args:
         device: that they are prepared on.

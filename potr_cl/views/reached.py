@@ -1,4 +1,5 @@
-"""Which splats each view reaches: :func:`reached_splats`.
+"""Which splats each view reaches, as a device finds it: :func:`reached_splats`; and which are surely seen at all:
+:func:`surely_seen`, the quick part of :func:`potr_cl.model.splat_groups.unseen_splats`.
 
 A view reaches a splat if a sweep fetches it, for any of its tiles. Most others lie beside the view; or behind what ends
 all pixels of their tiles, as most of a city does. What a sweep computes is the same to the last bit if the others are

@@ -1,4 +1,4 @@
-"""A client of a Dask cluster: :func:`client_of`."""
+"""A client of a Dask cluster (:func:`client_of`), and whether its workers still do anything (:class:`Pulse`)."""
 
 from __future__ import annotations
 
@@ -66,6 +66,8 @@ _STILL = 10.0
 
 class Pulse:
     """Asks workers for a sign of life, by way of the scheduler.
+
+    A process that stands still keeps its connections, and Dask takes it for alive for minutes.
 
     Args:
         client: of the cluster.

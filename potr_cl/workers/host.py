@@ -1,4 +1,5 @@
-"""Several devices of this computer: :class:`HostPool`. Each but the first has a thread of its own.
+"""The devices that a user names, opened (:func:`open_workers`); several of this computer are a :class:`HostPool`, in
+which each but the first has a thread of its own.
 
 Drivers leave the interpreter free while they compute, copy or build, so threads are enough.
 """

@@ -184,7 +184,7 @@ def fit_scene(
         held_out: numbers of the views to judge by; None: some of the given ones.
         fit_to: numbers of the views to look at, where the judges are given; None: all others.
         factors: what a file will round shapes and opacities with. All is looked at as it is rounded, but what comes of
-            it is not. The scene as :class:`potr_cl.stages.fitting.adam.Parameters` takes it then.
+            it is not. The scene as :class:`potr_cl.stages.fitting.adam.Adam` takes it then.
         help_from: do some of the views; the result is the same.
 
     Raises:

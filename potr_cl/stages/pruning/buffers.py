@@ -1,4 +1,9 @@
-"""What is there while splats are removed."""
+"""What lies on a device while splats are removed: which are left (:class:`Survivors`), prepared views
+(:class:`PreparedSet`), and who numbers splats how (:class:`Ledger`).
+
+A view's projection, tile lists and depth order do not depend on which splats are left: pruning only takes intersections
+out.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pruning controller on a GPU, which decides itself which splats go and which tiles are measured again.
+"""Who decides which splats go (:func:`prune_scene`): the host, or a GPU itself, which also lists the tiles to measure.
 
 To fetch the effects of all splats and to send back a decision would take longer than to measure them. The rules are
 those of :mod:`potr_cl.stages.pruning.schedule`, in float32, with one difference: splats of the same score go together.

@@ -1,4 +1,12 @@
-"""Removal effects measured by several."""
+"""Removal effects of a state (:func:`measurement`), whose views may be measured by several: :class:`RemovalPart` does
+some of them on a worker, and :class:`RemovalHelpers` takes to the master's device what they find.
+
+All totals are integers, in units that follow from all views (:class:`potr_cl.stages.pruning.sweep.FixedPoint`). So it
+makes no difference to any bit who measures which view. The master's device adds up: what other devices of this process
+lend, or what has changed elsewhere since it was last told (:mod:`~potr_cl.stages.pruning.exchange`). What is decided is
+decided in one place, from the sums: by :mod:`potr_cl.stages.pruning.schedule`, or on the master's device by
+:mod:`potr_cl.stages.pruning.controller`.
+"""
 
 from __future__ import annotations
 

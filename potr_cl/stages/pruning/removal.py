@@ -7,10 +7,9 @@ totals a splat, in units that follow from all views. So it makes no difference t
 together, with which splats, and which of them stay on the device: that is the plan's matter
 (:mod:`potr_cl.views.plan`), and the engine's (:mod:`potr_cl.views.engine`).
 
-The parts: staleness.py (what may be traded for speed, and which tiles the host has swept again), resident.py and
-streamed.py (measuring views that stay on the device and views that do not), prepared_set.py (what is kept of them, and
-who numbers splats how), launcher.py (the kernels of either family), survivors.py (which splats are left) and
-fixed_point.py (the totals' units).
+The parts: sweep.py (what may be traded for speed, the totals' units, and the kernels of either family), resident.py and
+streamed.py (measuring views that stay on the device and views that do not), buffers.py (which splats are left, what is
+kept of views, and who numbers splats how), helpers.py (others that measure some views).
 """
 
 from __future__ import annotations

@@ -60,6 +60,9 @@ class Queues:
 class TileSchedule:
     """Chooses the tiles of a measurement by staleness, and in turns.
 
+    A tile's staleness is the importance removed from it since its last sweep, as a part of its area; infinite before
+    the first sweep.
+
     Args:
         options: tolerance and turns.
         views: (number among the cameras, tiles) of the views whose tiles are numbered through, in their order.

@@ -1,4 +1,5 @@
-"""The splats' own blocks of the normal equations: the preconditioner, and what tells which coefficients to give up.
+"""The splats' own blocks of the normal equations (:class:`SplatBlocks`): the preconditioner, what tells which
+coefficients to give up, and what colours are rounded by (:class:`Rounding`).
 
 A splat's block is the sum over views s and pixels of w_s (T alpha)^2 B Bᵀ, B the SH basis towards the splat, for a
 channel of unit length in R, G, B; Y, Co and Cg have the squared lengths 3, 2 and 3 and do not mix.
@@ -171,7 +172,18 @@ class Steps:
 
 
 class Rounding(Owner):
-    """The steps of one scene's colours.
+    """Colours rounded to the steps of a file in rounds, between which the others are solved for again.
+
+    A coefficient that is rounded alone leaves an error in the pictures, and those of many splats add up. What is not
+    rounded yet can take most of it back. So half of the splats come first: their AC coefficients one after another,
+    each making up for those before it within the splat (cl/refit/rounding.cl; Babai: "On Lovász' lattice reduction and
+    the nearest lattice point problem", 1986, the nearest-plane method), and then the constant ones. All that is still
+    free takes some steps towards the pictures. Then come the AC coefficients of the other splats and half of their
+    constant ones, and after some more steps the rest. Each lies among others that are rounded at another time.
+
+    An AC coefficient becomes 0 instead of one step where the bits that this saves are worth more than the error that it
+    adds: rate-distortion optimised quantisation (Karczewicz, Ye, Chong: "Rate distortion optimized quantization",
+    VCEG-AH21, 2008), with an error that counts what the others of the splat make up for.
 
     Args:
         coefficients: whose vectors are rounded.

@@ -1,7 +1,7 @@
 """The linear least-squares problem of a re-fit and its solutions, for one scene and its views: :class:`ColourRefit`.
 
-It puts together the vectors of coefficients (placement.py), the map from them to pictures (colour_map.py), perhaps with
-workers that do some of the views (shared_map.py), and the solver (solver.py).
+It puts together the vectors of coefficients (coefficients.py), the map from them to pictures (colour_map.py), perhaps
+with workers that do some of the views (helpers.py), and the solver (solver.py).
 """
 
 from __future__ import annotations

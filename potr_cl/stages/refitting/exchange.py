@@ -1,7 +1,7 @@
 """What travels between the devices that do the views of a re-fit: :class:`Exchange`.
 
 Devices of one process lend each other their memory. To another computer go the coefficients that may change, splat by
-splat in one row (:mod:`potr_cl.stages.refitting.exchange`), and vectors without what is 0: once coefficients have
+splat in one row (:class:`PackedRow`), and vectors without what is 0: once coefficients have
 been given up, nine of ten are.
 """
 

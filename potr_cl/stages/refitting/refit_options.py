@@ -1,4 +1,4 @@
-"""How a re-fit of the colours goes, :class:`RefitOptions`, and what has come of it, :class:`Refitted`."""
+"""How a re-fit of the colours goes, :class:`RefitOptions`, of what, :class:`ComingScene`, and what came of it."""
 
 from __future__ import annotations
 
