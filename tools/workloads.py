@@ -20,8 +20,7 @@ from potr_cl.model.camera import Camera, resized
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.pipeline.run import Run
-from potr_cl.pipeline.stopwatch import Stopwatch
+from potr_cl.pipeline.run import Run, Stopwatch
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.code import Code
 from potr_cl.stages.stage import State

@@ -24,7 +24,7 @@ from potr_cl.ondevice.decode import decode_to_device
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.outputs.output import Output, Request, Rounded
-from potr_cl.raster.kept_scene import large_for
+from potr_cl.raster.resident import large_for
 from potr_cl.raster.scene_buffers import Drawable
 
 _NAMES = {

@@ -17,8 +17,7 @@ from potr_cl.pipeline.search import encode_to_target
 from potr_cl.pipeline.target import Target
 from potr_cl.placement.virtual import place_cameras
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
-from potr_cl.stages.fit import LeftOut
-from potr_cl.stages.fitting.fit import Fitted
+from potr_cl.stages.fitting.fitted import Fitted, LeftOut
 from potr_cl.stages.stage import State
 
 #: Half of the splats, so that there is something to make up for; with coarser steps files would not show it.
@@ -74,7 +73,7 @@ def test_a_fit_pays(device, plush_excerpt, plush_excerpt_cameras):
 def test_time_is_told_only_of_a_fit_that_was_asked_for(device, plush_excerpt, plush_excerpt_cameras, monkeypatch):
     # By a clock that stands still while others have the processors, as far as the processors do the work.
     clock = time.process_time if device.info.kind == "cpu" else time.perf_counter
-    monkeypatch.setattr("potr_cl.pipeline.stopwatch.time", SimpleNamespace(perf_counter=clock))
+    monkeypatch.setattr("potr_cl.pipeline.run.time", SimpleNamespace(perf_counter=clock))
     plain = encode(plush_excerpt, plush_excerpt_cameras, HALF.changed(fit=False), device=device)
     assert "fit" not in plain.seconds
     fitted = encode(plush_excerpt, plush_excerpt_cameras, HALF, device=device)
@@ -134,7 +133,7 @@ def test_what_files_said_of_one_quality_is_not_asked_of_another(device, plush_ex
     taken = encode(plush_excerpt, plush_excerpt_cameras, HALF.changed(fit={"steps": 60}), device=device).fitted
     assert isinstance(taken, Fitted)
     assert taken.files is not None
-    known = as_done(coarse, State.of(plush_excerpt).having_learnt(fitted=taken))
+    known = as_done(coarse, State.of(plush_excerpt).with_results(fitted=taken))
     assert isinstance(encode(plush_excerpt, plush_excerpt_cameras, known, device=device).fitted, Fitted)
 
 

@@ -9,11 +9,10 @@ import pytest
 
 from potr_cl.model.camera import resized, train_views
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.forecast import memory_needed
+from potr_cl.pipeline.forecast import fit_bytes, memory_needed
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.fit import FitOptions, fit_scene
-from potr_cl.stages.fitting.memory import fit_bytes
 from potr_cl.views.targets import RenderedTargets
 from tests.devices import FAMILIES
 

@@ -14,7 +14,7 @@ from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.refitting.photographs import hold_out
+from potr_cl.stages.held_out import hold_out
 from tests.cases.photographs import photographed_scene, photographs
 from tests.reference.scenes import ring_of_cameras
 

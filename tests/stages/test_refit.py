@@ -11,17 +11,15 @@ import pytest
 from potr_cl.errors import DataError, UsageError
 from potr_cl.model.scene import Scene
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.rules import INRIA
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.colour_refit import ColourRefit
-from potr_cl.stages.refitting.coming_scene import ComingScene
-from potr_cl.stages.refitting.layout import Layout
 from potr_cl.stages.refitting.own_views import OwnViews
 from potr_cl.stages.refitting.refit import active_coefficients, refit_colours
-from potr_cl.stages.refitting.refit_options import RefitOptions
-from potr_cl.stages.refitting.view_kernels import Sweep
+from potr_cl.stages.refitting.refit_options import ComingScene, RefitOptions
+from potr_cl.stages.refitting.sliced_arrays import Layout
+from potr_cl.stages.refitting.view_kernels import RefitSweep
 from tests.reference.refit import LENGTHS, selection, to_rgb, to_ycocg
 from tests.reference.refit_cases import Case, Linearised, Pictures
 from tests.reference.scenes import ring_of_cameras, tilted_camera, visible_scene
@@ -360,7 +358,7 @@ def test_nobody_waits_for_a_device_that_others_read_from(case, monkeypatch):
         return download(*args)
 
     rasterizer = Rasterizer(device, case.scene)
-    sweep = Sweep(device, INRIA)
+    sweep = RefitSweep(device)
     layout = Layout(len(case.scene), rasterizer.stride, case.scene.sh.shape[1], sweep.lanes)
     with (
         rasterizer,

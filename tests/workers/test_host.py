@@ -19,12 +19,11 @@ from potr_cl.opencl.memory import Memory
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.stages.pruning import removal
-from potr_cl.stages.pruning.shared_removal import RemovalPart
-from potr_cl.stages.refitting.shared_map import ColourPart
+from potr_cl.stages.pruning.helpers import RemovalPart
+from potr_cl.stages.refitting.helpers import ColourPart
 from potr_cl.views import targets, visibility
 from potr_cl.views.targets import RenderedTargets
-from potr_cl.workers.host import HostPool
-from potr_cl.workers.opening import open_workers
+from potr_cl.workers.host import HostPool, open_workers
 from potr_cl.workers.parts import Parts
 from potr_cl.workers.pool import Part
 from tests.cases.cameras import small
