@@ -34,6 +34,7 @@ What happens at the limits (``stress``):
 stress.run          every kernel against float64 on the worst inputs: what error is the kernel's own?
 stress.platforms    the rasterizer, the metrics and the re-fit on every OpenCL runtime of this machine
 stress.offline      do all GPU programs build for AMD's, Intel's and Apple's GPUs, and do any spill registers?
+stress.limits       encodes on a device that is told to be small and watched: do they fit, how long are kernels?
 stress.simulated    does Oclgrind see a race, an access out of bounds or an uninitialised read in any kernel?
 stress.fuzz         does any changed file do more than be refused or decode to finite numbers?
 stress.bombs        what do files take that unpack to far more than they are, or claim to?
