@@ -61,7 +61,7 @@ def devices_table(reports: Path = _REPORTS) -> str:
                     str(len(said)),
                 )
                 rows.append([*map(cell, told), *(_per_launch(entry.get("times", {}), name) for name in _KERNELS)])
-    head = ("device", "runtime and driver", "system", "self-check", "lines of the compiler")
+    head = ("device", "runtime and driver", "system", "self-check", "compiler warnings")
     return table((*head, *(f"`{name}`" for name in _KERNELS)), rows)
 
 
