@@ -18,7 +18,7 @@ import numpy as np
 import pyopencl as cl
 
 from potr_cl.errors import DeviceError, DeviceMemoryError
-from potr_cl.host.silence import whatever_warns
+from potr_cl.host.libraries import whatever_warns
 from potr_cl.host.threads import in_background, thread_pool
 from potr_cl.opencl import compiler, program_cache, quirks
 from potr_cl.opencl.ahead import context_of, leave
