@@ -53,6 +53,7 @@ make.readme_picture   the picture at the top of the README
 make.other_tools      splats in the formats of six tools, and how splat-transform reads them
 make.golden_files     files that every later decoder must read to the same values
 make.native           the compiled part of the decoder, in the checkout
+make.wheels          wheels for Linux, Windows and macOS, whose compiled part Zig builds here
 make.web              the decoder for browsers, and the viewer of pages
 make.docs             the pages and tables of README and docs that are made from the code (see CONTRIBUTING.md)
 make.benchmarks       the tables and plots of docs/benchmarks, from the results beside them
