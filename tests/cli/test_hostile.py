@@ -241,27 +241,6 @@ def test_errors_that_nobody_foresaw_are_one_line(
     assert all(line.isprintable() for line in said.split("\n"))
 
 
-@pytest.mark.parametrize("error", [OSError("Could not find libllvmlite.so"), SystemError("error return"), None])
-def test_a_library_that_does_not_start(
-    scene_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, error: Exception | None
-) -> None:
-    """What its compiler says where there is too little memory: seldom a MemoryError."""
-
-    class Finder:
-        def find_spec(self, name: str, *_: object) -> None:
-            if name == "gsply":
-                raise error or ImportError("no gsply")
-
-    packed = scene_path.with_suffix(".compressed.ply")
-    assert outcome(capsys, ["convert", scene_path, packed])[0] == 0  # written without it
-    monkeypatch.setattr(sys, "meta_path", [Finder(), *sys.meta_path])
-    for name in [name for name in sys.modules if name.partition(".")[0] == "gsply"]:
-        monkeypatch.delitem(sys.modules, name)
-    code, _, err = outcome(capsys, ["convert", packed, scene_path.with_suffix(".spz")])
-    assert code == (2 if error is None else 1)
-    assert "needs the library gsply" in err
-
-
 def test_a_scene_that_does_not_fit_the_memory(
     scene_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

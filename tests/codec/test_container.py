@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from potr_cl.codec import container, plain
-from potr_cl.codec.blocks.geometry import quantise
-from potr_cl.codec.blocks.splitting import blocks_of
+from potr_cl.codec.blocks import blocks_of, quantise
 from potr_cl.codec.container import FREE_BLOCKS, EntropyCoder
 from potr_cl.codec.decoder import decode, open_file
 from potr_cl.codec.encoder import Level, code_levels, code_scene

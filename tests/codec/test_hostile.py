@@ -18,8 +18,8 @@ from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.codec.sections import ORDER, SH, Coder, Property
 from potr_cl.errors import DataError, UsageError
+from potr_cl.host.inputs import FREE_SPLATS
 from potr_cl.model.box import Box
-from potr_cl.model.claims import FREE_SPLATS
 from potr_cl.model.scene import Scene
 from tests.cases.own_warnings import no_warnings
 from tests.oracles.decoder import decode as decode_independently
