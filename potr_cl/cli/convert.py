@@ -22,7 +22,7 @@ from potr_cl.cli.scenes import (
 from potr_cl.cli.terminal import say_done
 from potr_cl.errors import UsageError
 from potr_cl.formats import scene_writer
-from potr_cl.formats.registry import extras_needed, suffixes_read, suffixes_written
+from potr_cl.formats.registry import suffixes_read, suffixes_written
 from potr_cl.formats.scenes import page
 
 
@@ -61,7 +61,7 @@ def add_convert(commands: Commands) -> None:
         help="a scene from one format to another, for other tools",
         usage="potr-cl convert IN OUT [options]\n       potr-cl convert IN [IN ...] -o FOLDER --to SUFFIX [options]",
         description=f"Read a scene ({suffixes_read()}) and write it as {suffixes_written()}. Nothing but what the "
-        f"format itself rounds is changed; axes are kept. {extras_needed()}. All may be gzipped (.ply.gz). SOG is read "
+        f"format itself rounds is changed; axes are kept. All may be gzipped (.ply.gz). SOG is read "
         "from folders too (meta.json, lod-meta.json), level N of streamed SOG by FOLDER#N.",
     )
     p.add_argument(

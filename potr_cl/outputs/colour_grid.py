@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.blocks.geometry import AnyGeometry
+from potr_cl.codec.blocks import AnyGeometry
 from potr_cl.codec.steps.rule import factors
 
 

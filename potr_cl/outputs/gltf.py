@@ -8,7 +8,7 @@ from typing import ClassVar
 from potr_cl.codec.encoder import Coded
 from potr_cl.errors import UsageError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes import gltf, gltf_writer
+from potr_cl.formats.scenes import gltf, gltf_file
 from potr_cl.model.scene import Scene
 from potr_cl.outputs.output import Request, Rounded, RoundedScene
 from potr_cl.outputs.spz import Spz
@@ -38,4 +38,4 @@ class Gltf(Spz):
         rounded, sh = self.prepared(scene, rounded, request)
         assert isinstance(rounded, RoundedScene)
         coded = super().file(replace(scene, sh=sh), rounded, request)
-        return replace(coded, pieces=gltf_writer.binary(replace(scene, means=rounded.scene.means), coded.pieces))
+        return replace(coded, pieces=gltf_file.binary(replace(scene, means=rounded.scene.means), coded.pieces))

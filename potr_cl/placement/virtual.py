@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from potr_cl.model.camera import Camera, resized
-from potr_cl.model.placement.matter import frame_of
-from potr_cl.model.placement.sampling import F64
+from potr_cl.model.matter import frame_of
+from potr_cl.model.sampling import F64
 from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import FIELD, PREFIX, Plan, plan
 from potr_cl.opencl.device import Device

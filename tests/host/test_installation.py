@@ -6,20 +6,20 @@ import importlib.metadata
 
 import pytest
 
-from potr_cl.host.installation import install_command
+from potr_cl.host.libraries import install_command
 
 REQUIRES = [
     "numpy>=2.0",
     'intel-opencl-rt; ((sys_platform == "linux" and platform_machine == "x86_64")) and extra == "intel-cpu"',
     "intel-cmplr-lib-rt; (sys_platform == 'linux') and extra == 'intel-cpu'",
-    'gsply>=0.4.4; extra == "convert"',
+    'viser>=1.1; extra == "view"',
 ]
 
 
 def test_the_libraries_are_named_and_not_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
     """Which is on no index."""
     monkeypatch.setattr(importlib.metadata, "requires", lambda _name: REQUIRES)
-    assert install_command("convert") == 'pip install "gsply>=0.4.4"'
+    assert install_command("view") == 'pip install "viser>=1.1"'
     assert install_command("intel-cpu") == 'pip install "intel-opencl-rt" "intel-cmplr-lib-rt"'
 
 
@@ -28,4 +28,4 @@ def test_a_clone_that_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
         raise importlib.metadata.PackageNotFoundError
 
     monkeypatch.setattr(importlib.metadata, "requires", unknown)
-    assert install_command("convert") == 'pip install ".[convert]" in a clone of the repository'
+    assert install_command("view") == 'pip install ".[view]" in a clone of the repository'

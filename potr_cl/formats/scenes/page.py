@@ -21,7 +21,7 @@ from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.host.atomic_write import replacing
+from potr_cl.host.atomic_write import write_pieces
 from potr_cl.model.scene import Scene
 from potr_cl.plain_text import plain
 
@@ -146,10 +146,7 @@ def save(
         source: of the scene; the .potr file that it is, or has in it, goes into the page as it is.
     """
     check_viewer()
-    potr = potr_of(scene, source)
-    with replacing(path) as file:
-        for piece in page_around(potr, len(scene), title, author):
-            file.write(piece)
+    write_pieces(path, page_around(potr_of(scene, source), len(scene), title, author))
 
 
 FORMAT = SceneFormat(

@@ -1,4 +1,5 @@
-"""Warnings of libraries that tell a user nothing, not shown while something is done: :func:`without_warnings`.
+"""Libraries of others: their warnings, which tell users nothing (:func:`without_warnings`), and how to install one that
+is missing (:func:`install_command`).
 
 Python has one list of filters for all threads, and :class:`warnings.catch_warnings` puts back the one that it has
 found. Where two threads use it at overlapping times, the first to end has the other's warnings shown, and the second
@@ -7,6 +8,7 @@ one leaves its own filters behind for good. So all of this package use one block
 
 from __future__ import annotations
 
+import re
 import threading
 import warnings
 from collections.abc import Callable, Iterator
@@ -64,3 +66,30 @@ def whatever_warns(work: Callable[[], T]) -> T:
             continue
     with without_warnings():
         return work()
+
+
+#: The package, as pip knows it.
+_PACKAGE = "potr-cl"
+
+
+def install_command(extra: str) -> str:
+    """What a user types to get what an extra of this package brings.
+
+    The package may have been installed from a clone, from a wheel or from an index, and only an index would know
+    "potr-cl[view]" by that name. So the command names the libraries themselves, as the package's metadata has them.
+
+    Args:
+        extra: its name in pyproject.toml.
+    """
+    # Imported where something is missing: it takes longer than most of this package's own modules.
+    from importlib.metadata import PackageNotFoundError, requires
+
+    try:
+        needed = requires(_PACKAGE) or []
+    except PackageNotFoundError:  # a clone that is run without being installed
+        needed = []
+    of_extra = re.compile(rf"""\bextra\s*==\s*["']{re.escape(extra)}["']""")
+    names = [name.strip() for name, _, marker in (each.partition(";") for each in needed) if of_extra.search(marker)]
+    if not names:
+        return f'pip install ".[{extra}]" in a clone of the repository'
+    return "pip install " + " ".join(f'"{name}"' for name in names)
