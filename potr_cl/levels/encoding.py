@@ -20,9 +20,9 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.encoded import Encoded, LevelMade
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.pipeline.stopwatch import Stopwatch, added_up
+from potr_cl.pipeline.run import Stopwatch, added_up
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
-from potr_cl.raster.kept_scene import KeptScene
+from potr_cl.raster.resident import ResidentScene
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.stage import Progress
 from potr_cl.workers.pool import Pool
@@ -37,7 +37,7 @@ def encode_levels(
     progress: Progress | None = None,
     device: Device | None = None,
     *,
-    kept: KeptScene | None = None,
+    kept: ResidentScene | None = None,
     in_frame: bool = False,
     pool: Pool | None = None,
     tell: Callable[[str], None] | None = None,
