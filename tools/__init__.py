@@ -15,6 +15,7 @@ bench.decode           how fast does a file decode, by compiled code, NumPy or O
 bench.codec            speed, memory and size of the codec alone
 bench.paired           are whole encodes faster or slower than those of another checkout?
 bench.scaling          time and memory against splats, views and workers: with which exponents?
+bench.levels           how close are levels of detail where they are shown, and do leaves' errors foretell pictures'?
 bench.web              how fast is the browser's decoder against native C, and in how much memory?
 =====================  =================================================================================================
 
