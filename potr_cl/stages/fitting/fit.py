@@ -29,7 +29,7 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.stages.fitting.adam import UNROUNDED, Adam, Factors, Limits, Rates
 from potr_cl.stages.fitting.fitted import Fitted, decibels
-from potr_cl.stages.fitting.together import Batch, Descent, Ground, Together, room_for_pictures, together
+from potr_cl.stages.fitting.together import Batch, DeviceFit, Ground, SharedFit, room_for_pictures, together
 from potr_cl.stages.held_out import share_out
 from potr_cl.views.shares import HelpFrom
 from potr_cl.views.targets import TargetPictures, Targets
@@ -150,7 +150,7 @@ def fit_scene(
     ground = Ground(scene, cameras, background, rates, _limits(scene), factors)
     with (
         _pictures_of(device, cameras, targets, options.memory) as pictures,
-        Descent(device, ground, pictures) as descent,
+        DeviceFit(device, ground, pictures) as descent,
     ):
         if options.memory is None and options.steps * options.batch >= len(fit_to):
             pictures.fill([(number,) for number in (*held_out, *fit_to)])
@@ -207,7 +207,7 @@ def _pictures_of(
 
 def _run(
     options: FitOptions,
-    steps: Together,
+    steps: SharedFit,
     adam: Adam,
     judges: Judges,
     fit_to: Sequence[int],
