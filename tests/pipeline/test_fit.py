@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from types import SimpleNamespace
 
@@ -104,24 +103,15 @@ def test_what_only_fits_rounds_as_q_says(device, plush_excerpt, plush_excerpt_ca
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("target", "kept", "steps"),
-    [(Target(max_bytes=13_000), 0.3, 60), (Target(min_psnr=44), 0.3, 60)],
-    ids=str,
-)
-def test_a_search_fits(device, plush_excerpt, plush_excerpt_cameras, target, kept, steps):
-    options = HALF.changed(prune={"keep": kept}, fit={"steps": steps})
+def test_a_search_fits(device, plush_excerpt, plush_excerpt_cameras):
+    options, target = HALF.changed(prune={"keep": 0.3}, fit={"steps": 60}), Target(min_psnr=44)
     found = encode_to_target(plush_excerpt, plush_excerpt_cameras, target, options, device=device)
     assert isinstance(found.encoded.fitted, Fitted)
     low, high = target.window
     assert low <= found.value <= high
     again = encode(plush_excerpt, plush_excerpt_cameras, found.options, device=device)
     assert again.data == found.encoded.data
-    if target.max_bytes is None:
-        reached = psnr(device, plush_excerpt, again, plush_excerpt_cameras)
-        assert reached >= target.min_psnr
-    else:
-        assert round(math.exp(found.value)) == again.nbytes <= target.max_bytes
+    assert psnr(device, plush_excerpt, again, plush_excerpt_cameras) >= target.min_psnr
 
 
 @pytest.mark.slow

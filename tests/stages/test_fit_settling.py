@@ -92,6 +92,7 @@ def test_a_fit_can_look_at_what_a_file_will_hold(device, plush_excerpt, views):
 
 
 @pytest.mark.slow
+@pytest.mark.one_family
 def test_coefficients_are_chosen_and_the_rest_moves(device, plush_excerpt, views):
     _, then, errors, _ = settled(device, plush_excerpt, views, Settling(0.5, 0, 0.1))
     assert then.geometry is None

@@ -271,16 +271,6 @@ def test_python_takes_several_devices(plush_excerpt, plush_excerpt_cameras):
         potr_cl.encode(plush_excerpt, cameras, OPTIONS, device=[])
 
 
-def test_a_search_shares_views_out_too(plush_excerpt, plush_excerpt_cameras):
-    cameras = few(plush_excerpt_cameras)
-    options = EncodeOptions.for_preset("best", prune={"iterations": 4}, refit={"steps": 2})
-    device = Device()
-    alone = potr_cl.encode(plush_excerpt, cameras, options, device=device, max_size=16_000)
-    together = potr_cl.encode(plush_excerpt, cameras, options, device=[device, Device()], max_size=16_000)
-    assert together.data == alone.data
-    assert together.shared is not None
-
-
 @pytest.mark.slow
 def test_large_scenes_view_by_view(monkeypatch):
     """Each device looks at its views with what these may draw."""

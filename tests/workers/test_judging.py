@@ -194,6 +194,7 @@ def test_a_search_for_a_psnr_judges_together(plush_excerpt, cameras, monkeypatch
     devices = [device, open_device("cpu")]
     together = potr_cl.encode(plush_excerpt, cameras, options, device=devices, min_psnr=32)
     assert together.data == alone.data
+    assert together.shared is not None
     assert set(judged_by) == set(devices)
     assert [device.allocated for device in devices] == [0] * 2
 
