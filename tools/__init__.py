@@ -13,7 +13,6 @@ bench.refit            what does the re-fit of the colours bring, and what does 
 bench.fit              how fast are the fit's steps?
 bench.decode           how fast does a file decode, by compiled code, NumPy or OpenCL, and in how much memory?
 bench.codec            speed, memory and size of the codec alone
-bench.virtual_cameras  what does encoding without cameras cost, and what is left of places?
 bench.paired           are whole encodes faster or slower than those of another checkout?
 bench.scaling          time and memory against splats, views and workers: with which exponents?
 bench.web              how fast is the browser's decoder against native C, and in how much memory?

@@ -1,7 +1,8 @@
-"""Whether colours are fitted to photographs or to pictures of the uncompressed scene: photographs held out decide.
+"""Views and photographs that no fit looks at, so that they can judge it: :func:`share_out`, :func:`hold_out`.
 
 Photographs know more than the scene does, but also noise, exposure and whatever moved between them. A fit to few of
-them follows that too, and other photographs are then matched worse than before.
+them follows that too, and other photographs are then matched worse than before. So photographs held out decide
+(:class:`PhotographChoice`).
 """
 
 from __future__ import annotations
@@ -61,3 +62,23 @@ def hold_out(photographed: Sequence[Camera]) -> tuple[list[Camera], list[Camera]
         [camera for number, camera in enumerate(photographed) if number not in judging],
         [camera for number, camera in enumerate(photographed) if number in judging],
     )
+
+
+#: One view in so many is held out, but no more than the most.
+_ONE_VIEW_IN, _MOST_HELD_OUT = 8, 8
+
+
+def share_out(given: int, added: int) -> tuple[list[int], list[int]]:
+    """Numbers of the views to fit to, and of those that are held out, spread evenly over those that were given.
+
+    Args:
+        given: how many views there are at first, and added: between these. A view that was added is never held out.
+
+    Returns:
+        Nothing is held out if there are fewer than two given views.
+    """
+    if given < 2:
+        return list(range(given + added)), []
+    every = max(min(_ONE_VIEW_IN, given), -(-given // _MOST_HELD_OUT))
+    held_out = set(range(every // 2, given, every))
+    return [number for number in range(given + added) if number not in held_out], sorted(held_out)

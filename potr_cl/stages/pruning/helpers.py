@@ -1,18 +1,19 @@
-"""Removal effects whose views are measured by several: :class:`RemovalPart` does some of them on a worker, and
-:class:`OtherViews` takes to the master's device what they find.
+"""Removal effects of a state (:func:`measurement`), whose views may be measured by several: :class:`RemovalPart` does
+some of them on a worker, and :class:`RemovalHelpers` takes to the master's device what they find.
 
-All totals are integers, in units that follow from all views (:class:`potr_cl.stages.pruning.fixed_point.FixedPoint`).
-So it makes no difference to any bit who measures which view. The master's device adds up: what other devices of this
-process lend, or what has changed elsewhere since it was last told (:mod:`~potr_cl.stages.pruning.travelling_totals`).
-What is decided is decided in one place, from the sums: by :mod:`potr_cl.stages.pruning.schedule`, or on the master's
-device by :mod:`potr_cl.stages.pruning.on_device`.
+All totals are integers, in units that follow from all views (:class:`potr_cl.stages.pruning.sweep.FixedPoint`). So it
+makes no difference to any bit who measures which view. The master's device adds up: what other devices of this process
+lend, or what has changed elsewhere since it was last told (:mod:`~potr_cl.stages.pruning.exchange`). What is decided is
+decided in one place, from the sums: by :mod:`potr_cl.stages.pruning.schedule`, or on the master's device by
+:mod:`potr_cl.stages.pruning.controller`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -23,15 +24,19 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner, Scratch
 from potr_cl.opencl.relay import Lent, Relay
-from potr_cl.raster.carried import Excerpt
-from potr_cl.raster.kept_scene import KeptScene, PartOfKept, lying_on, whole_on_device
-from potr_cl.stages.pruning.removal import F64, Indices, add_totals, planned_sweep
-from potr_cl.stages.pruning.staleness import SweepOptions
-from potr_cl.stages.pruning.survivors import Bits
-from potr_cl.stages.pruning.travelling_totals import AddedChanges, AlivePacking, ChangedTotals, Changes
+from potr_cl.raster.resident import ResidentScene, ResidentSubset, SceneSubset, scene_on, whole_on_device
+from potr_cl.raster.scene_buffers import SceneBuffers
+from potr_cl.stages.pruning.buffers import Bits
+from potr_cl.stages.pruning.exchange import AddedChanges, AlivePacking, ChangedTotals, Changes
+from potr_cl.stages.pruning.removal import F64, Indices, RemovalSweep, add_totals, planned_sweep
+from potr_cl.stages.pruning.sweep import SweepOptions
+from potr_cl.stages.stage import State, Workbench
+from potr_cl.views.plan import none
+from potr_cl.views.shares import ViewShares
+from potr_cl.views.subsets import NoSplats
 from potr_cl.views.visibility import Visibility
 from potr_cl.workers.parts import Each, Parts, Pending
-from potr_cl.workers.pool import Part, Pool
+from potr_cl.workers.pool import Part, Pool, shares
 
 
 class RemovalPart(Part):
@@ -46,29 +51,26 @@ class RemovalPart(Part):
         options: speed/accuracy trade-offs.
         background: R, G, B behind the scene.
         numbers: of the views of this part, ascending.
-        sights: what all views see of it, where each had better be looked at with what it sees; None: with all splats.
-
-    Raises:
-        DeviceError: the scene or a view does not fit the device.
+        visibility: of all views, where each had better be looked at with what it sees; None: with all splats.
     """
 
     def __init__(
         self,
         device: Device,
         memory: int | None,
-        scene: Scene | KeptScene | PartOfKept | Excerpt,
+        scene: Scene | ResidentScene | ResidentSubset | SceneSubset,
         cameras: Sequence[Camera],
         options: SweepOptions,
         background: tuple[float, float, float],
         numbers: Sequence[int],
-        sights: Visibility | None = None,
+        visibility: Visibility | None = None,
     ) -> None:
         options = SweepOptions(**{**vars(options), "memory": memory})
         with ExitStack() as owned:
-            drawable = owned.enter_context(lying_on(device, scene))
-            if sights is not None:
+            drawable = owned.enter_context(scene_on(device, scene))
+            if visibility is not None:
                 drawable = owned.enter_context(whole_on_device(device, drawable))
-            sweep = planned_sweep(device, drawable, cameras, options, background, sights, numbers)
+            sweep = planned_sweep(device, drawable, cameras, options, background, visibility, numbers)
             self._sweep = owned.enter_context(sweep)
             self._alive = owned.enter_context(AlivePacking(device, self._sweep.splats, self._sweep.marks))
             self._changed: ChangedTotals | None = None
@@ -83,7 +85,7 @@ class RemovalPart(Part):
     def changes(self) -> Changes:
         """By how much the totals of the splats that are left have changed since the last call; all, at the first.
 
-        See :mod:`potr_cl.stages.pruning.travelling_totals`; valid until the next call.
+        See :mod:`potr_cl.stages.pruning.exchange`; valid until the next call.
         """
         sweep = self._sweep
         if self._changed is None:
@@ -138,12 +140,8 @@ class RemovalPart(Part):
         self._told = (place + 1, known)
         return None if found is None else (found[0], found[1].astype(np.uint32), found[2])
 
-    def close(self) -> None:
-        """Give all device memory back."""
-        self._owned.close()
 
-
-class OtherViews(Owner):
+class RemovalHelpers(Owner):
     """What others measure, for the :class:`potr_cl.stages.pruning.removal.RemovalSweep` of the master's device.
 
     Args:
@@ -153,9 +151,6 @@ class OtherViews(Owner):
         pool: of their workers.
         numbers: of each part's splats, (n,) int64, ascending, where it has no others and knows them by their places;
             None: all parts have all.
-
-    Raises:
-        DeviceError: the device has no room.
     """
 
     def __init__(
@@ -246,6 +241,84 @@ class OtherViews(Owner):
             yield number, seen.astype(np.int64) if self._numbers is None else self._numbers[part][seen], importances
             place += 1
 
-    def close(self) -> None:
-        """Give the master's device memory back; the parts are the caller's."""
-        self._owned.close()
+
+@contextmanager
+def measurement(
+    state: State,
+    bench: Workbench,
+    options: SweepOptions,
+    visibility: Visibility | None = None,
+    spared: NDArray[np.bool_] | None = None,
+    dealt: ViewShares | None = None,
+    seen: NDArray[np.int64] | None = None,
+) -> Iterator[RemovalSweep]:
+    """A removal sweep over the views of a state, its splats numbered as in the state's scene.
+
+    Args:
+        state, bench, options: of the stage.
+        visibility: what the views see, where each had better be looked at with what it sees.
+        spared: as of :class:`~potr_cl.stages.pruning.removal.RemovalSweep`; only with ``visibility``.
+        dealt: the views, for a pool whose workers get what these see and no more of the scene.
+        seen: (n,) numbers of the splats that the sweep is to have, ascending, which it numbers from 0 on; None: all.
+    """
+
+    def progress(done: int, count: int) -> None:
+        bench.progress("prepare views", done / count)
+
+    device, pool, views = bench.opened, bench.pool, state.views
+    splats = len(state.scene) if seen is None else len(seen)
+    share = None if pool is None else shares(pool, len(views))
+    with ExitStack() as stack:
+        if pool is None or share is None or not share.others:
+            scene = None
+            if visibility is not None:
+                scene = state.scene if seen is None else state.scene.subset(seen)
+                drawable = stack.enter_context(whole_on_device(device, bench.drawable(scene)))
+            else:
+                drawable = stack.enter_context(scene_on(device, bench.scene_of(state, seen)))
+            given_all = (device, drawable, views, options, bench.background, visibility, None, progress, scene, spared)
+            yield stack.enter_context(planned_sweep(*given_all))
+            return
+        given: list[tuple[Any, ...]] = []
+        if dealt is not None:
+            share = dealt.dealt
+            for part in dealt.shares:
+                subset = stack.enter_context(pool.shared(part.subset))
+                given.append((subset, views, options, bench.background, part.numbers, part.visibility))
+        else:
+            sent = stack.enter_context(bench.shared(pool, state, seen))
+            visibility = visibility if pool.in_process else None
+            given = [(sent, views, options, bench.background, numbers, visibility) for numbers in share.others]
+        parts = stack.enter_context(Parts(pool, RemovalPart, given, options.memory, share.names))
+        numbers = None if dealt is None else [each.splats for each in dealt.shares]
+        helpers = stack.enter_context(RemovalHelpers(device, splats, parts, pool, numbers))
+        if share.own:
+            drawable = stack.enter_context(scene_on(device, bench.scene_of(state, seen)))
+            # Only what lies on the device already is looked at in parts.
+            own_visibility = visibility if isinstance(drawable, SceneBuffers) else None
+            own = (device, drawable, views, options, bench.background, own_visibility, share.own, progress)
+            sweep = stack.enter_context(planned_sweep(*own, helpers=helpers))
+        else:
+            source = NoSplats(device, splats)
+            sweep = stack.enter_context(RemovalSweep(source, views, options, plan=none(), helpers=helpers))
+        parts.ready()
+        yield sweep
+
+
+def importances_of(
+    removal: RemovalSweep, left: NDArray[np.int64]
+) -> Iterator[tuple[int, NDArray[np.int64], NDArray[np.float64]]]:
+    """I_k(s) of the splats that are left, view by view.
+
+    Args:
+        removal: the sweep, which has measured.
+        left: (n,) the sweep's numbers of the splats that are left, ascending.
+
+    Yields:
+        The number of the view, the numbers among those left of the splats that it sees, ascending, and the mean of T α
+        of each over the view's pixels.
+    """
+    places = np.full(removal.splats, -1, np.int64)
+    places[left] = np.arange(len(left))
+    for view, seen, importances in removal.view_importances():
+        yield view, places[seen], importances

@@ -37,34 +37,23 @@ class AlivePacking(Owner):
     Args:
         device: that has the totals.
         splats: N.
-        states: (N,) uint8 in its memory, :class:`potr_cl.stages.pruning.survivors.SplatState`.
-
-    Raises:
-        DeviceError: the device has no room.
+        states: (N,) uint8 in its memory, :class:`potr_cl.stages.pruning.buffers.SplatState`.
     """
 
     def __init__(self, device: Device, splats: int, states: cl.Buffer) -> None:
         self._device, self._splats, self._states = device, splats, states
         self._left = splats
-        runs = -(-splats // _RUN)
-        self._runs = runs
         self._alive, self._pack, self._unpack = (
             device.kernel(_SOURCE, name) for name in ("alive_runs", "pack_alive", "unpack_alive")
         )
-        self._packed = Scratch(device, "the removal effects")
-        self._memory = Memory(device)
-        with device.all_or_nothing():
-            self._masks = self._memory.allocate(8 * runs, "the splats that are left")
-            self._starts = self._memory.allocate(4 * runs, "the splats that are left")
+        self._packed, self._runs = Scratch(device, _WHAT), _Runs(device, splats)
 
     def note(self) -> None:
         """Pack by the states as they are on the device from now on; before the first call all splats are packed."""
-        self._alive.bind(states=self._states, splats=self._splats, masks=self._masks, counts=self._starts)
-        self._alive.launch((-(-self._runs // _GROUP) * _GROUP,), (_GROUP,))
-        counts = self._device.download(self._starts, (self._runs,), np.uint32)
-        ends = np.cumsum(counts, dtype=np.uint32)
-        self._left = int(ends[-1])
-        self._device.copy(self._starts, ends - counts)
+        runs = self._runs
+        self._alive.bind(states=self._states, splats=self._splats, masks=runs.masks, counts=runs.starts)
+        self._alive.launch((-(-runs.count // _GROUP) * _GROUP,), (_GROUP,))
+        self._left = runs.begin()
 
     def lend(self, totals: cl.Buffer) -> Lent:
         """What others need of (N, 2) int64 totals, until the next call; all of them where all splats are left."""
@@ -84,14 +73,14 @@ class AlivePacking(Owner):
 
     def _launch(self, kernel: Kernel, totals: cl.Buffer, packed: cl.Buffer, **more: bool) -> None:
         kernel.bind(
-            totals=totals, splats=self._splats, masks=self._masks, starts=self._starts, packed=packed, **more
+            totals=totals, splats=self._splats, masks=self._runs.masks, starts=self._runs.starts, packed=packed, **more
         )  # fmt: skip
         kernel.launch((-(-self._splats // _GROUP) * _GROUP,), (_GROUP,))
 
     def close(self) -> None:
         """Give the device's memory back."""
         self._packed.close()
-        self._memory.close()
+        self._runs.close()
 
 
 class ChangedTotals(Owner):
@@ -100,11 +89,8 @@ class ChangedTotals(Owner):
     Args:
         device: that has the totals.
         splats: N.
-        states: (N,) uint8 in its memory, :class:`potr_cl.stages.pruning.survivors.SplatState`. Nobody asks for the
+        states: (N,) uint8 in its memory, :class:`potr_cl.stages.pruning.buffers.SplatState`. Nobody asks for the
             totals of splats that are not alive.
-
-    Raises:
-        DeviceError: the device has no room.
     """
 
     def __init__(self, device: Device, splats: int, states: cl.Buffer) -> None:
@@ -147,9 +133,6 @@ class AddedChanges(Owner):
 
     Args:
         device: that has the totals.
-
-    Raises:
-        DeviceError: the kernels cannot be built.
     """
 
     def __init__(self, device: Device) -> None:
@@ -231,6 +214,3 @@ class _Runs(Owner):
         ends = np.cumsum(counts, dtype=np.uint32)
         self._device.copy(self.starts, ends - counts)
         return int(ends[-1])
-
-    def close(self) -> None:
-        self._memory.close()

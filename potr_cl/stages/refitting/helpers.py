@@ -1,5 +1,5 @@
 """Products of a re-fit whose views are done by several: :class:`ColourPart` does some of them on a worker, and
-:class:`SharedViews` adds what the others find.
+:class:`ColourHelpers` adds what the others find.
 """
 
 from __future__ import annotations
@@ -20,24 +20,21 @@ from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.opencl.narrow import Narrowed
 from potr_cl.opencl.relay import Lent
-from potr_cl.raster.carried import Excerpt
-from potr_cl.raster.kept_scene import KeptScene, lying_on, whole_on_device
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.rules import RasterRules
+from potr_cl.raster.resident import ResidentScene, SceneSubset, scene_on, whole_on_device
 from potr_cl.raster.scene_buffers import stride_of
 from potr_cl.stages.refitting.coefficients import Coefficients
-from potr_cl.stages.refitting.coming_scene import AnyScene, arrived, colourless
 from potr_cl.stages.refitting.exchange import DrawnRows, Exchange, SentVector
-from potr_cl.stages.refitting.layout import Layout
 from potr_cl.stages.refitting.own_views import Look, OwnViews, parts_of
-from potr_cl.stages.refitting.view_kernels import Sweep
+from potr_cl.stages.refitting.refit_options import AnyScene, arrived, colourless
+from potr_cl.stages.refitting.sliced_arrays import Layout
+from potr_cl.stages.refitting.view_kernels import RefitSweep
 from potr_cl.views.reached import reached_splats
 from potr_cl.views.shares import ViewShares
 from potr_cl.views.targets import PicturesAhead, Targets, targets_of
 from potr_cl.views.visibility import Visibility
-from potr_cl.workers.dealing import Shares, shares
 from potr_cl.workers.parts import Each, Parts, Pending
-from potr_cl.workers.pool import Part, Pool, Shared
+from potr_cl.workers.pool import Part, Pool, Shared, Shares, shares
 
 
 @dataclass(frozen=True)
@@ -75,15 +72,12 @@ class ColourPart(Part):
         memory: bytes of its memory that prepared views and targets may take; None: the default.
         scene: whose geometry and opacities are used, perhaps still to come; its colours are not looked at.
         sh_count: M, coefficients of a channel.
-        rules, background: of the rasterizer.
+        background: of the rasterizer.
         source: the scene whose pictures are the targets, perhaps kept on devices, with pictures of it there, or what
             these views see of it.
         cameras: all views.
         numbers: of the views of this part, ascending.
-        sights: what all views may draw of the source, where no view sees much of it.
-
-    Raises:
-        DeviceError: the scenes or a view do not fit the device.
+        visibility: what all views may draw of the source, where no view sees much of it.
     """
 
     def __init__(
@@ -92,28 +86,27 @@ class ColourPart(Part):
         memory: int | None,
         scene: AnyScene,
         sh_count: int,
-        rules: RasterRules,
         background: tuple[float, float, float],
-        source: Scene | KeptScene | PicturesAhead | Excerpt,
+        source: Scene | ResidentScene | PicturesAhead | SceneSubset,
         cameras: Sequence[Camera],
         numbers: Sequence[int],
-        sights: Visibility | None = None,
+        visibility: Visibility | None = None,
     ) -> None:
         self._device = device
         with ExitStack() as owned:
-            sweep = Sweep(device, rules)
+            sweep = RefitSweep(device)
             layout = Layout(len(scene), stride_of(len(scene)), sh_count, sweep.lanes)
             self._coefficients = owned.enter_context(Coefficients(device, layout))
             self._exchange = owned.enter_context(Exchange(self._coefficients))
             self._x, self._direction = self._coefficients.vector(), self._coefficients.vector()
             self._coefficients.zero(self._x)
             ahead, kept = (source, source.source) if isinstance(source, PicturesAhead) else (None, source)
-            pictured = owned.enter_context(lying_on(device, kept))
-            if sights is not None:
+            pictured = owned.enter_context(scene_on(device, kept))
+            if visibility is not None:
                 pictured = owned.enter_context(whole_on_device(device, pictured))
-            of_source = owned.enter_context(targets_of(device, pictured, cameras, background, sights))
+            of_source = owned.enter_context(targets_of(device, pictured, cameras, background, visibility))
             here = arrived(scene)
-            rasterizer = owned.enter_context(Rasterizer(device, colourless(here), rules))
+            rasterizer = owned.enter_context(Rasterizer(device, colourless(here)))
             self._reach = reach = reached_splats(rasterizer, cameras, numbers, memory)
             self._views = owned.enter_context(
                 OwnViews(sweep, rasterizer, self._coefficients, cameras, background, memory, numbers, reach=reach)
@@ -127,12 +120,7 @@ class ColourPart(Part):
             self._owned = owned.pop_all()
 
     def gradient(
-        self,
-        x: SentVector,
-        flags: NDArray[np.uint32] | Lent,
-        blocks: bool,
-        constant: bool,
-        tell_drawn: bool = False,
+        self, x: SentVector, flags: NDArray[np.uint32] | Lent, blocks: bool, constant: bool, tell_drawn: bool = False
     ) -> Gradient:
         """What these views add to :meth:`~potr_cl.stages.refitting.colour_map.ColourMap.gradient`.
 
@@ -219,10 +207,6 @@ class ColourPart(Part):
         self._views.add_up(Look(self._direction, None, self._x, unit, constant, part))
         return self._exchange.send_sums(self._views.sums)
 
-    def close(self) -> None:
-        """Give all device memory back."""
-        self._owned.close()
-
 
 def unpacked(bits: NDArray[np.uint8], splats: int) -> NDArray[np.bool_]:
     """(N,), the splats whose bits are set, as of :attr:`Gradient.drawn`."""
@@ -236,16 +220,13 @@ _AT_ONCE = 1 << 26
 _OWN_SPEED = 1.06
 
 
-class SharedViews(Owner):
-    """A :class:`potr_cl.stages.refitting.colour_map.Helpers`.
+class ColourHelpers(Owner):
+    """What others add to the products of a :class:`potr_cl.stages.refitting.colour_map.ColourMap`.
 
     Args:
         coefficients: the master's, whose vectors are sent.
-        others: parts, each a :class:`potr_cl.stages.refitting.shared_map.ColourPart`.
+        others: parts, each a :class:`ColourPart`.
         in_process: whether they are threads of this process, which read what lies on the master's device themselves.
-
-    Raises:
-        DeviceError: the kernels cannot be built.
     """
 
     def __init__(self, coefficients: Coefficients, others: Parts, in_process: bool) -> None:
@@ -338,7 +319,7 @@ class SharedViews(Owner):
 
 
 def colour_shares(pool: Pool, views: int) -> Shares:
-    """Who does which of a re-fit's views; raises what :func:`potr_cl.workers.dealing.shares` does."""
+    """Who does which of a re-fit's views; raises what :func:`potr_cl.workers.pool.shares` does."""
     return shares(pool, views, parts_of(views), _OWN_SPEED)
 
 
@@ -347,9 +328,8 @@ def colour_parts(
     pool: Pool,
     share: Shares,
     scene: AnyScene,
-    rules: RasterRules,
     background: tuple[float, float, float],
-    source: Scene | KeptScene | PicturesAhead | ViewShares,
+    source: Scene | ResidentScene | PicturesAhead | ViewShares,
     cameras: Sequence[Camera],
     memory: int | None,
 ) -> Iterator[Parts]:
@@ -359,7 +339,7 @@ def colour_parts(
         pool: of their workers.
         share: who does which views.
         scene: whose colours are re-fitted.
-        rules, background: of the rasterizer.
+        background: of the rasterizer.
         source: the scene whose pictures are the targets, perhaps kept on devices, with pictures of it there, or what
             the views see of it.
         cameras: all views.
@@ -373,12 +353,12 @@ def colour_parts(
         shape = stack.enter_context(pool.shared(scene))
         pictured: list[tuple[Shared, Visibility | None]]
         if isinstance(source, ViewShares):
-            pictured = [(stack.enter_context(pool.shared(each.excerpt)), each.sights) for each in source.shares]
+            pictured = [(stack.enter_context(pool.shared(each.subset)), each.visibility) for each in source.shares]
         else:
             pictured = [(stack.enter_context(pool.shared(source)), None)] * len(share.others)
         given = [
-            (shape, sh_count, rules, background, own, cameras, numbers, sights)
-            for (own, sights), numbers in zip(pictured, share.others, strict=True)
+            (shape, sh_count, background, own, cameras, numbers, visibility)
+            for (own, visibility), numbers in zip(pictured, share.others, strict=True)
         ]
         with Parts(pool, ColourPart, given, memory, share.names) as parts:
             yield parts

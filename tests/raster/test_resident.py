@@ -13,9 +13,9 @@ from potr_cl.codec.quantize import HyperParameters
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.raster import kept_scene, scene_buffers
-from potr_cl.raster.kept_scene import KeptScene, PartOfKept, lying_on
+from potr_cl.raster import resident, scene_buffers
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.resident import ResidentScene, ResidentSubset, scene_on
 from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.stage import State, Workbench
@@ -35,7 +35,7 @@ def device(request: pytest.FixtureRequest) -> Iterator[Device]:
 
 def test_only_the_scene_itself_is_on_its_device(device):
     scene = random_splats(100)
-    with KeptScene(device, scene) as kept:
+    with ResidentScene(device, scene) as kept:
         assert isinstance(kept.drawable(device, scene), SceneBuffers)
         other = replace(scene)
         assert kept.drawable(device, other) is other
@@ -46,7 +46,7 @@ def test_only_the_scene_itself_is_on_its_device(device):
 def test_a_scene_is_not_kept_where_it_would_take_much_of_the_memory(device, monkeypatch):
     scene = random_splats(5000)
     monkeypatch.setattr(device, "info", replace(device.info, memory=2 * scene.nbytes))
-    with KeptScene(device, scene) as kept:
+    with ResidentScene(device, scene) as kept:
         assert kept.drawable(device, scene) is scene
         assert device.allocated == 0
 
@@ -55,16 +55,16 @@ def test_a_large_scene_is_not_there_twice_where_a_device_has_the_memory_of_the_h
     if device.info.kind != "cpu":
         pytest.skip("this device has memory of its own")
     scene = random_splats(5000)
-    with KeptScene(device, scene, memory=2 * scene.nbytes) as kept:
+    with ResidentScene(device, scene, memory=2 * scene.nbytes) as kept:
         assert kept.drawable(device, scene) is scene
-    with KeptScene(device, scene, memory=20 * scene.nbytes) as kept:
+    with ResidentScene(device, scene, memory=20 * scene.nbytes) as kept:
         assert kept.drawable(device, scene) is not scene
 
 
 def test_other_colours_leave_the_kept_ones_alone(device):
     scene, camera = random_splats(400, seed=3), straight_camera()
     other = random_splats(400, seed=4).sh
-    with KeptScene(device, scene) as kept:
+    with ResidentScene(device, scene) as kept:
         with Rasterizer(device, kept.drawable(device, scene)) as rasterizer:
             before = rasterizer.render(camera)[0]
             assert rasterizer.replace_sh(other) is None  # those of the kept scene are nobody's to free
@@ -95,7 +95,7 @@ def test_an_encode_uploads_its_scene_once_and_makes_the_same_bytes(
     monkeypatch.setattr(scene_buffers.SceneBuffers, "write_sh", counted)
     once = encode(plush_excerpt, plush_excerpt_cameras, OPTIONS, device=device).data
     assert sum(scenes) == 1
-    monkeypatch.setattr(kept_scene, "_PART", 1 << 40)
+    monkeypatch.setattr(resident, "_PART", 1 << 40)
     scenes.clear()
     assert encode(plush_excerpt, plush_excerpt_cameras, OPTIONS, device=device).data == once
     assert sum(scenes) > 1
@@ -105,19 +105,19 @@ def test_an_encode_uploads_its_scene_once_and_makes_the_same_bytes(
 def test_other_devices_keep_it_too(device):
     scene, camera = random_splats(300, seed=5), straight_camera()
     other = Device(device.info, family=device.family)
-    with KeptScene(device, scene) as kept:
-        assert kept.on(device) is kept.drawable(device, scene)
+    with ResidentScene(device, scene) as kept:
+        assert kept.found_on(device) is kept.drawable(device, scene)
         kept.bring_to(other)
-        there = kept.on(other)
+        there = kept.found_on(other)
         assert isinstance(there, SceneBuffers)
-        assert kept.on(other) is there
+        assert kept.found_on(other) is there
         with Rasterizer(other, there) as moved, Rasterizer(device, scene) as wanted:
             assert np.array_equal(moved.render(camera)[0], wanted.render(camera)[0])
     assert other.allocated == 0
     # A device without the room is given the host's.
     small = Device(replace(device.info, memory=2 * scene.nbytes), family=device.family)
-    with KeptScene(device, scene) as kept:
-        assert kept.on(small) is scene
+    with ResidentScene(device, scene) as kept:
+        assert kept.found_on(small) is scene
         assert small.allocated == 0
 
 
@@ -142,10 +142,10 @@ def test_a_part_of_what_is_kept_is_taken_on_the_device(device):
     scene, camera = random_splats(700, seed=6), straight_camera()
     numbers = np.flatnonzero(np.random.default_rng(7).random(700) < 0.4)
     other = Device(device.info, family=device.family)
-    with KeptScene(device, scene) as kept, Rasterizer(device, scene.subset(numbers)) as wanted:
+    with ResidentScene(device, scene) as kept, Rasterizer(device, scene.subset(numbers)) as wanted:
         expected = wanted.render(camera)[0]
         for place in (device, other):
-            with lying_on(place, PartOfKept(kept, numbers)) as part:
+            with scene_on(place, ResidentSubset(kept, numbers)) as part:
                 assert isinstance(part, SceneBuffers)
                 with Rasterizer(place, part) as rasterizer:
                     assert np.array_equal(rasterizer.render(camera)[0], expected)
@@ -172,7 +172,7 @@ def test_without_what_no_view_sees_the_scene_is_still_uploaded_once(
     assert found.unseen is not None
     assert found.unseen.splats > 0
     assert splats == [len(scene)]
-    monkeypatch.setattr(kept_scene, "_PART", 1 << 40)
+    monkeypatch.setattr(resident, "_PART", 1 << 40)
     assert encode(scene, cameras, options, device=device).data == found.data
 
 
@@ -184,7 +184,7 @@ def test_pruning_copies_no_more_of_a_scene_than_is_left(device):
     scene.means[::20, 2] = -50  # behind the camera
     state = State.of(scene, [replace(straight_camera(), name=f"{k}") for k in range(2)])
     parameters = replace(HyperParameters.from_quality(0.1, "best"), delta_mse_max=1e-3)
-    with KeptScene(device, scene) as kept:
+    with ResidentScene(device, scene) as kept:
         bench = Workbench(parameters, device=device, kept=kept)
         Prune(iterations=2).run(state, bench)  # what is made once is made
         tracemalloc.start()
@@ -193,7 +193,7 @@ def test_pruning_copies_no_more_of_a_scene_than_is_left(device):
             _, most = tracemalloc.get_traced_memory()
         finally:
             tracemalloc.stop()
-    assert left.learnt.unseen.splats == 3000
+    assert left.results.unseen.splats == 3000
     assert not left.scene.sh[np.isin(left.survivors, np.arange(0, 60_000, 20)), 1:].any()
     assert np.array_equal(left.scene.means, scene.means[left.survivors])
     assert len(left.scene) < 20_000
@@ -202,9 +202,9 @@ def test_pruning_copies_no_more_of_a_scene_than_is_left(device):
 
 def test_another_device_gets_the_same_bits(device):
     scene, other = random_splats(3000, degree=3, seed=4), Device(device.info, family=device.family)
-    with KeptScene(device, scene, others=[other]) as kept:
+    with ResidentScene(device, scene, others=[other]) as kept:
         assert other.allocated or kept.bring_to(other).result()  # it has begun, or is done
-        first, second = kept.on(device), kept.bring_to(other).result()
+        first, second = kept.found_on(device), kept.bring_to(other).result()
         assert isinstance(first, SceneBuffers)
         assert second is not None
         for name in ("means", "scales", "quaternions", "log2_opacities", "sh"):

@@ -1,10 +1,12 @@
-"""Splats that no training view sees (:func:`find_unseen`): they are kept, while the others are pruned without them."""
+"""Splats that no training view sees (:class:`Unseen`): they are kept, while the others are pruned without them. And
+those that no view has resolved (:class:`Unresolved`), which stages leave alone.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
@@ -13,11 +15,88 @@ from numpy.typing import NDArray
 
 from potr_cl.host.threads import Run, in_background
 from potr_cl.model.camera import Camera
-from potr_cl.model.scene import Scene
+from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.model.splat_groups import SplatGroups, opacity_weighted_areas, unseen_splats
-from potr_cl.raster.surely_seen import Seen
 from potr_cl.stages.pruning.schedule import Course, Pruned
 from potr_cl.stages.stage import State
+from potr_cl.views.reached import Seen
+
+
+@dataclass(frozen=True)
+class Unresolved:
+    """The splats of the uncompressed scene that no view has resolved.
+
+    Attributes:
+        mask: (N,) whether each is one.
+        find_area: returns their part of the scene's opacity-weighted area.
+    """
+
+    mask: NDArray[np.bool_]
+    find_area: Callable[[], float] = field(repr=False, compare=False)
+
+    @property
+    def splats(self) -> int:
+        """How many they are."""
+        return int(np.count_nonzero(self.mask))
+
+    @property
+    def of(self) -> int:
+        """How many splats the scene has."""
+        return len(self.mask)
+
+    def among(self, survivors: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(n,) the same of those that are left."""
+        return self.mask if len(survivors) == len(self.mask) else self.mask[survivors]
+
+    @property
+    def area(self) -> float:
+        """Their part of the scene's opacity-weighted area, 0 to 1."""
+        return self.find_area()
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """All by name."""
+        return {"splats": self.splats, "of": self.of, "area": self.area, "kept": True}
+
+    def __str__(self) -> str:
+        return (
+            f"no view shows {self.splats:,} splats ({100 * self.splats / self.of:.2g} %), "
+            f"{100 * self.area:.2g} % of the scene's area, from near enough to judge them: kept as they are"
+        )
+
+
+def as_they_were(state: State) -> State:
+    """A state in which stages have not changed what no view has resolved."""
+    unresolved = state.results.unresolved
+    if unresolved is None or state.scene is state.source:
+        return state
+    rows = np.flatnonzero(unresolved.among(state.survivors))
+    source, scene = state.survivors[rows], state.scene
+    changed: dict[str, Any] = {}
+    for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
+        now, before = getattr(scene, name), getattr(state.source, name)
+        if now is before or np.array_equal(now[rows], before[source]):
+            continue
+        changed[name] = now.copy()
+        changed[name][rows] = before[source]
+    if not changed:
+        return state
+    geometry = state.geometry if changed.keys() == {"sh"} else None
+    return replace(state, scene=replace(scene, **changed), geometry=geometry, cut=None)
+
+
+def as_important(effects: FloatArray, state: State) -> FloatArray:
+    """What errors of splats cost, (n,), where what no view has resolved counts as the middle of the others at least."""
+    unresolved = state.results.unresolved
+    if unresolved is None:
+        return effects
+    rows = unresolved.among(state.survivors)
+    if not rows.any() or rows.all():
+        return effects
+    found = effects.copy()
+    found[rows] = np.maximum(effects[rows], np.median(effects[~rows]))
+    return found
+
 
 #: What can be done with them.
 CHOICES = ("keep", "drop", "protect")
@@ -44,8 +123,9 @@ class Unseen:
         """Their part of the scene's opacity-weighted area, 0 to 1."""
         return self.find_area()
 
-    def told(self) -> dict[str, Any]:
-        """For programs."""
+    @property
+    def facts(self) -> dict[str, Any]:
+        """All by name."""
         return {"splats": self.splats, "of": self.of, "area": self.area, "kept": self.kept}
 
     def __str__(self) -> str:
@@ -72,7 +152,7 @@ def find_unseen(
         state: whose scene and views.
         groups: of the scene, where they are known.
         run: shares the work out.
-        surely_seen: finds quickly which splats some views see, (N,) :class:`potr_cl.raster.surely_seen.Seen`; those
+        surely_seen: finds quickly which splats some views see, (N,) :class:`potr_cl.views.reached.Seen`; those
             that it leaves undecided are looked at here.
     """
     views, scene = state.views[: len(state.views) - state.added], state.scene

@@ -1,4 +1,4 @@
-"""The pruning controller on a GPU, which decides itself which splats go and which tiles are measured again.
+"""Who decides which splats go (:func:`prune_scene`): the host, or a GPU itself, which also lists the tiles to measure.
 
 To fetch the effects of all splats and to send back a decision would take longer than to measure them. The rules are
 those of :mod:`potr_cl.stages.pruning.schedule`, in float32, with one difference: splats of the same score go together.
@@ -16,7 +16,7 @@ from potr_cl.model.order import ascending
 from potr_cl.opencl.kernel import Kernel
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.opencl.structs import bytes_before, struct_dtype
-from potr_cl.raster.macros import totals_limits
+from potr_cl.raster.sweep import totals_limits
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import Course, Indices, Iteration, Pruned, PruningOptions, prune
 
@@ -50,11 +50,7 @@ def prune_scene(
 
 
 class _Controller(Owner):
-    """The schedule with its state in the device's memory.
-
-    Raises:
-        DeviceError: the device has no room for the state.
-    """
+    """The schedule with its state in the device's memory."""
 
     def __init__(self, removal: RemovalSweep, options: PruningOptions, spared: NDArray[np.bool_] | None) -> None:
         self._removal, self._options = removal, options
@@ -152,12 +148,7 @@ class _Controller(Owner):
         return Pruned(len(left), iteration, done, course.result)
 
     def _course(
-        self,
-        done: int,
-        iteration: NDArray[np.int32],
-        removed: np.ndarray,
-        left: Indices,
-        smoothed: NDArray[np.float32],
+        self, done: int, iteration: NDArray[np.int32], removed: np.ndarray, left: Indices, smoothed: NDArray[np.float32]
     ) -> Course:
         """In which order splats went, and those that are left would go; what is known of each iteration.
 
@@ -181,6 +172,3 @@ class _Controller(Owner):
             history.append(Iteration(self._splats - gone, weight, harm, float(effect.max())))
         order[gone:] = left[ascending(smoothed[left])]
         return Course(order, tuple(history))
-
-    def close(self) -> None:
-        self._memory.close()
