@@ -51,7 +51,7 @@ from potr_cl.quality.metrics import Lpips
 from potr_cl.raster.rules import RULES, RasterRules
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.report.labels import U8, comparison_picture, shrunk
-from potr_cl.workers.opening import ClusterSource, DevicesSource, Workers, open_workers
+from potr_cl.workers.host import ClusterSource, DevicesSource, Workers, open_workers
 
 if TYPE_CHECKING:
     from potr_cl.outputs.coded_scene import CodedScene

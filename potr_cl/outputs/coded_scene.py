@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import Output
-from potr_cl.raster.carried import Carried
+from potr_cl.raster.resident import SceneHandle
 from potr_cl.raster.scene_buffers import Drawable
 
 
 @dataclass(frozen=True)
-class CodedScene(Carried):
+class CodedScene(SceneHandle):
     """Each device decodes it for itself, to the same bits: a file is many times smaller than what it decodes to.
 
     Attributes:
@@ -30,7 +30,7 @@ class CodedScene(Carried):
         return len(self.data)
 
     def on(self, device: Device) -> AbstractContextManager[Drawable]:
-        """See :meth:`potr_cl.raster.carried.Carried.on`.
+        """See :meth:`potr_cl.raster.resident.SceneHandle.on`.
 
         Raises:
             DataError: nobody can read it.

@@ -16,7 +16,7 @@ from potr_cl.codec.quantize import HyperParameters
 from potr_cl.codec.sections import ORDER, SH, Property
 from potr_cl.errors import DeviceError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes.potr import FORMAT
+from potr_cl.formats.scenes.page import POTR
 from potr_cl.host.mapped import bounded
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
@@ -24,7 +24,7 @@ from potr_cl.ondevice.decode import decode_to_device
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.outputs.output import Output, Request, Rounded
-from potr_cl.raster.kept_scene import large_for
+from potr_cl.raster.resident import large_for
 from potr_cl.raster.scene_buffers import Drawable
 
 _NAMES = {
@@ -42,7 +42,7 @@ _NAMES = {
 class Potr(Output):
     """A .potr file: :mod:`potr_cl.codec`. AC coefficients are rounded to steps finer than one sees."""
 
-    format: ClassVar[SceneFormat] = FORMAT
+    format: ClassVar[SceneFormat] = POTR
     choices: ClassVar[frozenset[str]] = frozenset(
         {"entropy", "zstd_level"} | {each.name for each in fields(HyperParameters)}
     )

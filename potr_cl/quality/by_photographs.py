@@ -10,7 +10,7 @@ from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.quality.ground_truth import GroundTruth, PhotographFigures
 from potr_cl.quality.judging import Judging, Looks
-from potr_cl.raster.kept_scene import KeptScene
+from potr_cl.raster.resident import ResidentScene
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.workers.pool import Pool
 
@@ -18,7 +18,7 @@ from potr_cl.workers.pool import Pool
 def judge_by_photographs(
     ground_truth: GroundTruth,
     cameras: Sequence[Camera],
-    scenes: tuple[Scene | KeptScene, Drawable],
+    scenes: tuple[Scene | ResidentScene, Drawable],
     device: Device,
     background: Colour = (0.0, 0.0, 0.0),
     pool: Pool | None = None,

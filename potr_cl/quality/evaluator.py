@@ -16,8 +16,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.quality.compare import Comparison, comparing, comparison_of, mean_view
 from potr_cl.quality.figures import ViewFigures
 from potr_cl.quality.judging import Judging, Looks
-from potr_cl.raster.carried import Carried
-from potr_cl.raster.kept_scene import KeptScene
+from potr_cl.raster.resident import ResidentScene, SceneHandle
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.workers.pool import Pool
 
@@ -106,7 +105,7 @@ class Evaluator(Judging):
     def __init__(
         self,
         device: Device,
-        scene: Drawable | KeptScene,
+        scene: Drawable | ResidentScene,
         views: EvaluationViews,
         background: Colour,
         pool: Pool | None = None,
@@ -119,7 +118,7 @@ class Evaluator(Judging):
         self,
         candidate: Drawable,
         most: int | None = None,
-        coded: Carried | None = None,
+        coded: SceneHandle | None = None,
         progress: Callable[[float], None] = lambda done: None,
     ) -> float:
         """Mean over the views of the PSNR against the uncompressed scene's pictures, in decibels.
@@ -136,7 +135,7 @@ class Evaluator(Judging):
         return _mean_psnr(self.figures(candidate, views if most is None else _evenly(views, most), coded, progress))
 
     def judge(
-        self, candidate: Drawable, progress: Callable[[str, float], None], coded: Carried | None = None
+        self, candidate: Drawable, progress: Callable[[str, float], None], coded: SceneHandle | None = None
     ) -> tuple[Comparison, float | None]:
         """PSNR and SSIM from every view, and the mean PSNR from the training views beside them, if there are any.
 

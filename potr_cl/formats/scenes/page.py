@@ -1,4 +1,5 @@
-"""Scenes in web pages: a .potr file and what shows it, one file that opens without a server or a network.
+"""Scenes from this package's own files (:data:`POTR`), and in web pages: a .potr file and what shows it, one file that
+opens without a server or a network.
 
 What pages are made of, ``page.html`` beside this module, has the viewer, its decoder and their licences in it; ``python
 -m tools.make.web`` builds it from web/. Of a page that is read, nothing but the .potr file is looked at.
@@ -109,11 +110,7 @@ def sizes(page: bytes) -> dict[str, int]:
 
 
 def scene_in(page: bytes) -> bytes:
-    """The .potr file in a page.
-
-    Raises:
-        DataError: there is none.
-    """
+    """The .potr file in a page. Raises DataError if there is none."""
     begin = page.find(BEGIN) + len(BEGIN)
     end = page.find(END, begin)
     if begin < len(BEGIN) or end < 0:
@@ -148,6 +145,17 @@ def save(
     check_viewer()
     write_pieces(path, page_around(potr_of(scene, source), len(scene), title, author))
 
+
+#: They are only read here: what makes them is the whole pipeline of encode.
+POTR = SceneFormat(
+    name="potr_cl",
+    suffixes=(".potr",),
+    note="this package's own: what `encode` makes of a scene in any of these formats",
+    load=decode,
+    not_written="a .potr file is made by the command encode, which reads all that convert reads",
+    starts=(MAGIC,),
+    packed=True,
+)
 
 FORMAT = SceneFormat(
     name="web page",
