@@ -6,9 +6,9 @@ The folder is streamed SOG, by any tool. Two tables, both of held-out views:
 
 - of each level: PSNR against the full scene in views that are smaller by √½ a level, and against the level before it
   there, where a viewer changes from one to the other;
-- of budgets: the levels that PlayCanvas' engine would show of each leaf in each view for so many splats (coverage × error
-  removed / splats added, until one does not fit), the PSNR of that, and how far the sum of coverage × error is from the
-  squared error that the picture really has against the finest level, the median over the views.
+- of budgets: the levels that PlayCanvas' engine would show of each leaf in each view for so many splats (coverage ×
+  error removed / splats added, until one does not fit), the PSNR of that, and how far the sum of coverage × error is
+  from the squared error that the picture really has against the finest level, the median over the views.
 """
 
 from __future__ import annotations
@@ -51,23 +51,22 @@ class Streamed:
         levels = meta["lodLevels"]
         self.scenes = [load_scene(f"{path}#{level}") for level in range(levels)]
         self.boxes = np.array([[*leaf["bound"]["min"], *leaf["bound"]["max"]] for leaf in leaves])
-        self.counts = np.array(
-            [[leaf["lods"].get(str(k), {"count": 0})["count"] for k in range(levels)] for leaf in leaves]
-        )
+        parts = [[leaf["lods"].get(str(level)) for level in range(levels)] for leaf in leaves]
+        self.counts = np.array([[part["count"] if part else 0 for part in own] for own in parts])
         if meta.get("lodErrors"):
             self.errors = np.array([leaf["errors"] for leaf in leaves], float)
         else:
             self.errors = np.log(np.maximum(self.counts[:, :1], 1) / np.maximum(self.counts, 1))
         self._starts: list[list[int]] = []
         for level in range(levels):
-            parts = [leaf["lods"].get(str(level)) for leaf in leaves]
+            own = [leaf[level] for leaf in parts]
             ends: dict[int, int] = {}
-            for part in filter(None, parts):
+            for part in filter(None, own):
                 ends[part["file"]] = max(ends.get(part["file"], 0), part["offset"] + part["count"])
-            first = dict(
-                zip(sorted(ends), np.cumsum([0, *(ends[file] for file in sorted(ends))]).tolist(), strict=False)
-            )
-            self._starts.append([first[part["file"]] + part["offset"] if part else 0 for part in parts])
+            first, behind = {}, 0
+            for file in sorted(ends):  # as the reader joins them
+                first[file], behind = behind, behind + ends[file]
+            self._starts.append([first[part["file"]] + part["offset"] if part else 0 for part in own])
 
     def shown(self, levels: NDArray[np.int64]) -> Scene:
         """The scene of which each leaf shows its own level."""
@@ -162,10 +161,10 @@ def main() -> None:
         for view, full_picture, fine in zip(views, whole, finest, strict=True):
             levels = streamed.within(view, budget)
             scene = streamed.shown(levels)
-            (own,) = pictures(device, scene, [view])
+            (picture,) = pictures(device, scene, [view])
             shown.append(len(scene))
-            errors += differences([own], [full_picture])
-            real += differences([own], [fine])
+            errors += differences([picture], [full_picture])
+            real += differences([picture], [fine])
             leaves = np.arange(len(levels))
             told.append(float((coverage(view, streamed.boxes) * streamed.errors[leaves, levels]).sum()))
         off = np.median([abs(10 * math.log10(max(a, 1e-12) / max(b, 1e-12))) for a, b in zip(told, real, strict=True)])
