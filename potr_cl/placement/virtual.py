@@ -15,7 +15,7 @@ from potr_cl.model.sampling import F64
 from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import FIELD, PREFIX, Plan, plan
 from potr_cl.opencl.device import Device
-from potr_cl.placement.candidates import AIMS, BINS, Candidates, ColourMemory, Targets, candidates_of, resolution
+from potr_cl.placement.candidates import AIMS, BINS, Candidates, SurfacePoints, ViewMemory, candidates_of, resolution
 from potr_cl.placement.space import Space
 
 #: A target that so many views show well is worth half of what it is at first.
@@ -140,10 +140,10 @@ class _Ground:
     device: Device
     planned: Plan
     space: Space
-    targets: Targets
+    targets: SurfacePoints
     half_view: float
     pixels: float
-    memory: ColourMemory | None
+    memory: ViewMemory | None
     up: F64
 
     @staticmethod
@@ -153,7 +153,7 @@ class _Ground:
         half_view = math.tan(math.radians(field / 2))
         space = Space.of(scene)
         wanted = min(_TARGETS * plan(len(scene)).training, max(len(scene) // 10, _LEAST_TARGETS), _MOST_TARGETS)
-        targets = Targets.of(scene, space, wanted)
+        targets = SurfacePoints.of(scene, space, wanted)
         pixels, memory = resolution(opened, scene, space, targets, planned.size / 2 / half_view)
         frame = frame_of(scene.subset(np.arange(0, len(scene), max(len(scene) // _FRAME, 1))))
         return _Ground(opened, planned, space, targets, half_view, pixels, memory, frame.up)
