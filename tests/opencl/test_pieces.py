@@ -77,6 +77,7 @@ def test_pieces_are_as_long_as_they_may_be(monkeypatch: pytest.MonkeyPatch) -> N
     assert pieces.cut == {"mark_reached": 1}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", ["gpu", "cpu"])
 @pytest.mark.parametrize("options", [{"preset": "paper"}, {"preset": "best", "fit": {"on": True, "steps": 20}}])
 def test_an_encode_in_pieces_has_the_same_bytes(
