@@ -127,7 +127,7 @@ VALUES: dict[str, tuple[list[str], Any]] = {
 #: What only says how the work is done.
 SAME_RESULT = {"--threads", "--trust", "--memory", "--device", "--output", "--cameras", "--reference", "--report",
                "--report-view", "--order", "--tolerance", "--cameras-anyway", "--unseen",
-               "--level", "--splats"}  # fmt: skip
+               "--level", "--splats", "--lod-chunk-count", "--lod-chunk-extent"}  # fmt: skip
 #: What else has to be given for an option to have anything to do.
 WITH: dict[str, list[str]] = {"--report-view": ["--report"], "--compact-at": ["--compact"]}
 #: Options that cannot be given with cameras.
@@ -305,7 +305,8 @@ def called(command: str, flags: list[str], files: dict[str, Path], folder: Path,
         suffix = {"encode": ".potr", "render": "", "compare": ".png"}.get(command, ".ply")
         suffix = ".spz" if "--spz-version" in flags else suffix
         suffix = ".html" if {"--title", "--author"} & {*flags} else suffix
-        names = {**files, "output": here / f"out{suffix}", "report": here / "page.html", "order": here / "order.npy"}
+        name = "lod-meta.json" if {"--lod-chunk-count", "--lod-chunk-extent"} & {*flags} else f"out{suffix}"
+        names = {**files, "output": here / name, "report": here / "page.html", "order": here / "order.npy"}
         paths = {name: str(path) for name, path in names.items()}
         sources = {"decode": ["potr"], "refit": ["reduced"], "fit": ["reduced"], "compare": ["scene", "reduced"]}.get(
             command, ["scene"]
