@@ -250,8 +250,9 @@ class Encoder:
                 encoded = job.encoding(progress)()
             else:
                 found = encode_to_target(
-                    job.scene, job.cameras, self._target, job.options, progress, job.device, _log.info, pool=job.pool
-                )
+                    job.scene, job.cameras, self._target, job.options, progress, job.device, _log.info, in_frame=True,
+                    pool=job.pool,
+                )  # fmt: skip
                 encoded, search = replace(found.encoded, options=found.options), search_report(self._target, found)
             watch = Stopwatch(progress)
             quality: dict[str, Any] | str = "not judged, as asked"

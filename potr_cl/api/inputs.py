@@ -170,7 +170,7 @@ def coded_scene(source: SceneSource, trust: bool = False) -> CodedScene | None:
 def _is_potr(source: SceneSource) -> bool:
     if encoded_bytes(source) is not None:
         return True
-    return isinstance(source, (str, os.PathLike)) and _holds_potr(Path(source))
+    return isinstance(source, (str, os.PathLike)) and holds_potr(Path(source))
 
 
 def on_device(
@@ -359,7 +359,7 @@ def chosen_views(
     return tests or list(cameras)
 
 
-def _holds_potr(path: Path) -> bool:
+def holds_potr(path: Path) -> bool:
     """Whether a path is that of a .potr file, whatever it is called; whoever reads it will say what else is wrong."""
     try:
         if not path.is_file():  # a pipe can be read only once
