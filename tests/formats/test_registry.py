@@ -346,7 +346,7 @@ def test_a_ladder_in_the_place_of_a_scene(tmp_path, read):
     ladder = Ladder(tmp_path / "ladder.json", "a.ply", 9, "", (Rung(0.5, "a_q0.5.potr", 3, 1),))
     ladder.save()
     for path in (tmp_path, ladder.path):
-        with pytest.raises(UsageError, match="is a ladder, .* see all of them with potr-cl view SCENE"):
+        with pytest.raises(UsageError, match=r"is a ladder, .* see all of them with potr-cl view SCENE"):
             read(path)
 
 
