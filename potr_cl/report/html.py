@@ -26,6 +26,12 @@ from potr_cl.report.colours import ACCENT, SERIES, STAGE
 from potr_cl.report.labels import BEFORE_AND_AFTER, difference_label, view_label
 from potr_cl.report.summary import decibels
 
+#: What the pictures show.
+_PICTURES = (
+    "<p>Drag the line in a picture: uncompressed is to its left, compressed to its right. Beside it is "
+    "where they differ: black not at all, then red, yellow and white. Most differences are too small to be seen, so they "
+    "are multiplied by the number below the picture.</p>\n"
+)
 #: Pixels along a side of a WebP picture.
 _WIDEST_WEBP = 16383
 
@@ -51,12 +57,13 @@ class PicturePair:
 
 
 def views_to_show(quality: dict[str, Any], chosen: str | None) -> list[tuple[str, dict[str, Any]]]:
-    """The worst, the median and a chosen view of a report's quality, with titles; the first view if none is chosen."""
+    """A chosen view, the median and the worst of a report's quality, with titles; also the first if none is chosen."""
     views = quality["views"]
     by_psnr = sorted(views, key=lambda view: math.inf if view["psnr"] is None else view["psnr"])
-    wanted = {"worst view": by_psnr[0], "typical view": by_psnr[(len(views) - 1) // 2]}
-    named = [view for view in views if view["name"] == chosen]
-    wanted["chosen view" if named else "first view"] = (named or views)[0]
+    wanted = {"chosen view": view for view in views if view["name"] == chosen}
+    wanted |= {"typical view": by_psnr[(len(views) - 1) // 2], "worst view": by_psnr[0]}
+    if "chosen view" not in wanted:
+        wanted["first view"] = views[0]
     shown: dict[str, tuple[str, dict[str, Any]]] = {}
     for title, view in wanted.items():
         if view["name"] in shown:
@@ -76,7 +83,7 @@ def html_report(report: dict[str, Any], pictures: Sequence[PicturePair]) -> str:
     sections = [
         _headline(report),
         _section("Where the bytes are", _sizes(report)),
-        _section("Pictures", "".join(map(_pair, pictures))) if pictures else "",
+        _section("Pictures", _PICTURES + "".join(map(_pair, pictures))) if pictures else "",
         _section("Quality by view", _quality(report["quality"])),
         _section("Photographs", _photographs(report["photographs"])) if report.get("photographs") else "",
         _section("Pruning", _pruning(report)) if report["pruning"] is not None else "",
@@ -158,7 +165,8 @@ def _pair(pair: PicturePair) -> str:
         "oninput=\"this.parentNode.style.setProperty('--at', this.value + '%')\"></div>\n"
         f"<figcaption>{before} | {after}</figcaption></figure>\n"
         f'<figure><img {size} src="{_data_uri(heat)}" alt="{name}, difference">\n'
-        f"<figcaption>{_text(difference_label(factor))}</figcaption></figure>{_photograph(pair, name, size)}</div>"
+        f"<figcaption>{_text(difference_label(factor))}: white is {round(255 / factor)} of 255 or more</figcaption>"
+        f"</figure>{_photograph(pair, name, size)}</div>"
     )
 
 
