@@ -61,8 +61,8 @@ def add_convert(commands: Commands) -> None:
         help="a scene from one format to another, for other tools",
         usage="potr-cl convert IN OUT [options]\n       potr-cl convert IN [IN ...] -o FOLDER --to SUFFIX [options]",
         description=f"Read a scene ({suffixes_read()}) and write it as {suffixes_written()}. Nothing but what the "
-        f"format itself rounds is changed; axes are kept. {extras_needed()}. All may be gzipped (.ply.gz). SOG is read "
-        "from folders too (meta.json, lod-meta.json), level N of streamed SOG by FOLDER#N.",
+        "format itself rounds is changed; axes are kept. All may be gzipped (.ply.gz). SOG is read "
+        f"from folders too (meta.json, lod-meta.json), level N of streamed SOG by FOLDER#N; {extras_needed()}.",
     )
     p.add_argument(
         "scenes",

@@ -145,7 +145,9 @@ def add_compare(commands: Commands) -> None:
     p.add_argument(
         "--truth", type=ReadPhotographs, metavar="DIR", help="photographs, named after the views: judge A and B by them"
     )
-    p.add_argument("--lpips", action="store_true", help="also compute LPIPS; needs the extra lpips and its weights")
+    p.add_argument(
+        "--lpips", action="store_true", help='also compute LPIPS; needs pip install "potr_cl[lpips]" and its weights'
+    )
     add_view_options(p, "test views if there are any, else all")
     p.add_argument(
         "-o",

@@ -277,11 +277,11 @@ def suffixes_written() -> str:
 
 
 def extras_needed() -> str:
-    """For help: which scenes need which extra, a clause for each extra."""
+    """For help: which scenes can be read with which extra only, a clause for each extra."""
     clauses = []
     for extra in dict.fromkeys(entry.extra for entry in SCENE_FORMATS if entry.extra is not None):
         suffixes = _scene_suffixes(entry for entry in SCENE_FORMATS if entry.extra == extra)
-        clauses.append(f"{listed(suffixes, 'and')} {'need' if suffixes[1:] else 'needs'} the extra {extra}")
+        clauses.append(f'reading {listed(suffixes, "and")} needs pip install "potr_cl[{extra}]"')
     return "; ".join(clauses)
 
 

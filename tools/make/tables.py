@@ -57,7 +57,7 @@ def formats_table() -> str:
 
 
 def _needs(extra: str | None) -> str:
-    return "nothing" if extra is None else f"the extra `{extra}`"
+    return "nothing" if extra is None else f"to read: the extra `{extra}`"
 
 
 def presets_table() -> str:
