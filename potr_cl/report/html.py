@@ -28,9 +28,9 @@ from potr_cl.report.summary import decibels
 
 #: What the pictures show.
 _PICTURES = (
-    "<p>Drag the line in a picture: uncompressed is to its left, compressed to its right. Beside it is "
-    "where they differ: black not at all, then red, yellow and white. Most differences are too small to be seen, so they "
-    "are multiplied by the number below the picture.</p>\n"
+    "<p>Drag the line in a picture: uncompressed is to its left, compressed to its right. Beside it is where they "
+    "differ: black not at all, then red, yellow and white. Most differences are too small to be seen, so they are "
+    "multiplied by the number below the picture.</p>\n"
 )
 #: Pixels along a side of a WebP picture.
 _WIDEST_WEBP = 16383
@@ -60,9 +60,10 @@ def views_to_show(quality: dict[str, Any], chosen: str | None) -> list[tuple[str
     """A chosen view, the median and the worst of a report's quality, with titles; also the first if none is chosen."""
     views = quality["views"]
     by_psnr = sorted(views, key=lambda view: math.inf if view["psnr"] is None else view["psnr"])
-    wanted = {"chosen view": view for view in views if view["name"] == chosen}
+    named = [view for view in views if view["name"] == chosen]
+    wanted = {"chosen view": named[0]} if named else {}
     wanted |= {"typical view": by_psnr[(len(views) - 1) // 2], "worst view": by_psnr[0]}
-    if "chosen view" not in wanted:
+    if not named:
         wanted["first view"] = views[0]
     shown: dict[str, tuple[str, dict[str, Any]]] = {}
     for title, view in wanted.items():
