@@ -50,7 +50,7 @@ from potr_cl.pipeline.run import Run
 from potr_cl.pipeline.stopwatch import Stopwatch
 from potr_cl.pipeline.target import as_bytes
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
-from potr_cl.quality.ground_truth import GroundTruth
+from potr_cl.quality.photographs import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.compact import Compact as Compact
 from potr_cl.stages.fitting.fit import FitOptions as FitOptions

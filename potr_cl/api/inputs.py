@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from potr_cl.formats.images import Colour
     from potr_cl.opencl.device import Device
     from potr_cl.opencl.discovery import DeviceInfo
-    from potr_cl.outputs.coded_scene import CodedScene
+    from potr_cl.outputs.output import CodedScene
     from potr_cl.pipeline.encoded import Encoded
     from potr_cl.raster.rules import RasterRules
     from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
@@ -153,7 +153,7 @@ def coded_scene(source: SceneSource, trust: bool = False) -> CodedScene | None:
     """
     if not _is_potr(source):
         return None
-    from potr_cl.outputs.coded_scene import CodedScene
+    from potr_cl.outputs.output import CodedScene
     from potr_cl.outputs.potr import Potr
 
     data = encoded_bytes(source)

@@ -38,7 +38,7 @@ from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
-from potr_cl.quality.pictures import Renderer
+from potr_cl.quality.metrics_device import Renderer
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import RasterRules
 from potr_cl.report.labels import U8, contact_sheet

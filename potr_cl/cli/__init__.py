@@ -27,7 +27,7 @@ COMMANDS = {
     "fit": "edit",
     "decode": "files",
     "info": "files",
-    "convert": "convert",
+    "convert": "files",
     "render": "pictures",
     "compare": "pictures",
     "view": "view",

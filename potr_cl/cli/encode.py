@@ -10,7 +10,15 @@ from potr_cl.api.choices import DEFAULT, PRESETS, PURPOSE, encode_options, encod
 from potr_cl.api.encoder import Encoder, ladder_files
 from potr_cl.cli.batch import Row, add_batch_options, for_each_scene, jobs
 from potr_cl.cli.guard import CamerasBeside, StandardInput, StandardOutput, WrittenFolder, check_files, read_file
-from potr_cl.cli.options import SEVERAL, Commands, add_cluster_option, add_device_options, add_memory_option
+from potr_cl.cli.options import (
+    SEVERAL,
+    Commands,
+    add_cameras_options,
+    add_cluster_option,
+    add_device_options,
+    add_memory_option,
+    given_cameras,
+)
 from potr_cl.cli.outputs import WrittenEncoded, WrittenPage, place, writing
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
@@ -25,7 +33,6 @@ from potr_cl.cli.scenes import (
 )
 from potr_cl.cli.stage_flags import add_stage_flags, stage_choices
 from potr_cl.cli.terminal import note, say_document, say_done, say_line
-from potr_cl.cli.views import add_cameras_options, given_cameras
 from potr_cl.errors import UsageError
 from potr_cl.formats.ladder import Ladder, qualities
 from potr_cl.formats.registry import cameras_beside, extensions, suffixes_read

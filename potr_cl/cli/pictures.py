@@ -18,13 +18,13 @@ from potr_cl.cli.options import (
     add_cluster_option,
     add_rendering_options,
     add_view_options,
+    read_cameras,
 )
 from potr_cl.cli.outputs import WrittenPicture
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
 from potr_cl.cli.scenes import ANTIALIASED, add_antialiased_option, add_trust_option
 from potr_cl.cli.terminal import note, say, say_document, say_done
-from potr_cl.cli.views import read_cameras
 from potr_cl.formats.registry import suffixes_read
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.camera import Camera

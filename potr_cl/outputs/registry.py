@@ -8,14 +8,11 @@ from typing import Any
 
 from potr_cl.errors import UsageError
 from potr_cl.formats.registry import listed, stem_of_scene, suffix_of_name, unwritten, written_format
-from potr_cl.outputs.compressed_ply import CompressedPly
-from potr_cl.outputs.gltf import Gltf
 from potr_cl.outputs.output import Output
-from potr_cl.outputs.page import Page
-from potr_cl.outputs.ply import Ply
-from potr_cl.outputs.potr import Potr
+from potr_cl.outputs.ply import CompressedPly, Ply
+from potr_cl.outputs.potr import Page, Potr
 from potr_cl.outputs.sog import Sog
-from potr_cl.outputs.spz import Spz
+from potr_cl.outputs.spz import Gltf, Spz
 
 #: In the order in which people are told of them; the first is the usual one.
 OUTPUTS: tuple[type[Output], ...] = (

@@ -31,7 +31,7 @@ from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
-from potr_cl.outputs.coded_scene import CodedScene
+from potr_cl.outputs.output import CodedScene
 from potr_cl.pipeline.encode import cameras_or_virtual, tell_left_out, tell_losses
 from potr_cl.pipeline.encoded import Encoded
 from potr_cl.pipeline.fallback import on_device

@@ -101,7 +101,7 @@ WRONG = {
 def test_refused_in_one_line_before_any_work(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, call: str, said: str
 ) -> None:
-    for reader in ("potr_cl.formats.load_scene", "potr_cl.cli.files.decode", "potr_cl.cli.views.load_cameras"):
+    for reader in ("potr_cl.formats.load_scene", "potr_cl.cli.files.decode", "potr_cl.cli.options.load_cameras"):
         monkeypatch.setattr(reader, lambda *_, **__: pytest.fail("something was read"))
     before = sorted(folder.rglob("*"))
     assert cli.main(call.split()) == 2

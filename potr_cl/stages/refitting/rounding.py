@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.opencl.memory import Memory, Owner
-from potr_cl.outputs.colour_grid import ColourGrid
+from potr_cl.outputs.output import ColourGrid
 from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.coefficients import Coefficients, Vector
 from potr_cl.stages.refitting.layout import CHANNELS
@@ -56,7 +56,7 @@ class Steps:
 
     Attributes:
         turns: (stride,) int32, the turn in which a splat is due.
-        constant, others: (stride,) float32, as of :class:`potr_cl.outputs.colour_grid.ColourGrid`.
+        constant, others: (stride,) float32, as of :class:`potr_cl.outputs.output.ColourGrid`.
     """
 
     turns: NDArray[np.int32]
