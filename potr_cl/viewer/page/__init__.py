@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib.resources import files
 from string import Template
 
-from potr_cl.report import style
+from potr_cl.report.style import ACCENT, STAGE, TEST_VIEW, TRAINING_VIEW, WARNING
 from potr_cl.viewer.access import Asset
 
 _FOLDER = "/potr_cl"
@@ -30,11 +30,11 @@ def assets() -> dict[str, Asset]:
     """The files of the page by their paths."""
     folder = files(__package__)
     style = Template(folder.joinpath("page.css").read_text("utf-8")).substitute(
-        accent=style.ACCENT,
-        warning=style.WARNING,
-        stage=style.STAGE,
-        training=style.TRAINING_VIEW,
-        test=style.TEST_VIEW,
+        accent=ACCENT,
+        warning=WARNING,
+        stage=STAGE,
+        training=TRAINING_VIEW,
+        test=TEST_VIEW,
     )
     script = folder.joinpath("page.js").read_bytes()
     return {
