@@ -12,8 +12,7 @@ def main() -> int:
     Returns:
         Its exit code, see :func:`potr_cl.cli.main`; a process that a signal ends exits with 128 and its number.
     """
-    from potr_cl.host.signals import end_cleanly_on_signals
-    from potr_cl.host.standard_files import open_standard_files
+    from potr_cl.host.process import end_at_once, end_cleanly_on_signals, open_standard_files
 
     end_cleanly_on_signals()
     open_standard_files()
@@ -24,7 +23,6 @@ def main() -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
     from potr_cl.cli import main as run
-    from potr_cl.host.ending import end_at_once
 
     code = run()
     end_at_once(code)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
-import pickle
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +17,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.opencl.loader import register_runtimes
 from potr_cl.opencl.verdict import TRUST_VARIABLE
 from potr_cl.placement.space import Space
+from tests.cases.once import once
 from tests.reference.gpu_programs import undeclared
 
 # Tests take devices as they are; tests/opencl/test_verdict.py tries them.
@@ -70,20 +69,6 @@ def programs_are_declared() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Device, "_built", checked)
         yield
-
-
-def once(function: Callable[..., Any], most: int) -> Callable[..., Any]:
-    """A function that is not called again with equal arguments; the results of the last ones are kept."""
-    known: dict[bytes, Any] = {}
-
-    def known_or_made(*arguments: Any) -> Any:
-        key = hashlib.sha256(pickle.dumps(arguments)).digest()
-        known[key] = known.pop(key) if key in known else function(*arguments)
-        while len(known) > most:
-            del known[next(iter(known))]
-        return known[key]
-
-    return known_or_made
 
 
 @pytest.fixture(scope="session", autouse=True)

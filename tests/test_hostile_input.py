@@ -6,7 +6,6 @@ wrong may end.
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import subprocess
 import sys
@@ -18,11 +17,24 @@ import pytest
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the tools look into /proc")
 
 ROOT = Path(__file__).parents[1]
-#: Formats whose files are attacked; compressed PLY is read by a library that may be missing.
+#: Formats whose files are attacked.
 FORMATS = [
-    *("potr", "ply", "spz", "sog", "sog-folder", "sog-levels", "glb", "gltf", "splat", "ksplat", "html", "ply.gz"),
+    *(
+        "potr",
+        "ply",
+        "compressed.ply",
+        "spz",
+        "sog",
+        "sog-folder",
+        "sog-levels",
+        "glb",
+        "gltf",
+        "splat",
+        "ksplat",
+        "html",
+        "ply.gz",
+    ),
     *("cameras.json", "transforms.json", "colmap-binary", "colmap-text", "png", "jpeg", "webp"),
-    *(["compressed.ply"] if importlib.util.find_spec("gsply") else []),
 ]
 
 

@@ -15,7 +15,6 @@ bench.decode           how fast does a file decode, by compiled code, NumPy or O
 bench.codec            speed, memory and size of the codec alone
 bench.virtual_cameras  what does encoding without cameras cost, and what is left of places?
 bench.paired           are whole encodes faster or slower than those of another checkout?
-bench.recoded          are the same splats smaller, and faster to decode, than with another checkout's coder?
 bench.scaling          time and memory against splats, views and workers: with which exponents?
 bench.web              how fast is the browser's decoder against native C, and in how much memory?
 =====================  =================================================================================================
@@ -47,7 +46,6 @@ What tests and pages are made of (``make``):
 ====================  ==================================================================================================
 make.large_scene      a scene of any size with the statistics of a real one
 make.city             copies of trained scenes side by side, any number of splats and views
-make.places           houses, streets and sites out of trained scenes, with views from where people stand
 make.test_data        the excerpts in tests/data
 make.release          a wheel and an sdist that are ready for a package index
 make.readme_picture   the picture at the top of the README

@@ -36,7 +36,7 @@ from potr_cl.codec.quantize import ac_sparsity
 from potr_cl.errors import UsageError
 from potr_cl.formats.images import Colour
 from potr_cl.host.atomic_write import replacing
-from potr_cl.host.signals import first_interrupt_asks
+from potr_cl.host.process import first_interrupt_asks
 from potr_cl.model.camera import Camera, test_views, train_views, within_photographs
 from potr_cl.model.scene import Scene
 from potr_cl.model.views_between import views_between as place_between

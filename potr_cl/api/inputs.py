@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 from potr_cl.codec.container import MAGIC
 from potr_cl.codec.decoder import PotrFile, decode, open_file
 from potr_cl.errors import DataError, UsageError
-from potr_cl.host.unchanged import unchanged
+from potr_cl.host.inputs import unchanged
 from potr_cl.model.camera import Camera, test_views, train_views
 from potr_cl.model.scene import Scene
 
@@ -299,7 +299,7 @@ def rules_of(source: RasterRules | str) -> RasterRules:
 
 
 def bytes_of_source(source: SceneSource) -> int | None:
-    """Bytes of the file that a scene comes from, or of all its files (:mod:`potr_cl.formats.scene_size`); None where it
+    """Bytes of the file that a scene comes from, or of all its files (:mod:`potr_cl.formats.registry`); None where it
     comes from none, or whoever reads it will say so.
     """
     encoded = encoded_file(source)
@@ -307,7 +307,7 @@ def bytes_of_source(source: SceneSource) -> int | None:
         return len(encoded[1])
     if not isinstance(source, (str, os.PathLike)):
         return None
-    from potr_cl.formats.scene_size import bytes_of_scene
+    from potr_cl.formats.registry import bytes_of_scene
 
     return bytes_of_scene(source)
 

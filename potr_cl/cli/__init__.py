@@ -15,7 +15,7 @@ from potr_cl.cli import guard, outputs
 from potr_cl.cli.parser import SHELLS, CommandParser, PrintCompletion
 from potr_cl.cli.terminal import note, speak
 from potr_cl.errors import PotrError
-from potr_cl.host.signals import unwinding
+from potr_cl.host.process import unwinding
 from potr_cl.plain_text import plain
 
 #: The commands, and who adds them, in the order of the help.

@@ -19,7 +19,7 @@ from potr_cl.cli.scenes import TO_HELP
 from potr_cl.cli.terminal import duration, megabytes, note, say_done, say_line
 from potr_cl.errors import PotrError, UsageError
 from potr_cl.formats import registry
-from potr_cl.formats.scene_size import bytes_of_scene
+from potr_cl.formats.registry import bytes_of_scene
 from potr_cl.plain_text import plain
 
 

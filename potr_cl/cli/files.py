@@ -25,7 +25,7 @@ from potr_cl.cli.scenes import (
 from potr_cl.cli.terminal import say, say_document, say_done
 from potr_cl.errors import UsageError
 from potr_cl.formats import scene_writer
-from potr_cl.formats.registry import extras_needed, suffixes_read, suffixes_written
+from potr_cl.formats.registry import suffixes_read, suffixes_written
 from potr_cl.formats.scenes import page
 from potr_cl.model.scene import SH_COEFFICIENTS
 
@@ -145,7 +145,7 @@ def add_convert(commands: Commands) -> None:
         usage="potr-cl convert IN OUT [options]\n       potr-cl convert IN [IN ...] -o FOLDER --to SUFFIX [options]",
         description=f"Read a scene ({suffixes_read()}) and write it as {suffixes_written()}. Nothing but what the "
         "format itself rounds is changed; axes are kept. All may be gzipped (.ply.gz). SOG is read "
-        f"from folders too (meta.json, lod-meta.json), level N of streamed SOG by FOLDER#N; {extras_needed()}.",
+        "from folders too (meta.json, lod-meta.json), level N of streamed SOG by FOLDER#N.",
     )
     p.add_argument(
         "scenes",

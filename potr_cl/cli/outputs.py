@@ -17,7 +17,7 @@ from typing import Protocol
 from potr_cl.cli.guard import StandardOutput, WrittenFile, WrittenFolder, named
 from potr_cl.errors import UsageError, WriteError
 from potr_cl.host.atomic_write import check_place, replacing
-from potr_cl.host.standard_files import closed, standard_output_for_data
+from potr_cl.host.process import closed, standard_output_for_data
 
 
 class WrittenScene(WrittenFile):

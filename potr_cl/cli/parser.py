@@ -14,7 +14,7 @@ from potr_cl.cli.guard import ReadCameras, ReadFile, ReadPhotographs, WrittenFil
 from potr_cl.cli.outputs import place, scene_output
 from potr_cl.cli.terminal import note, say
 from potr_cl.errors import UsageError
-from potr_cl.host.installation import install_command
+from potr_cl.host.libraries import install_command
 from potr_cl.plain_text import plain
 
 #: More digits than any number of views, steps or splats has.

@@ -15,10 +15,10 @@ from potr_cl.cli.guard import StandardInput, StandardOutput
 from potr_cl.cli.outputs import not_streamed
 from potr_cl.errors import UsageError
 from potr_cl.formats import scene_writer
-from potr_cl.formats.scene_size import bytes_of_scene
+from potr_cl.formats.registry import bytes_of_scene
 from potr_cl.formats.scenes import spz
 from potr_cl.formats.streams import received, send
-from potr_cl.host.standard_files import closed
+from potr_cl.host.process import closed
 from potr_cl.model.scene import Scene
 
 FROM_HELP = 'format of "-", standard input: .ply, .spz …; default: detected'

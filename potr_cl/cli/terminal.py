@@ -16,7 +16,7 @@ import sys
 from typing import Any, Literal, TextIO
 
 from potr_cl.errors import PotrError
-from potr_cl.host.standard_files import closed
+from potr_cl.host.process import closed
 from potr_cl.plain_text import plain_document, plain_lines
 
 #: What a line is: of an error or a warning, which are always shown; of what happens, which --quiet leaves out; or of

@@ -18,20 +18,19 @@ from potr_cl.codec import container, dequantizer, quantize
 from potr_cl.codec.bundles.decoder import Reader, Wanted, check_said
 from potr_cl.codec.bundles.layout import BUNDLE
 from potr_cl.codec.bundles.sections import MAIN
-from potr_cl.codec.bundles.tokens import largest_integer
+from potr_cl.codec.bundles.streams import largest_integer
 from potr_cl.codec.container import Block
 from potr_cl.codec.native.bundles import BEYOND_TABLE
-from potr_cl.codec.native.functions import Functions
-from potr_cl.codec.native.share import BundleShare
+from potr_cl.codec.native.library import Functions
 from potr_cl.codec.native.table import definition
-from potr_cl.codec.native.values import Tables, ValueArrays
+from potr_cl.codec.native.values import BundleShare, Tables, ValueArrays
 from potr_cl.codec.sections import Property
 from potr_cl.codec.steps import prediction
 from potr_cl.codec.steps.rule import CLASSES, ColourSteps, factors
 from potr_cl.errors import DataError
 
 if TYPE_CHECKING:
-    from potr_cl.codec.destination import Activation, BundleTaker
+    from potr_cl.codec.dequantizer import Activation, BundleTaker
 
 #: Bundles that NumPy decodes side by side.
 _SIDE_BY_SIDE = 32

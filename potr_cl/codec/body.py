@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from potr_cl.codec import container, octree
 from potr_cl.codec.block_values import BlockValues
 from potr_cl.codec.container import Block
-from potr_cl.codec.destination import BundleTaker, Fillable, SceneArrays
+from potr_cl.codec.dequantizer import BundleTaker, Fillable, SceneArrays
 from potr_cl.codec.native.values import ValueArrays
-from potr_cl.codec.plain_values import PlainValues
+from potr_cl.codec.plain import PlainValues
 from potr_cl.codec.sections import Coder, Property
 from potr_cl.codec.steps.rule import ColourSteps
 from potr_cl.errors import DataError

@@ -22,8 +22,8 @@ from potr_cl.codec.quantisers import QUANTISERS, Quantiser
 from potr_cl.codec.sections import ORDER, Coder, Property, Section
 from potr_cl.codec.steps.rule import MOST_BESIDE_GROUPS
 from potr_cl.errors import DataError, UsageError
+from potr_cl.host.inputs import FREE_SPLATS, check_claim
 from potr_cl.model.box import Box
-from potr_cl.model.claims import FREE_SPLATS, check_claim
 from potr_cl.model.scene import LOW_PASS, MIP_SPLATTING_LOW_PASS, SH_COEFFICIENTS
 
 MAGIC = b"POTR\r\n\x1a\n"

@@ -7,6 +7,8 @@ blocks are when they are asked for, and no others.
 from __future__ import annotations
 
 import contextvars
+import json
+import math
 import os
 import stat
 from collections.abc import Callable, Iterator
@@ -14,20 +16,62 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, NoReturn, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec import container, metadata
+from potr_cl.codec import container
 from potr_cl.codec.body import Body
 from potr_cl.codec.container import FIXED_BYTES, Block, FileHeader, header_bytes_of
 from potr_cl.codec.sections import Property
 from potr_cl.errors import DataError, UsageError
 from potr_cl.host import mapped
-from potr_cl.host.unchanged import State, refuse_changed, state_of, unchanged
+from potr_cl.host.inputs import State, refuse_changed, state_of, unchanged
 from potr_cl.model.box import Box
 from potr_cl.model.scene import Scene, joined, most_coefficients
+
+#: Whole numbers have at most this many bits beside their sign: what other languages read them into.
+_BITS = 63
+
+
+def parse(raw: bytes) -> dict[str, Any]:
+    """The object of a metadata section.
+
+    Strict, where Python's own reader is lenient: UTF-8 only, no NaN or Infinity, no number beyond float64 or 64 bits,
+    no half of a surrogate pair. So what comes out can be written as JSON again.
+
+    Raises:
+        DataError: it is something else.
+    """
+    try:
+        facts = json.loads(raw.decode("utf-8"), parse_constant=_refuse, parse_float=_real, parse_int=_whole)
+        json.dumps(facts, ensure_ascii=False).encode("utf-8")  # fails on half a surrogate pair
+    except (ValueError, RecursionError):
+        facts = None
+    if not isinstance(facts, dict):
+        raise DataError("section 'metadata' is not a JSON object")
+    return facts
+
+
+def _refuse(name: str) -> NoReturn:
+    raise ValueError(f"{name} is no JSON")
+
+
+def _real(digits: str) -> float:
+    value = float(digits)
+    if not math.isfinite(value):
+        raise ValueError("beyond float64")
+    return value
+
+
+def _whole(digits: str) -> int:
+    # Length first: to read thousands of digits takes long, and Python refuses it with an error of its own.
+    value = int(digits) if len(digits) <= 20 else 1 << 64
+    if abs(value) >> _BITS:
+        raise ValueError("beyond 64 bits")
+    return value
+
 
 #: Blocks that are decoded side by side; each has threads of its own.
 _SIDE_BY_SIDE = 4
@@ -248,7 +292,7 @@ def _opened(start: bytes, file_bytes: int, trust: bool, read: Reading) -> PotrFi
         if section.kind is Property.METADATA:
             stored = read(header.start + section.offset, section.stored_bytes)
             raw = container.read_section(stored, replace(section, offset=0))
-            facts = metadata.parse(raw.tobytes())
+            facts = parse(raw.tobytes())
     return PotrFile(header, facts, read)
 
 

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import container, octree, plain, quantize
-from potr_cl.codec.blocks.geometry import AnyGeometry, GeometryOfBlocks, quantise
+from potr_cl.codec.blocks import AnyGeometry, GeometryOfBlocks, quantise
 from potr_cl.codec.bundles import encoder as bundles
-from potr_cl.codec.colours import colour_levels
 from potr_cl.codec.container import Block, CodedSection, EntropyCoder
 from potr_cl.codec.geometry import Geometry
 from potr_cl.codec.quantisers import QUANTISERS
 from potr_cl.codec.sections import ORDER, SH, Coder, Property
+from potr_cl.codec.splat_levels import colour_levels
 from potr_cl.codec.steps.prediction import to_residuals
 from potr_cl.errors import DataError
 from potr_cl.host.threads import Run, thread_pool

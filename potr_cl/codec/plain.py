@@ -1,4 +1,5 @@
-"""The plain coder of splats' integers: a section a property, its streams one after another, then zstd.
+"""The plain coder of splats' integers: a section a property, its streams one after another, then zstd; and the values
+of a block of it (:class:`PlainValues`).
 
 As short as it can be: what the paper does, and for readers that have a zstd library and nothing else. docs/format.md,
 "Plain streams", is the normative description.
@@ -7,19 +8,24 @@ As short as it can be: what the paper does, and for readers that have a zstd lib
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec import container
-from potr_cl.codec.bundles.layout import BUNDLE, Bundles
-from potr_cl.codec.bundles.levels import Levels
-from potr_cl.codec.container import MOST_PLANES, CodedSection, EntropyCoder
+from potr_cl.codec import container, dequantizer
+from potr_cl.codec.bundles.layout import BUNDLE, Bundles, Levels
+from potr_cl.codec.container import MOST_PLANES, Block, CodedSection, EntropyCoder
+from potr_cl.codec.native.values import ValueArrays
 from potr_cl.codec.sections import SH, Property
 from potr_cl.codec.steps.rule import ColourSteps
 from potr_cl.errors import DataError
-from potr_cl.host.threads import Run
+from potr_cl.host.threads import Run, thread_pool
+
+if TYPE_CHECKING:
+    from potr_cl.codec.dequantizer import Activation, BundleTaker
 
 U8 = NDArray[np.uint8]
 Integers = NDArray[np.integer]
@@ -163,3 +169,65 @@ def opened(data: bytes | memoryview, block: container.Block, open_steps: Callabl
         return None if section is None else container.read_section(data, section)
 
     return Reader(block.splats, content, open_steps)
+
+
+#: Bundles that a thread works on at a time, and threads that do: integers may be wide, and take memory.
+_AT_A_TIME, _MOST_THREADS = 3, 2
+
+
+@dataclass(frozen=True)
+class PlainValues:
+    """A block's splats but for their centres; attributes as of :class:`potr_cl.codec.block_values.BlockValues`."""
+
+    block: Block
+    data: bytes | memoryview
+    open_steps: Callable[[], ColourSteps | None]
+    activation: Activation | None = None
+
+    @cached_property
+    def reader(self) -> Reader:
+        """Of the integers."""
+        return opened(self.data, self.block, self.open_steps)
+
+    def fill(self, arrays: ValueArrays, threads: int = 1, beside: Callable[[], None] | None = None) -> None:
+        """As :meth:`potr_cl.codec.block_values.BlockValues.fill`."""
+        with thread_pool(min(threads, _MOST_THREADS)) as pool:
+            other = None if beside is None else pool.submit(beside)
+            reader = self._opened(arrays)
+            list(pool.map(lambda first: self._fill(reader, self._bundles(first), arrays), self._starts))
+            if other is not None:
+                other.result()
+
+    def pack(
+        self, destination: BundleTaker, sh_count: int, threads: int, means: Callable[[], NDArray[np.float32]]
+    ) -> None:
+        """As :meth:`potr_cl.codec.block_values.BlockValues.pack`."""
+        destination.expect_bundles()
+        destination.take_means(means())
+        reader: Reader | None = None
+        for first in self._starts:
+            bundles = self._bundles(first)
+
+            def filled(arrays: ValueArrays, bundles: range = bundles) -> None:
+                nonlocal reader
+                reader = reader or self._opened(arrays)
+                self._fill(reader, bundles, arrays)
+
+            dequantizer.pack(destination, self.block, sh_count, bundles, filled)
+
+    def _opened(self, arrays: ValueArrays) -> Reader:
+        """The integers that some arrays are made of."""
+        reader, rotations = self.reader, arrays.quaternions is not None
+        reader.open(0 if arrays.sh is None else len(arrays.sh), rotations or arrays.log_scales is not None, rotations)
+        return reader
+
+    def _fill(self, reader: Reader, bundles: range, arrays: ValueArrays) -> None:
+        levels = reader.levels(bundles.start, bundles.stop)
+        dequantizer.fill(arrays, self.block, levels, reader.steps, self.activation)
+
+    @property
+    def _starts(self) -> range:
+        return range(0, self.reader.bundles.number, _AT_A_TIME)
+
+    def _bundles(self, first: int) -> range:
+        return range(first, min(first + _AT_A_TIME, self.reader.bundles.number))

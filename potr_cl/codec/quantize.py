@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.logarithm import natural_logarithm
-from potr_cl.codec.native.functions import Functions
+from potr_cl.codec.native.library import Functions
 from potr_cl.codec.native.table import definition
 from potr_cl.errors import DataError, UsageError
 

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from potr_cl.errors import DataError, UsageError
-from potr_cl.formats import gzipped, registry
+from potr_cl.formats import registry, streams
 from potr_cl.formats.cameras.view_files import read_json
-from potr_cl.formats.lfs_pointer import refuse_lfs_pointer
+from potr_cl.host.inputs import refuse_lfs_pointer
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 
@@ -41,10 +41,10 @@ def load_scene(path: str | os.PathLike[str], trust: bool = False, antialiased: b
             which those of gsplat and nerfstudio do not.
 
     Raises:
-        UsageError: the file cannot be opened, its extension is unknown, or it needs an extra.
+        UsageError: the file cannot be opened, or its extension is unknown.
         DataError: its content is damaged, or it holds too many splats for its size.
     """
-    with _silent_overflows(), gzipped.plain(Path(path), trust) as file:
+    with _silent_overflows(), streams.plain(Path(path), trust) as file:
         return registry.reader_of(file)(file, trust).rendered(antialiased)
 
 
@@ -84,7 +84,7 @@ def save_scene(path: str | os.PathLike[str], scene: Scene, **choices: Any) -> No
         choices: see :func:`scene_writer`.
 
     Raises:
-        UsageError: see :func:`scene_writer`; or ``path`` cannot be written to, or an extra is missing.
+        UsageError: see :func:`scene_writer`; or ``path`` cannot be written to.
         PotrError: the format cannot hold the scene, or the system failed to write.
     """
     scene_writer(path, **choices)(scene)
@@ -101,7 +101,7 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
         The views with their split into training and test views; at least one.
 
     Raises:
-        UsageError: there is nothing at ``path``, or it is of no known kind, or needs an extra.
+        UsageError: there is nothing at ``path``, or it is of no known kind.
         DataError: its content is damaged.
     """
     path = Path(path)

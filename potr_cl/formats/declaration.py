@@ -20,7 +20,7 @@ class SceneLoader(Protocol):
             to the size of the file.
 
     Raises:
-        UsageError: the file cannot be opened, or the format's extra is missing.
+        UsageError: the file cannot be opened.
         DataError: it is damaged, or holds too many splats for its size.
     """
 
@@ -38,7 +38,7 @@ class SceneSaver(Protocol):
         scene: of any SH degree; its arrays may have any strides.
 
     Raises:
-        UsageError: the path cannot be written to, or the format's extra is missing.
+        UsageError: the path cannot be written to.
         DataError: the format cannot hold the scene.
         PotrError: the system failed to write.
     """
@@ -59,7 +59,6 @@ class SceneFormat:
         load: reads a file.
         save: writes a scene to a path, or None where the format is only read.
         not_written: what a user should do instead, as a clause, where ``save`` is None.
-        extra: of the package, which brings what the format needs; None if nothing is needed.
         recognises: whether the content of a file is of this format; False for a file that cannot be read. For formats
             that share the last part of a suffix: it decides which of them reads a file, and one of them has none, to
             read what no other recognises.
@@ -83,7 +82,6 @@ class SceneFormat:
     load: SceneLoader
     save: SceneSaver | None = None
     not_written: str = ""
-    extra: str | None = None
     recognises: Callable[[Path], bool] | None = None
     starts: tuple[bytes, ...] = ()
     gzipped: bool = False
@@ -110,12 +108,11 @@ class CameraFormat:
         recognises: whether a file is of this format, from its path and, for a .json, the value that it holds (else
             None). Only asked about files with one of the suffixes.
         load: reads a file that ``recognises`` accepted, from the same arguments. Raises UsageError if a file cannot be
-            opened or the extra is missing, DataError if one is damaged.
+            opened, DataError if one is damaged.
         is_in: whether a folder holds files of this format under their usual names.
         load_folder: reads a folder that ``is_in`` accepted. Raises what ``load`` raises.
         json_mark: what in a .json makes it this format, for the message about one that is of none.
         subfolders: where else, below the folder that a user names, the files may be; looked into in this order.
-        extra: of the package, which brings what the format needs; None if nothing is needed.
     """
 
     name: str
@@ -127,4 +124,3 @@ class CameraFormat:
     load_folder: Callable[[Path], list[Camera]]
     json_mark: str = ""
     subfolders: tuple[str, ...] = ()
-    extra: str | None = None

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import DataError, PotrError, UsageError
-from potr_cl.formats.lfs_pointer import refuse_lfs_pointer
-from potr_cl.host.silence import without_warnings
+from potr_cl.host.inputs import refuse_lfs_pointer
+from potr_cl.host.libraries import without_warnings
 from potr_cl.model.scene import FloatArray
 
 # Pillow takes a tenth of the time that a command needs to begin, and few commands see a picture.

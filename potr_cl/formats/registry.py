@@ -19,8 +19,8 @@ from potr_cl.formats.cameras import cameras_json, colmap, transforms
 from potr_cl.formats.cameras.view_files import read_json
 from potr_cl.formats.declaration import CameraFormat, SceneFormat, SceneLoader, SceneSaver
 from potr_cl.formats.ladder import ladder_at
-from potr_cl.formats.levels import without_level
 from potr_cl.formats.scenes import compressed_ply, gltf, ksplat, page, ply, potr, sog, sog_levels, splat, spz
+from potr_cl.formats.scenes.scene_files import without_level
 
 _GSPLAT = "export it as PLY, by gsplat's simple_trainer.py with --save-ply or by gsplat.export_splats"
 _NERFSTUDIO = "export it as PLY, by nerfstudio's `ns-export gaussian-splat --load-config CONFIG.yml --output-dir DIR`"
@@ -276,18 +276,9 @@ def suffixes_written() -> str:
     return listed(_scene_suffixes(entry for entry in SCENE_FORMATS if entry.save is not None))
 
 
-def extras_needed() -> str:
-    """For help: which scenes can be read with which extra only, a clause for each extra."""
-    clauses = []
-    for extra in dict.fromkeys(entry.extra for entry in SCENE_FORMATS if entry.extra is not None):
-        suffixes = _scene_suffixes(entry for entry in SCENE_FORMATS if entry.extra == extra)
-        clauses.append(f'reading {listed(suffixes, "and")} needs pip install "potr_cl[{extra}]"')
-    return "; ".join(clauses)
-
-
 def cameras_read() -> str:
-    """For messages and help: the kinds of cameras that are read, "a x, a y or a z", those without an extra first."""
-    return listed([f"a {entry.name}" for entry in sorted(CAMERA_FORMATS, key=lambda entry: entry.extra is not None)])
+    """For messages and help: the kinds of cameras that are read, "a x, a y or a z"."""
+    return listed([f"a {entry.name}" for entry in CAMERA_FORMATS])
 
 
 def json_cameras() -> str:
@@ -302,3 +293,29 @@ def listed(items: Sequence[str], word: str = "or") -> str:
 
 def _scene_suffixes(formats: Iterable[SceneFormat]) -> list[str]:
     return [suffix for entry in formats for suffix in entry.suffixes]
+
+
+def bytes_of_scene(path: str | os.PathLike[str]) -> int | None:
+    """Bytes of a scene: of its file, or of all files that belong to it, whatever level of detail is read.
+
+    Args:
+        path: as :func:`potr_cl.formats.load_scene` takes it.
+
+    Returns:
+        The number, of the files that there are; None where there is no such scene, or no reader would know its files.
+    """
+    given = without_level(path)
+    try:
+        if not given.exists():
+            return None
+        return sum(file.stat().st_size for file in _files(given) if file.is_file()) or None
+    except (OSError, ValueError, PotrError):
+        return None
+
+
+def _files(path: Path) -> list[Path]:
+    try:
+        files = format_of(path).files
+    except UsageError:  # of a .potr file by another name, its own
+        files = None
+    return [path] if files is None else files(path)

@@ -7,7 +7,7 @@ import errno
 import os
 import secrets
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -58,6 +58,13 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
             if not target.parent.is_dir():
                 why = f"the folder '{target.parent}' is gone"
             raise WriteError(f"cannot write '{path}': {why}", os.fspath(path)) from error
+
+
+def write_pieces(path: str | os.PathLike[str], pieces: Iterable[bytes | memoryview]) -> None:
+    """Write a file from pieces, one after another; it appears when it is whole. Raises as :func:`replacing`."""
+    with replacing(path) as file:
+        for piece in pieces:
+            file.write(piece)
 
 
 def check_place(path: str | os.PathLike[str]) -> None:

@@ -1,7 +1,7 @@
 """Temporary files and folders, none of which outlives the process (:func:`removed_at_end`, :func:`temporary_folder`).
 
 What is registered here goes when its block ends, and also when a signal ends the process in the middle of anything
-(:mod:`potr_cl.host.signals`). Few imports: this is loaded before a signal can be handled at all.
+(:mod:`potr_cl.host.process`). Few imports: this is loaded before a signal can be handled at all.
 """
 
 from __future__ import annotations

@@ -15,16 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.model.camera import Camera, camera_centres
-from potr_cl.model.placement.sampling import spiral
-from potr_cl.model.placement.surface import points_on_splats
+from potr_cl.model.sampling import points_on_splats, spiral
 from potr_cl.model.scene import Scene, opacities_of
 from potr_cl.model.spherical_harmonics import ac_basis, energy, unit_coefficients
+from potr_cl.model.splat_groups import NEAR
 
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-#: Nothing nearer than this, in world units, is seen: the renderer's near plane.
-NEAR = 0.2
 #: Splats that a scene is thinned to, splats that are looked at, points that hide what is behind them.
 _THINNED, _TARGETS, _POINTS = 60_000, 1_500, 6_000
 #: A splat's opacity above which it counts as matter.

@@ -6,7 +6,7 @@ spoils what lies between them. The pictures that it compares with are renders, s
 it, and looks where the two look. Where cameras orbit something, the way is the orbit and not the chord: the distance to
 what they look at is kept.
 
-A view is only added where a camera might have been (:meth:`potr_cl.model.placement.given_views.GivenViews.allow`).
+A view is only added where a camera might have been (:meth:`potr_cl.model.given_views.GivenViews.allow`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from potr_cl.errors import UsageError
 from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera, camera_centres
-from potr_cl.model.placement.given_views import GivenViews
+from potr_cl.model.given_views import GivenViews
 from potr_cl.model.scene import Scene
 
 F64 = NDArray[np.float64]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
-from potr_cl.model.camera import Camera, camera_centres
+from potr_cl.model.camera import Camera, camera_centres, focus
 from potr_cl.model.views_between import is_between
 
 F32 = NDArray[np.float32]
@@ -113,11 +113,9 @@ def standpoints(cameras: Sequence[Camera], means: F32) -> F64:
 def describe(cameras: Sequence[Camera]) -> str:
     """How many views, and where, in words."""
     centres = camera_centres(cameras)
-    across = np.eye(3) - np.stack([np.outer(c.rotation[2], c.rotation[2]) for c in cameras])
-    # The point that their lines of sight come nearest to.
-    focus = np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, centres), rcond=1e-9)[0]
-    distance = np.linalg.norm(centres - focus, axis=1)
-    at = ", ".join(f"{x:.3g}" for x in focus)
+    middle = focus(cameras)
+    distance = np.linalg.norm(centres - middle, axis=1)
+    at = ", ".join(f"{x:.3g}" for x in middle)
     train, test = (sum(c.split == split for c in cameras) for split in ("train", "test"))
     judges = f" and {test} to judge by" if test else ""
     return f"{train} virtual views{judges}, {distance.min():.3g} to {distance.max():.3g} units from ({at})"

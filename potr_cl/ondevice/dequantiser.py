@@ -13,7 +13,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from potr_cl.codec.destination import BundleTaker
+from potr_cl.codec.dequantizer import BundleTaker
 from potr_cl.codec.native.values import PackedValues
 from potr_cl.ondevice.staged_bundles import StagedBundles, pinned_rooms
 from potr_cl.raster.activation import activated_scales, log2_opacities, unit_quaternions
@@ -26,7 +26,7 @@ _WORTH_PINNING = 1 << 18
 
 
 class Activated:
-    """Values as the projection takes them (:class:`potr_cl.codec.destination.Activation`)."""
+    """Values as the projection takes them (:class:`potr_cl.codec.dequantizer.Activation`)."""
 
     def scales(self, log_scales: F32) -> F32:
         return activated_scales(log_scales).astype(np.float32)

@@ -7,7 +7,7 @@ import re
 
 import pyopencl as cl
 
-from potr_cl.host.silence import whatever_warns
+from potr_cl.host.libraries import whatever_warns
 
 _EMPTY_PROGRAM = "kernel void nothing(void) {}"
 #: What pyopencl puts before and after the compiler's own words.

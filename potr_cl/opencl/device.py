@@ -17,12 +17,13 @@ import numpy as np
 import pyopencl as cl
 
 from potr_cl.errors import DeviceError, DeviceMemoryError
-from potr_cl.host.silence import whatever_warns
+from potr_cl.host.libraries import whatever_warns
 from potr_cl.host.threads import in_background, thread_pool
 from potr_cl.opencl import compiler, program_cache, quirks
 from potr_cl.opencl.ahead import context_of, leave
 from potr_cl.opencl.discovery import DeviceInfo, Family, choose_device, compiler_fault, not_to_be_taken
 from potr_cl.opencl.kernel import Kernel, declared_parameters
+from potr_cl.opencl.pieces import Pieces
 from potr_cl.opencl.program_cache import Foresight, Wanted, building
 from potr_cl.opencl.source import kernel_source
 
@@ -63,6 +64,7 @@ class Device:
         family: "cpu" or "gpu".
         vector_width: floats a vector of the CPU kernels has; asked of the device and proved by a build.
         allocated: bytes taken with :meth:`allocate` and not freed.
+        pieces: cuts launches that would take too long; None where they may take as long as they like.
         timings: (kernel name, event) of the launches since the list was last cleared; empty without profiling.
 
     Raises:
@@ -89,6 +91,8 @@ class Device:
         self.allocated = 0
         self._unfinished: dict[int, list[list[cl.Buffer]]] = {}  # by thread
         self.profiling = profiling
+        longest = self.info.longest_kernel
+        self.pieces = None if longest is None else Pieces(longest, self.info.compute_units)
         self._build_options = tuple(build_options)
         self._variants = dict(variants or {})
         for path in self._variants.values():
@@ -104,6 +108,8 @@ class Device:
             self.context, self._built_before = context_of(self.info)
             self._leaving = weakref.finalize(self, leave, self.info.handle, self.context, self._built_before)
             self._leaving.atexit = False
+            if profiling and not self.info.profiling:
+                raise DeviceError(f"device {self.info} measures no times: open it without profiling")
             flags = cl.command_queue_properties.PROFILING_ENABLE if profiling else 0
             self.queue = cl.CommandQueue(self.context, self.info.handle, properties=flags)
         if self.info.max_work_group < 256 and self.family == "gpu":
@@ -113,6 +119,10 @@ class Device:
             )
         self.vector_width = self._proven_vector_width()
         self.native_exp2 = self.family == "gpu" and self._native_exp2_is_exact()
+
+    @property
+    def _in_pieces(self) -> list[str]:
+        return [] if self.pieces is None else ["-DIN_PIECES=1"]
 
     @property
     def several_queues(self) -> bool:
@@ -181,7 +191,12 @@ class Device:
         if wanted not in self._programs:
             with building(wanted, alone=self.info.kind == "cpu"):
                 if wanted not in self._programs:
-                    options = ["-cl-std=CL1.2", *self._build_options, *(f"-D{name}={value}" for name, value in macros)]
+                    options = [
+                        "-cl-std=CL1.2",
+                        *self._build_options,
+                        *self._in_pieces,
+                        *(f"-D{name}={value}" for name, value in macros),
+                    ]
                     text = kernel_source(source, self._variants)
                     program = self._built_before.get((text, tuple(options)))
                     if program is None:

@@ -15,8 +15,8 @@ from typing import Literal
 import pyopencl as cl
 
 from potr_cl.errors import DeviceError
-from potr_cl.host.installation import install_command
-from potr_cl.opencl import compiler, loader, quirks, verdict
+from potr_cl.host.libraries import install_command
+from potr_cl.opencl import compiler, limits, loader, quirks, verdict
 
 Family = Literal["cpu", "gpu"]
 
@@ -41,6 +41,8 @@ class DeviceInfo:
         vector_width: floats in the native vector (1 where scalar code is what the device wants).
         max_work_group: work-items that fit one work-group.
         family: which kernels it will run: "gpu" (a work-group a tile) or "cpu" (row vectors).
+        longest_kernel: seconds that a kernel may take before a watchdog might end it; None: as long as it likes.
+        profiling: whether the device measures times.
         handle: the pyopencl device.
     """
 
@@ -57,6 +59,8 @@ class DeviceInfo:
     vector_width: int
     max_work_group: int
     family: Family
+    longest_kernel: float | None
+    profiling: bool
     handle: cl.Device
 
     @property
@@ -102,7 +106,7 @@ def _find_devices() -> Iterator[DeviceInfo]:
             continue
         for handle in handles:
             try:
-                info = _describe(index, platform, handle)
+                info = limits.limited(_describe(index, platform, handle))
             except cl.Error as error:
                 logger.warning("leaving out an OpenCL device that cannot be queried: %s", error)
                 continue
@@ -134,6 +138,8 @@ def _describe(index: int, platform: cl.Platform, handle: cl.Device) -> DeviceInf
         vector_width=max(w for w in (1, 4, 8, 16) if w <= max(native, 1)),
         max_work_group=int(handle.max_work_group_size),
         family=family,
+        longest_kernel=limits.longest_kernel(kind, handle),
+        profiling=bool(handle.queue_properties & cl.command_queue_properties.PROFILING_ENABLE),
         handle=handle,
     )
 

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 import pyopencl as cl
 
+from potr_cl.opencl.pieces import Pieces
 from potr_cl.opencl.source import kernel_source
 from potr_cl.opencl.structs import struct_dtype
 
@@ -50,6 +51,7 @@ class Kernel:
         self.name: str = handle.function_name
         self.parameters = declared_parameters(source, self.name, variants)
         self._device = device
+        self._declared_in = source, self.name, tuple((variants or {}).items())
         self._places = {parameter.name: place for place, parameter in enumerate(self.parameters)}
         if handle.num_args != len(self.parameters):
             raise TypeError(
@@ -105,14 +107,21 @@ class Kernel:
         Raises:
             DeviceError: the device refused it.
         """
-        device = self._device
+        device, queue = self._device, queue or self._device.queue
+
+        def enqueue(some: tuple[int, ...], offset: tuple[int, ...] | None = None) -> None:
+            event = cl.enqueue_nd_range_kernel(queue, self.handle, some, group, offset)
+            if device.profiling:
+                device.timings.append((self.name, event))
+
         try:
-            event = cl.enqueue_nd_range_kernel(queue or device.queue, self.handle, items, group)
+            if device.pieces is None:
+                enqueue(items)
+            else:
+                device.pieces.launch(enqueue, queue, self._declared_in, items, group)
         except (cl.Error, MemoryError):
             with device.errors(f"failed to run {self.name}"):
                 raise
-        if device.profiling:
-            device.timings.append((self.name, event))
 
     def _accepted(self, parameter: Parameter, value: Any) -> Any:
         """The value, if it is of the declared kind."""
@@ -139,6 +148,7 @@ class Launches(Protocol):
 
     queue: cl.CommandQueue
     profiling: bool
+    pieces: Pieces | None
     timings: list[tuple[str, cl.Event]]
 
     def errors(self, what: str) -> AbstractContextManager[None]:

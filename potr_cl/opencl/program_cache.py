@@ -25,7 +25,7 @@ from pyopencl.characterize import has_src_build_cache
 
 from potr_cl.errors import PotrError
 from potr_cl.host.atomic_write import replacing
-from potr_cl.host.silence import without_warnings
+from potr_cl.host.libraries import without_warnings
 from potr_cl.opencl.cache_folder import cache_folder
 
 cl._PYOPENCL_NO_CACHE = True

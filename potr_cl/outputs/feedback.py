@@ -15,7 +15,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from potr_cl.codec.native.functions import Functions
+from potr_cl.codec.native.library import Functions
 from potr_cl.codec.native.table import definition
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray

@@ -19,7 +19,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.blocks.geometry import AnyGeometry
+from potr_cl.codec.blocks import AnyGeometry
 from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.encoder import Coded
 from potr_cl.codec.quantize import HyperParameters

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from potr_cl.codec.encoder import Coded
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes import compressed_ply, compressed_ply_values, ply
-from potr_cl.formats.scenes.compressed_ply_chunks import in_chunks
+from potr_cl.formats.scenes.compressed_ply_values import in_chunks
 from potr_cl.formats.scenes.scene_files import unfilled, unit_quaternions
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import LOW_PASS, SH_COEFFICIENTS, FloatArray, Scene

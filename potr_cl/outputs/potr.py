@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.blocks.geometry import AnyGeometry, GeometryOfBlocks, quantise
+from potr_cl.codec.blocks import AnyGeometry, GeometryOfBlocks, quantise
 from potr_cl.codec.decoder import PotrFile, decode, open_file
 from potr_cl.codec.encoder import Coded, code_scene
 from potr_cl.codec.geometry import Geometry
@@ -53,7 +53,7 @@ class Potr(Output):
     fixes_ac: ClassVar[bool] = True
 
     def geometry(self, scene: Scene, request: Request) -> AnyGeometry:
-        """See :func:`potr_cl.codec.blocks.geometry.quantise`."""
+        """See :func:`potr_cl.codec.blocks.quantise`."""
         with thread_pool(request.threads) as pool:
             return quantise(scene, request.parameters, request.views, pool.map)
 

@@ -18,7 +18,7 @@ from potr_cl.codec.geometry import distances_to_views
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes import sog
 from potr_cl.formats.scenes.sog_images import PALETTE, Palette, SogImages, bundle
-from potr_cl.formats.scenes.sog_palette import areas
+from potr_cl.formats.scenes.sog_values import areas
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device

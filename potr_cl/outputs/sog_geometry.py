@@ -16,11 +16,11 @@ from potr_cl.clustering.codebook import codebook, nearest
 from potr_cl.clustering.curve import along_curve
 from potr_cl.codec.quantisers import QUANTISERS
 from potr_cl.codec.quantize import HyperParameters, canonical_rotations, dequantize_scales, quantize_scales
+from potr_cl.formats.scenes.scene_files import byte_logits
 from potr_cl.formats.scenes.sog_images import CODEBOOK, FIRST_TAG, U8
-from potr_cl.formats.scenes.sog_steps import (
+from potr_cl.formats.scenes.sog_values import (
     STEPS,
     log_transformed,
-    opacity_logits,
     unpacked_means,
     unpacked_rotations,
 )
@@ -63,7 +63,7 @@ class SogGeometry:
             means=unpacked_means(self.steps, self.least, self.most).take(back, axis=0),
             log_scales=self.scale_book.take(self.scales.take(back, axis=0)),
             quaternions=unpacked_rotations(self.quaternions).take(back, axis=0),
-            opacity_logits=opacity_logits().take(self.opacities.take(back)),
+            opacity_logits=byte_logits().take(self.opacities.take(back)),
         )
 
 

@@ -14,7 +14,7 @@ from potr_cl.codec.quantisers import QUANTISERS, Balanced, Paper
 from potr_cl.codec.quantize import ZERO_SCALE, HyperParameters, canonical_rotations
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes import gltf, gltf_writer, spz, spz_values
+from potr_cl.formats.scenes import gltf, gltf_file, spz, spz_values
 from potr_cl.formats.scenes.scene_files import unfilled
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray, Scene
@@ -294,4 +294,4 @@ class Gltf(Spz):
         rounded, sh = self.prepared(scene, rounded, request)
         assert isinstance(rounded, RoundedScene)
         coded = super().file(replace(scene, sh=sh), rounded, request)
-        return replace(coded, pieces=gltf_writer.binary(replace(scene, means=rounded.scene.means), coded.pieces))
+        return replace(coded, pieces=gltf_file.binary(replace(scene, means=rounded.scene.means), coded.pieces))

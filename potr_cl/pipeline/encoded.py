@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import DataError, PotrError, UsageError
-from potr_cl.host.atomic_write import replacing
+from potr_cl.host.atomic_write import write_pieces
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import CodedScene
@@ -103,9 +103,7 @@ class Encoded:
             raise UsageError(
                 f"'{path}' is no name for a {own[0]} file: encode with to='{Path(path).suffix}', or name it *{own[0]}"
             )
-        with replacing(path) as file:
-            for piece in self.pieces:
-                file.write(piece)
+        write_pieces(path, self.pieces)
 
 
 @dataclass(frozen=True)

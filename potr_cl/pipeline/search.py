@@ -24,7 +24,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from types import TracebackType
 
-from potr_cl.codec.blocks.geometry import GeometryOfBlocks
+from potr_cl.codec.blocks import GeometryOfBlocks
 from potr_cl.codec.geometry import Geometry
 from potr_cl.errors import UnreachableError, UsageError
 from potr_cl.model.camera import Camera, train_views

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.model.placement.sampling import F64, low_discrepancy, on_sphere
+from potr_cl.model.sampling import F64, low_discrepancy, on_sphere
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.placement.memory import Memory

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.model.placement.sampling import F64
+from potr_cl.model.sampling import F64
 from potr_cl.model.spherical_harmonics import unit_coefficients
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory as DeviceMemory

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.model.camera import Camera
-from potr_cl.model.unseen import bounds
+from potr_cl.model.splat_groups import bounds
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory
 from potr_cl.opencl.structs import struct_dtype

@@ -9,8 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.model.placement.sampling import F64, low_discrepancy
-from potr_cl.model.placement.surface import opacity_weighted, turned
+from potr_cl.model.sampling import F64, low_discrepancy, opacity_weighted, turned
 from potr_cl.model.scene import Scene
 
 F32 = NDArray[np.float32]

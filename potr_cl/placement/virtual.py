@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from potr_cl.model.camera import Camera, resized
-from potr_cl.model.placement.sampling import F64
+from potr_cl.model.sampling import F64
 from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import FIELD, PREFIX, Plan, plan
 from potr_cl.opencl.device import Device

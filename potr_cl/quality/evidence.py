@@ -17,15 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import PotrError
-from potr_cl.formats.cameras.points import read_points
+from potr_cl.formats.cameras.view_files import read_points
 from potr_cl.formats.images import read_thumbnail
 from potr_cl.formats.scenes.scene_files import SH_0
 from potr_cl.model.agreement import Evidence
 from potr_cl.model.camera import Camera, resized, within_photographs
 from potr_cl.model.lens import Pinhole
 from potr_cl.model.scene import Scene, opacities_of
-from potr_cl.model.sightings import NEAR, looked_at
+from potr_cl.model.sightings import looked_at
 from potr_cl.model.spherical_harmonics import ac_basis
+from potr_cl.model.splat_groups import NEAR
 from potr_cl.quality.photographs import undistorted
 
 F64 = NDArray[np.float64]

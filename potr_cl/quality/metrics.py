@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
-from potr_cl.host.installation import install_command
-from potr_cl.host.silence import without_warnings
+from potr_cl.host.libraries import install_command, without_warnings
 
 #: SSIM's Gaussian window: 11 x 11 pixels, sigma 1.5; the weights from its centre outwards along one axis.
 _RADIUS = 5

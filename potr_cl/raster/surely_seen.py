@@ -1,5 +1,5 @@
 """Which splats views see, found on a device but for few: :func:`surely_seen`, the quick part of
-:func:`potr_cl.model.unseen.unseen_splats`."""
+:func:`potr_cl.model.splat_groups.unseen_splats`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.model.camera import Camera
-from potr_cl.model.unseen import NEAR, REACH, bounds, views_in_turn
+from potr_cl.model.splat_groups import NEAR, REACH, bounds, views_in_turn
 from potr_cl.opencl.memory import Memory
 from potr_cl.opencl.structs import struct_dtype
 from potr_cl.raster.scene_buffers import SPLAT_GROUP, SceneBuffers

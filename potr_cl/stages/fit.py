@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from potr_cl.errors import UsageError
-from potr_cl.host.signals import first_interrupt_asks
+from potr_cl.host.process import first_interrupt_asks
 from potr_cl.model.views_between import views_between
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.discovery import Family

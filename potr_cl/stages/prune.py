@@ -49,8 +49,9 @@ class Prune(Stage):
         delta_mse_max: replaces q's ΔMSE_MAX: that of a scene that each view shows whole.
         iterations, decay, mapping_a: of the schedule (:class:`potr_cl.stages.pruning.schedule.PruningOptions`).
         unseen: "keep" or "drop": what becomes of splats that no training view's picture reaches
-            (:mod:`potr_cl.model.unseen`). With ``keep`` or ``count`` they go first in any case. "protect", and "keep"
-            where views were placed: what no view has resolved stays as it is (:mod:`potr_cl.placement.guard`).
+            (:func:`potr_cl.model.splat_groups.unseen_splats`). With ``keep`` or ``count`` they go first in any case.
+            "protect", and "keep" where views were placed: what no view has resolved stays as it is
+            (:mod:`potr_cl.placement.guard`).
         tolerance, turns, transmittance_threshold: of the measurements
             (:class:`potr_cl.stages.pruning.staleness.SweepOptions`).
 

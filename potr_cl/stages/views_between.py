@@ -9,7 +9,7 @@ from typing import Literal
 from potr_cl.errors import UsageError
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
-from potr_cl.model.placement.given_views import GivenViews
+from potr_cl.model.given_views import GivenViews
 from potr_cl.model.scene import Scene
 from potr_cl.model.views_between import SPREAD, views_between
 from potr_cl.model.virtual_cameras import is_virtual

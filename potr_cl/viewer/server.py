@@ -17,7 +17,7 @@ from potr_cl.errors import PotrError, UsageError
 from potr_cl.formats import load_scene
 from potr_cl.formats.images import Colour, to_8_bits
 from potr_cl.formats.ladder import Ladder
-from potr_cl.host.installation import install_command
+from potr_cl.host.libraries import install_command
 from potr_cl.model.camera import Camera, focus
 from potr_cl.opencl.device import Device
 from potr_cl.plain_text import LONGEST_VALUE, plain

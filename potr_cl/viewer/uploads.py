@@ -12,7 +12,7 @@ from typing import BinaryIO
 
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats import load_scene, registry
-from potr_cl.formats.called import called
+from potr_cl.formats.streams import called
 from potr_cl.host.leftovers import temporary_folder
 from potr_cl.plain_text import LONGEST_VALUE, plain
 from potr_cl.viewer.session import Exhibit

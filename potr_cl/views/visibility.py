@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from potr_cl.host.threads import Run
 from potr_cl.model import splat_groups
 from potr_cl.model.camera import Camera
-from potr_cl.model.morton import morton_order
+from potr_cl.model.order import morton_order
 from potr_cl.model.scene import Scene
 from potr_cl.model.splat_groups import Indices, SplatGroups
 from potr_cl.raster.rules import INRIA

@@ -6,7 +6,7 @@ import logging
 from typing import TYPE_CHECKING
 
 from potr_cl.errors import UsageError
-from potr_cl.host.installation import install_command
+from potr_cl.host.libraries import install_command
 
 if TYPE_CHECKING:
     from dask.distributed import Client

@@ -26,7 +26,7 @@ from potr_cl.api.choices import EncodeChoices, encode_options
 from potr_cl.api.editing import EditChoices, _CompactKeywords, _PruneKeywords
 from potr_cl.cli import command_parser
 from potr_cl.formats.scenes import page
-from potr_cl.host import signals
+from potr_cl.host import process
 from potr_cl.model.virtual_cameras import PREFIX
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import list_devices
@@ -224,7 +224,7 @@ def shown(value: Any) -> Any:
     if value is None or isinstance(value, (int, float)):
         return value
     # Who is told of progress differs, and nothing that is made depends on it.
-    return None if callable(value) or isinstance(value, signals.Asked) else str(value)
+    return None if callable(value) or isinstance(value, process.Asked) else str(value)
 
 
 def asked(device: Device | None, *what: Any, **more: Any) -> None:

@@ -39,11 +39,6 @@ def test_encode_decode_convert(folder: Path, capsys: pytest.CaptureFixture[str])
     assert capsys.readouterr().out.count("small/a.spz: 60 splats") == 1
 
 
-def test_names_that_no_shell_has_put_in_the_place_of_an_asterisk(folder: Path) -> None:
-    assert cli.main(["encode", "*.ply", "-o", "small", *KEEP]) == 0
-    assert sorted(path.name for path in Path("small").iterdir()) == ["a.potr", "b.potr", "c.potr"]
-
-
 def test_one_bad_scene_does_not_lose_the_others(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     Path("b.ply").write_bytes(Path("b.ply").read_bytes()[:-50])
     call = ["encode", "a.ply", "b.ply", "none.ply", "c.ply", "-o", "small", *KEEP, "--json"]

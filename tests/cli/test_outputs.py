@@ -125,8 +125,6 @@ def test_refused_in_one_line_before_any_work(
     ],
 )
 def test_a_scene_is_written_as_its_name_says(folder: Path, command: str, suffix: str) -> None:
-    if "compressed" in suffix:
-        pytest.importorskip("gsply", reason="the extra convert is not installed")
     out = f"out{suffix}"
     assert cli.main([*command.split(), out]) == 0
     content = Path(out).read_bytes()

@@ -82,13 +82,6 @@ def test_info_of_standard_input(folder: Path) -> None:
     assert report["file"] == "-"
 
 
-@pytest.mark.slow
-def test_one_command_feeds_another(folder: Path) -> None:
-    small = piped(folder, f"encode - -o - {' '.join(KEEP)}").stdout
-    (folder / "back.spz").write_bytes(piped(folder, "decode - -o - --to spz", small).stdout)
-    assert len(load_scene(folder / "back.spz")) == 100
-
-
 @pytest.mark.parametrize(
     ("call", "source", "code", "said"),
     [

@@ -13,9 +13,8 @@ import pytest
 
 import potr_cl
 from potr_cl import cli
-from potr_cl.codec.blocks import geometry as blocks_geometry
-from potr_cl.codec.blocks.geometry import GeometryOfBlocks, quantise
-from potr_cl.codec.blocks.splitting import blocks_of
+from potr_cl.codec import blocks as blocks_geometry
+from potr_cl.codec.blocks import GeometryOfBlocks, blocks_of, quantise
 from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import decode, open_file
 from potr_cl.codec.encoder import Coded, Level, code_levels, code_scene
@@ -25,7 +24,7 @@ from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.scenes import ply
 from potr_cl.host.mapped import bounded
 from potr_cl.host.threads import thread_pool
-from potr_cl.model.morton import morton_order
+from potr_cl.model.order import morton_order
 from potr_cl.model.scene import Scene
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions

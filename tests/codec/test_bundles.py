@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from potr_cl.codec.bundles import encoder, native_encoder
+from potr_cl.codec.bundles import encoder
 from potr_cl.codec.bundles.decoder import Reader, Wanted
 from potr_cl.codec.bundles.sections import MAIN, ORDER, ROTATION
 from potr_cl.codec.decoder import open_file
@@ -153,7 +153,7 @@ def test_streams_that_several_threads_ask_for_first(monkeypatch):
     values = integers(400, spread=200)
     classes = classes_of(values, steps_of(400))
     expected = encoder.encode(values, classes)
-    monkeypatch.setattr(native_encoder, "streams_of", native_encoder.streams_of.__wrapped__)
+    monkeypatch.setattr(encoder, "streams_of", encoder.streams_of.__wrapped__)
     assert encoder.encode(values, classes) == expected
 
 

@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from potr_cl.codec import container, plain
-from potr_cl.codec.blocks.geometry import quantise
-from potr_cl.codec.blocks.splitting import blocks_of
+from potr_cl.codec.blocks import blocks_of, quantise
 from potr_cl.codec.container import FREE_BLOCKS, EntropyCoder
 from potr_cl.codec.decoder import decode, open_file
 from potr_cl.codec.encoder import Level, code_levels, code_scene
@@ -153,6 +152,10 @@ def twice(file: File) -> None:
     file.blocks[0].sections.append(file.blocks[0].sections[-1])
 
 
+def rising(file: File) -> None:
+    file.blocks += [dataclasses.replace(file.blocks[0], level=1), file.blocks[0]]
+
+
 def swapped(file: File) -> None:
     file.blocks[0].sections[:2] = file.blocks[0].sections[1::-1]
 
@@ -194,6 +197,7 @@ LIES = {
     "sections in another order": (swapped, "stands twice, or not in its place"),
     "no opacity": (lambda file: file.blocks[0].sections.pop(4), "no opacity|the finest"),
     "SH beyond the degree": (changed(degree=0), "needs a section 'SHC1'"),
+    "levels that rise": (rising, "block 1 is invalid: level 1"),
     "a section of the file in a block": (in_entry(b"OCCU", name=b"META"), "needs a section 'META'"),
 }
 
@@ -210,13 +214,6 @@ def test_lies_in_header_and_table(data, name):
     if "splats than its bytes" not in name:  # who trusts it may have them
         with pytest.raises((ValueError, struct.error)):
             decode_independently(lie)
-
-
-def test_levels_that_rise(data):
-    file = File.of(data)
-    file.blocks += [dataclasses.replace(file.blocks[0], level=1), file.blocks[0]]
-    with pytest.raises(DataError, match="block 1 is invalid: level 1"):
-        open_file(file.bytes())
 
 
 DAMAGE = {
@@ -238,14 +235,6 @@ def test_damage(data, name):
     damage, message = DAMAGE[name]
     with pytest.raises(DataError, match=message):
         open_file(damage(data))
-
-
-def test_flags_say_how_a_scene_is_rendered(data):
-    for flags, antialiased, low_pass in [(0, False, 0.3), (1, True, 0.3), (3, True, 0.1)]:
-        file = File.of(data)
-        file.flags = flags
-        scene = decode(file.bytes())
-        assert (scene.antialiased, scene.low_pass) == (antialiased, low_pass)
 
 
 def test_blocks_of_next_to_nothing_are_refused():

@@ -15,8 +15,7 @@ from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import decode, open_file
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.native import library
-from potr_cl.codec.native.functions import Functions
-from potr_cl.codec.native.library import LIBRARY_VARIABLE, VARIABLE, native
+from potr_cl.codec.native.library import LIBRARY_VARIABLE, VARIABLE, Functions, native
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.codec.sections import Property
 from potr_cl.errors import DataError, UsageError

@@ -74,38 +74,6 @@ def test_tolerance_for_each_splat():
     roundtrip(means, RNG.uniform(1e-5, 1e-1, size=2000))
 
 
-def test_deterministic_whatever_the_order_of_coincident_splats():
-    means = np.repeat(RNG.normal(size=(100, 3)), 2, axis=0).astype(np.float32)
-    first, order = octree.build(means, 1e-4)
-    again, order_again = octree.build(means.copy(), 1e-4)
-    assert np.array_equal(order, order_again)
-    for field in dataclasses.fields(first):
-        assert np.array_equal(getattr(first, field.name), getattr(again, field.name))
-
-
-def test_order_is_depth_first():
-    """Against a recursive walk of the paper's octree."""
-    means = RNG.uniform(-1, 1, size=(300, 3)).astype(np.float32)
-    streams, order = octree.build(means, 1e-3)
-
-    def walk(indices, corner, edge, level):
-        if len(indices) <= 1 or level == streams.depth:
-            return list(indices)
-        half = edge / 2
-        out = []
-        for child in range(8):
-            low = corner + half * np.array([child & 1, child >> 1 & 1, child >> 2 & 1])
-            inside = [
-                k for k in indices if all((means[k].astype(float) >= low) == [True] * 3) and
-                all(means[k].astype(float) < low + half + (low + half >= corner + edge) * 1e-9)
-            ]  # fmt: skip
-            out += walk(inside, low, half, level + 1)
-        return out
-
-    expected = walk(range(len(means)), np.array(streams.origin), streams.side, 0)
-    assert list(order) == expected
-
-
 COORDINATE = st.one_of(
     st.floats(-1e6, 1e6, width=32), st.sampled_from([0.0, 1.0, -1.0, 1e6, -1e6, 1e-6, 2.0**-24, 0.5])
 )

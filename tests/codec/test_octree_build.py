@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from potr_cl.codec import octree
-from potr_cl.codec.native import octree_build
+from potr_cl.codec.native import octree as native_octree
 from potr_cl.codec.native.library import VARIABLE, native
 from potr_cl.errors import DataError
 from potr_cl.host.threads import thread_pool
@@ -60,7 +60,7 @@ def test_the_same_octree(monkeypatch, tolerance):
     wanted, wanted_order = octree.build(means, tolerance, absolute=True)
     monkeypatch.setattr(order, "_LARGE", 1000)
     monkeypatch.setattr(order, "_RANGE", 1024)
-    monkeypatch.setattr(octree_build, "_AT_A_TIME", 3000)
+    monkeypatch.setattr(native_octree, "_AT_A_TIME", 3000)
     with thread_pool(3) as pool:
         tree, its_order = octree.build(means, tolerance, absolute=True, run=pool.map)
     assert np.array_equal(wanted_order, its_order)

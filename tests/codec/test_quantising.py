@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from potr_cl.codec import quantize
-from potr_cl.codec.median import median
 from potr_cl.codec.native.library import VARIABLE, native
+from potr_cl.codec.quantisers import median
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.codec.splat_levels import splat_levels
 from potr_cl.errors import DataError

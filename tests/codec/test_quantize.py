@@ -11,20 +11,13 @@ from hypothesis.extra import numpy as hnp
 from potr_cl.codec import quantize
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import DataError, UsageError
+from tests.reference.raster import rotation_matrices
 
 HALF = 0.5 + 1e-6  # steps; the float32 result adds its own rounding, checked apart
 
 
 def covariance(quaternions, log_scales):
-    w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    ).transpose(2, 0, 1)
-    half = rotation * np.exp(log_scales)[:, None, :]
+    half = rotation_matrices(quaternions) * np.exp(log_scales)[:, None, :]
     return half @ half.transpose(0, 2, 1)
 
 
@@ -42,12 +35,8 @@ def test_paper_values():
 
 def test_single_values_replace():
     p = HyperParameters.from_quality(0.5, sf_sh=20, beta=None)
-    assert p.sf_sh == 20
+    assert (p.sf_sh, p.sf_dc) == (20, 20)  # one factor for all of SH in the paper
     assert p.beta == pytest.approx(7e-5)
-
-
-def test_one_factor_for_all_of_sh_in_the_paper():
-    assert HyperParameters.from_quality(0.5, sf_sh=20).sf_dc == 20
     assert HyperParameters.from_quality(0.5, sf_sh=20, sf_dc=30).sf_dc == 30
     best = HyperParameters.from_quality(0.5, "best")
     assert HyperParameters.from_quality(0.5, "best", sf_sh=20).sf_dc == best.sf_dc
@@ -127,15 +116,11 @@ def test_opacities(logits, sf):
 
 @given(hnp.arrays(np.float64, (20, 3), elements=st.floats(-100, 100)), st.floats(1, 101))
 def test_sh(rgb, sf):
-    for values in quantize.to_ycocg(rgb):
-        levels = quantize.quantize_sh(values, sf)
-        assert (np.abs(levels / sf - values) <= HALF / sf).all()
-
-
-def test_ycocg_is_undone_by_the_formats_sums():
-    rgb = np.random.default_rng(0).normal(size=(100, 3))
     y, co, cg = quantize.to_ycocg(rgb)
     assert np.allclose(np.stack([y + co - cg, y + cg, y - co - cg], 1), rgb)
+    for values in (y, co, cg):
+        levels = quantize.quantize_sh(values, sf)
+        assert (np.abs(levels / sf - values) <= HALF / sf).all()
 
 
 def test_rotation_error_bounded_by_steps():

@@ -14,7 +14,7 @@ import pytest
 from numpy._core import _multiarray_umath as umath
 
 from potr_cl.codec import quantize
-from potr_cl.codec.bundles.tokens import SIZES
+from potr_cl.codec.bundles.streams import SIZES
 from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.logarithm import natural_logarithm

@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from potr_cl.codec import colours, geometry, octree, quantize
+from potr_cl.codec import geometry, octree, quantize
 from potr_cl.codec.bundles import encoder
-from potr_cl.codec.bundles.native_encoder import narrow
+from potr_cl.codec.bundles.encoder import narrow
 from potr_cl.codec.native.library import VARIABLE, native
 from potr_cl.codec.native.table import TABLE, resolved
 from potr_cl.codec.octree.builder import Begun
 from potr_cl.codec.quantize import HyperParameters
-from potr_cl.codec.splat_levels import splat_levels
-from potr_cl.codec.steps.classes import colour_classes
+from potr_cl.codec.splat_levels import colour_levels, splat_levels
 from potr_cl.codec.steps.prediction import to_residuals
+from potr_cl.codec.steps.rule import colour_classes
 from potr_cl.outputs.feedback import unit_factors
 from tests.codec.test_bundles import classes_of, integers, steps_of
 from tests.reference.scenes import random_scene
@@ -72,7 +72,7 @@ def _colours() -> Iterator[Case]:
         for layout, each in layouts.items():
             for classes in ((some, some[::-1].copy()), (np.zeros(40_000, np.int8), some)):
                 arguments = (each, _rng(1).permutation(40_000), parameters, classes, map)
-                yield f"{largest:g}, {layout}", colours.colour_levels, arguments
+                yield f"{largest:g}, {layout}", colour_levels, arguments
 
 
 def _splats() -> Iterator[Case]:
@@ -161,7 +161,7 @@ CASES: dict[str, Callable[[], Iterator[Case]] | None] = {
     "codec.block_values:bundle_share": None,
     "codec.bundles.decoder:bundled_file": None,
     "codec.bundles.encoder:coded": _bundles,
-    "codec.colours:quantised": _colours,
+    "codec.splat_levels:quantised": _colours,
     "codec.geometry:nearest": _places,
     "codec.octree.builder:begin": _octrees,
     "codec.octree.builder:leaf_order": _octrees,
@@ -169,7 +169,7 @@ CASES: dict[str, Callable[[], Iterator[Case]] | None] = {
     "codec.quantize:canonical_rotations": _rotations,
     "codec.quantize:nonzero_levels": _colours,
     "codec.splat_levels:splat_levels": _splats,
-    "codec.steps.classes:colour_classes": _steps,
+    "codec.steps.rule:colour_classes": _steps,
     "codec.steps.prediction:to_residuals": _steps,
     "outputs.feedback:unit_factors": _factors,
 }

@@ -12,9 +12,6 @@ from potr_cl.formats import load_scene, scene_writer
 from potr_cl.opencl.device import Device
 from tests.cases.judging import psnr
 
-pytest.importorskip("gsply", reason="the extra convert is not installed")
-
-
 #: What splat-transform made of the excerpt, and the PSNR in dB that its renders reach: less is a misread convention.
 FOREIGN = {
     "version_3.spz": 48,

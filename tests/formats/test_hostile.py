@@ -47,7 +47,6 @@ def test_a_number_that_single_precision_has_not_gives_no_warning(tmp_path, value
 
 
 def test_infinite_bounds_of_a_chunk_give_no_warning(tmp_path):
-    pytest.importorskip("gsply")
     save_scene(tmp_path / "a.compressed.ply", random_scene(300, 0))
     data = bytearray((tmp_path / "a.compressed.ply").read_bytes())
     start = data.index(b"end_header\n") + len(b"end_header\n")

@@ -11,7 +11,7 @@ import pytest
 
 from potr_cl import Scene, cli
 from potr_cl.formats import load_scene
-from potr_cl.formats.scene_size import bytes_of_scene
+from potr_cl.formats.registry import bytes_of_scene
 
 #: What is read, and how splat-transform 3.7.0 reads it, as a PLY.
 FILES = {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 import importlib
 import os
 import pkgutil
@@ -21,20 +20,17 @@ from hypothesis import strategies as st
 
 from potr_cl import DataError, Scene, UsageError, cli, info
 from potr_cl.formats import cameras, load_cameras, load_scene, registry, save_scene, scene_writer, scenes
-from potr_cl.formats.declaration import CameraFormat, SceneFormat
+from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.ladder import Ladder, Rung
 from potr_cl.formats.registry import CAMERA_FORMATS, SCENE_FORMATS, listed
 from potr_cl.formats.scenes import page
-from potr_cl.formats.scenes.compressed_ply import is_compressed_ply
 from potr_cl.formats.scenes.scene_files import opened
-from potr_cl.host.installation import install_command
 from tests.cases.cameras import nerfstudio, view, write_json
 from tests.cases.scenes import in_order_of, turned_by
 from tests.reference.scenes import random_scene
 
 ROOT = Path(__file__).parents[2]
 WRITTEN = [entry for entry in SCENE_FORMATS if entry.save is not None]
-WITH_EXTRA: list[SceneFormat | CameraFormat] = [f for f in (*SCENE_FORMATS, *CAMERA_FORMATS) if f.extra is not None]
 
 
 def name(entry: Any) -> str:
@@ -63,13 +59,11 @@ def test_no_two_formats_claim_one_suffix_without_a_recogniser() -> None:
 
 
 def test_declarations_are_complete() -> None:
-    extras = re.findall(r"^([a-z-]+) = \[", (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
     for entry in (*SCENE_FORMATS, *CAMERA_FORMATS):
         assert all(re.fullmatch(r"(\.[a-z0-9]+)+", suffix) for suffix in entry.suffixes), entry.name
         assert entry.suffixes or getattr(entry, "names", ()), entry.name
         assert entry.note, entry.name
         assert not {"\n", "|"} & set(entry.name + entry.note), "it would break the documentation's table"
-        assert entry.extra is None or entry.extra in extras, entry.name
     for entry in SCENE_FORMATS:
         assert bool(entry.not_written) == (entry.save is None), entry.name
         assert all(re.fullmatch(r"[a-z0-9-]+\.[a-z0-9]+", each) for each in entry.names), entry.name
@@ -98,8 +92,6 @@ def test_formats_import_no_heavy_library() -> None:
 def test_every_format_reads_what_it_writes(
     entry: SceneFormat, splats: int, degree: int, seed: int, tmp_path: Path
 ) -> None:
-    if entry.extra == "convert":
-        pytest.importorskip("gsply", reason="the extra convert is not installed")
     if entry is page.FORMAT and not page.TEMPLATE.exists():
         pytest.skip("the viewer of pages is not built: python -m tools.make.web")
     scene = random_scene(splats, degree, seed)
@@ -175,53 +167,6 @@ def test_a_name_longer_than_a_file_system_takes(suffix: str, tmp_path: Path) -> 
         info(path)
 
 
-# Extras --------------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def no_extras(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As if no library that an extra brings were installed."""
-    real = builtins.__import__
-
-    def without(name: str, *args: Any, **kwargs: Any) -> Any:
-        if name.split(".")[0] in ("gsply", "pycolmap"):
-            raise ImportError(f"No module named '{name}'")
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-
-
-@pytest.mark.usefixtures("no_extras")
-@pytest.mark.parametrize("entry", WITH_EXTRA, ids=name)
-def test_a_missing_extra_is_named(entry: SceneFormat | CameraFormat, tmp_path: Path) -> None:
-    assert entry.extra is not None
-    expected = re.escape(install_command(entry.extra))
-    if isinstance(entry, CameraFormat):
-        with pytest.raises(UsageError, match=expected):
-            entry.load_folder(tmp_path)
-        return
-    path = tmp_path / f"a{entry.suffixes[0]}"
-    if entry.save is not None:
-        entry.save(path, random_scene(3))  # only to read needs a library
-    path.write_bytes(b"")
-    with pytest.raises(UsageError, match=expected):
-        entry.load(path)
-
-
-@pytest.mark.usefixtures("no_extras")
-def test_a_missing_library_is_named(tmp_path: Path, data: Path, plush_excerpt: Scene) -> None:
-    with pytest.raises(UsageError, match=re.escape(install_command("convert"))):
-        load_scene(data / "foreign" / "degree_3.compressed.ply")
-    scene_writer(tmp_path / "x.compressed.ply")(plush_excerpt)  # only to read needs it
-    assert is_compressed_ply(tmp_path / "x.compressed.ply")
-
-
-@pytest.mark.usefixtures("no_extras")
-@pytest.mark.parametrize("name", ["version_3.spz", "version_4.spz", "degree_3.sog"])
-def test_formats_without_an_extra_need_no_library(name: str, data: Path) -> None:
-    assert len(load_scene(data / "foreign" / name)) == 1500
-
-
 # Cameras -------------------------------------------------------------------------------------------------------------
 
 
@@ -267,7 +212,7 @@ def test_a_format_is_one_line_of_the_table(
         scene = random_scene(3, 0)
         return Scene(np.load(path), scene.log_scales, scene.quaternions, scene.opacity_logits, scene.sh)
 
-    added = SceneFormat("Centres", (".centres",), "of this test", load, save, extra="centres")
+    added = SceneFormat("Centres", (".centres",), "of this test", load, save)
     monkeypatch.setattr(registry, "SCENE_FORMATS", (*SCENE_FORMATS, added))
     scene = random_scene(3, 0)
     save_scene(tmp_path / "a.ply", scene)
@@ -281,7 +226,6 @@ def test_a_format_is_one_line_of_the_table(
         cli.main(["convert", "--help"])
     said = " ".join(capsys.readouterr().out.split())
     assert said.count("or .centres") == 2
-    assert ".centres needs the extra " in said
 
 
 def test_lists_for_people() -> None:

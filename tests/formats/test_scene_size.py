@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from potr_cl.formats import load_scene
-from potr_cl.formats.scene_size import bytes_of_scene
+from potr_cl.formats.registry import bytes_of_scene
 from tests.cases.gltf import attributes, described, glb, gltf
 from tests.reference.scenes import random_scene
 

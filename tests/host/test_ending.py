@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def run(program: str, **options) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", f"import sys\nfrom potr_cl.host.ending import end_at_once\n{program}"]
+    command = [sys.executable, "-c", f"import sys\nfrom potr_cl.host.process import end_at_once\n{program}"]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=300, **options)
 
 
@@ -38,7 +38,7 @@ def test_work_that_goes_on_is_waited_for():
 
 def test_a_profiler_is_not_cheated_of_its_result(tmp_path):
     program = tmp_path / "program.py"
-    program.write_text("from potr_cl.host.ending import end_at_once\nend_at_once(0)\nprint('an ordinary end')\n")
+    program.write_text("from potr_cl.host.process import end_at_once\nend_at_once(0)\nprint('an ordinary end')\n")
     command = [sys.executable, "-m", "cProfile", "-o", str(tmp_path / "profile"), str(program)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300, env=environment)
@@ -50,7 +50,7 @@ def test_a_profiler_is_not_cheated_of_its_result(tmp_path):
 def test_what_cannot_be_written_is_told_by_an_ordinary_end():
     with open("/dev/full", "w") as full:
         done = subprocess.run(
-            [sys.executable, "-c", "from potr_cl.host.ending import end_at_once\nprint('x')\nend_at_once(0)"],
+            [sys.executable, "-c", "from potr_cl.host.process import end_at_once\nprint('x')\nend_at_once(0)"],
             cwd=ROOT, stdout=full, stderr=subprocess.PIPE, text=True, check=False, timeout=300,
         )  # fmt: skip
     assert done.returncode != 0

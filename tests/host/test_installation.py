@@ -6,13 +6,13 @@ import importlib.metadata
 
 import pytest
 
-from potr_cl.host.installation import install_command
+from potr_cl.host.libraries import install_command
 
 
 def test_what_is_installed_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     """pip takes the extra's libraries from what is installed; tried with a package that is on no index."""
     monkeypatch.setattr(importlib.metadata, "version", lambda _name: "1.0")
-    assert install_command("convert") == 'pip install "potr_cl[convert]"'
+    assert install_command("view") == 'pip install "potr_cl[view]"'
 
 
 def test_a_clone_that_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -20,4 +20,4 @@ def test_a_clone_that_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
         raise importlib.metadata.PackageNotFoundError
 
     monkeypatch.setattr(importlib.metadata, "version", unknown)
-    assert install_command("convert") == 'pip install ".[convert]" in a clone of the repository'
+    assert install_command("view") == 'pip install ".[view]" in a clone of the repository'

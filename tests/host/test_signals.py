@@ -29,11 +29,11 @@ import os, signal, sys
 from pathlib import Path
 from potr_cl.host.atomic_write import replacing
 from potr_cl.host.leftovers import temporary_folder
-from potr_cl.host import signals
-signals.PATIENCE = float(sys.argv[3])
-signals.end_cleanly_on_signals()
+from potr_cl.host import process
+process.PATIENCE = float(sys.argv[3])
+process.end_cleanly_on_signals()
 number = getattr(signal, sys.argv[1])
-with signals.unwinding(), replacing(sys.argv[2]) as file, temporary_folder() as folder:
+with process.unwinding(), replacing(sys.argv[2]) as file, temporary_folder() as folder:
     (Path(folder) / "inner").mkdir()
     (Path(folder) / "inner" / "file").write_bytes(b"x")
     file.write(b"half")
@@ -89,11 +89,11 @@ def test_what_is_ignored_stays_ignored(tmp_path: Path) -> None:
 #: Works in rounds; sends itself signals in the second.
 ASKED = """
 import os, signal, sys
-from potr_cl.host import signals
+from potr_cl.host import process
 from potr_cl.host.atomic_write import replacing
-signals.end_cleanly_on_signals()
-with signals.unwinding(), replacing(sys.argv[1]) as file:
-    with signals.first_interrupt_asks() as asked:
+process.end_cleanly_on_signals()
+with process.unwinding(), replacing(sys.argv[1]) as file:
+    with process.first_interrupt_asks() as asked:
         for number in range(9):
             if asked:
                 break
@@ -127,7 +127,7 @@ def test_nobody_asks_after_the_work(tmp_path: Path) -> None:
 
 
 def test_a_program_that_has_its_own_way_with_signals_is_not_asked(tmp_path: Path) -> None:
-    program = ASKED.replace("signals.end_cleanly_on_signals()", "")
+    program = ASKED.replace("process.end_cleanly_on_signals()", "")
     result = run(program, tmp_path / "out", "SIGINT")
     assert "KeyboardInterrupt" in result.stderr
     assert not list(tmp_path.iterdir())
@@ -161,7 +161,7 @@ def test_while_modules_are_imported(module: str, number: signal.Signals, code: i
 def test_a_converter_that_is_told_to_end(tmp_path: Path, data: Path) -> None:
     """At the moment when all of the file is written but its checksum."""
     program = (
-        "import os, signal, sys; from potr_cl.host.signals import end_cleanly_on_signals; end_cleanly_on_signals();"
+        "import os, signal, sys; from potr_cl.host.process import end_cleanly_on_signals; end_cleanly_on_signals();"
         "import zlib; zlib.crc32 = lambda *_: os.kill(os.getpid(), signal.SIGTERM);"
         "from potr_cl.cli import main; sys.exit(main(sys.argv[1:]))"
     )
@@ -177,7 +177,7 @@ def test_a_converter_that_is_told_to_end(tmp_path: Path, data: Path) -> None:
 @pytest.mark.parametrize("closed", [(0,), (1,), (2,), (0, 1, 2)])
 def test_closed_standard_files_are_not_written_to_by_accident(tmp_path: Path, closed: tuple[int, ...]) -> None:
     program = (
-        "import os, sys; from potr_cl.host.standard_files import open_standard_files; open_standard_files();"
+        "import os, sys; from potr_cl.host.process import open_standard_files; open_standard_files();"
         "file = open(sys.argv[1], 'wb'); assert file.fileno() > 2; os.write(1, b'x'); os.write(2, b'y');"
         "print('z', file=sys.stderr); print('z'); file.write(b'content')"
     )

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from potr_cl.formats.images import opened_image
-from potr_cl.host.silence import whatever_warns, without_warnings
+from potr_cl.host.libraries import whatever_warns, without_warnings
 from potr_cl.opencl.program_cache import building
 
 

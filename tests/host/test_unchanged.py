@@ -17,7 +17,7 @@ from potr_cl.api.inputs import coded_scene
 from potr_cl.codec.decoder import open_file
 from potr_cl.errors import DataError
 from potr_cl.formats import load_cameras
-from potr_cl.host.unchanged import unchanged
+from potr_cl.host.inputs import unchanged
 from tests.cli.calls import cameras_json
 
 SAID = r"was changed while it was read: wait until the program that writes it has finished"

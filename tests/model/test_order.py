@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from potr_cl.host.threads import thread_pool
-from potr_cl.model import morton, order
-from potr_cl.model.morton import BITS, morton_codes, morton_order
-from potr_cl.model.order import ascending
+from potr_cl.model import order
+from potr_cl.model.order import BITS, ascending, morton_codes, morton_order
 
 
 @pytest.fixture(autouse=True)
@@ -17,7 +16,7 @@ def _small_ranges(monkeypatch):
     monkeypatch.setattr(order, "_LARGE", 1000)
     monkeypatch.setattr(order, "_RANGE", 128)
     monkeypatch.setattr(order, "_DEALT", 700)
-    monkeypatch.setattr(morton, "_ROWS", 300)
+    monkeypatch.setattr(order, "_ROWS", 300)
 
 
 def scores(kind: str, count: int) -> np.ndarray:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from potr_cl.model.quaternions import rotated_sh
+from potr_cl.model.spherical_harmonics import rotated_sh
 from tests.reference.raster import rotation_matrices, sh_basis
 from tests.reference.scenes import random_scene
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from potr_cl.host.threads import thread_pool
-from potr_cl.model import morton, splat_groups, unseen
-from potr_cl.model.splat_groups import SplatGroups
-from potr_cl.model.unseen import opacity_weighted_areas, unseen_splats
+from potr_cl.model import order, splat_groups
+from potr_cl.model.splat_groups import SplatGroups, opacity_weighted_areas, unseen_splats
 from tests.reference.scenes import plain_splats, random_splats, ring_of_cameras, straight_camera
 
 
@@ -66,7 +65,7 @@ def test_groups_of_neighbours_change_nothing(monkeypatch, plush_excerpt, plush_e
     cameras = [dataclasses.replace(c, fx=40 * c.fx, fy=40 * c.fy) for c in plush_excerpt_cameras[:4]]
     wanted = unseen_splats(plush_excerpt, cameras)
     assert 0 < wanted.sum() < len(plush_excerpt)
-    monkeypatch.setattr(unseen, "_BLOCK", 100)
+    monkeypatch.setattr(splat_groups, "_BLOCK", 100)
     with thread_pool(3) as pool:
         groups = SplatGroups.of(plush_excerpt, 16, pool.map)
         assert np.array_equal(unseen_splats(plush_excerpt, cameras, groups, pool.map), wanted)
@@ -74,7 +73,7 @@ def test_groups_of_neighbours_change_nothing(monkeypatch, plush_excerpt, plush_e
 
 def test_threads_make_the_same_groups(monkeypatch, plush_excerpt):
     wanted = SplatGroups.of(plush_excerpt, 16)
-    monkeypatch.setattr(morton, "_ROWS", 1000)
+    monkeypatch.setattr(order, "_ROWS", 1000)
     monkeypatch.setattr(splat_groups, "_GROUPS", 7)
     with thread_pool(3) as pool:
         found = SplatGroups.of(plush_excerpt, 16, pool.map)

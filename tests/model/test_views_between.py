@@ -10,7 +10,7 @@ import pytest
 from potr_cl.errors import UsageError
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera, camera_centres
-from potr_cl.model.placement.given_views import GivenViews
+from potr_cl.model.given_views import GivenViews
 from potr_cl.model.views_between import is_between, views_between
 from tests.cases.surfaces import flat_splats, sphere
 from tests.reference.surfaces import together

@@ -19,7 +19,7 @@ from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import PotrFile, open_file
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.native.library import native
-from potr_cl.codec.native.share import BundleShare
+from potr_cl.codec.native.values import BundleShare
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import DataError, DeviceError, DeviceMemoryError, UsageError
 from potr_cl.model.sightings import looked_at

@@ -23,7 +23,7 @@ def invented(
     index: int, name: str, kind: str, platform: str = "Some", version: str = "1", integrated: bool = False
 ) -> DeviceInfo:
     return DeviceInfo(
-        index, name, platform, version, kind, integrated, 1 << 30, 1 << 28, 1 << 15, 8, 8, 256, "gpu", None  # type: ignore[arg-type]
+        index, name, platform, version, kind, integrated, 1 << 30, 1 << 28, 1 << 15, 8, 8, 256, "gpu", None, True, None  # type: ignore[arg-type]
     )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ import potr_cl
 from potr_cl import encode, load_scene
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.formats.scenes import sog
-from potr_cl.formats.scenes.sog_palette import areas
+from potr_cl.formats.scenes.sog_values import areas
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import Request
 from potr_cl.outputs.sog import Sog

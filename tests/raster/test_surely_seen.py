@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from potr_cl.model.unseen import unseen_splats
+from potr_cl.model.splat_groups import unseen_splats
 from potr_cl.raster.scene_buffers import uploaded
 from potr_cl.raster.surely_seen import Seen, surely_seen
 from potr_cl.stages.pruning.unseen import find_unseen

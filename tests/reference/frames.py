@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from potr_cl.model.camera import Camera, camera_centres
-from potr_cl.model.quaternions import quaternions_of, rotated_sh
 from potr_cl.model.scene import Scene
+from potr_cl.model.spherical_harmonics import quaternions_of, rotated_sh
 from potr_cl.placement.virtual import place_cameras
 from tests.reference.captures import looking
 from tests.reference.raster import rotation_matrices

@@ -11,7 +11,7 @@ import pytest
 from potr_cl.codec.decoder import decode
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.model.camera import Camera, train_views
-from potr_cl.model.placement.given_views import GivenViews
+from potr_cl.model.given_views import GivenViews
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode

@@ -13,6 +13,7 @@ from potr_cl.raster.rules import GSPLAT, INRIA
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from tests.cases.kinds_of_scenes import KINDS_OF_SCENES
+from tests.cases.once import once
 from tests.devices import KERNELS, open_device
 from tests.reference.derivatives import gradient
 from tests.reference.scenes import plain_splats, ring_of_cameras, straight_camera, tilted_camera, visible_scene
@@ -45,8 +46,7 @@ def of_group(columns, degree):
     return dict(zip(names, np.split(columns, [3, 6, 10, 11], axis=1), strict=True))
 
 
-def wanted(scene, cameras, values, rules=INRIA):
-    """The same in float64."""
+def in_float64(scene, cameras, values, rules=INRIA):
     sums = {}
     for camera, v in zip(cameras, values, strict=True):
         weight = REFERENCE_PIXELS / (camera.width * camera.height)
@@ -54,6 +54,10 @@ def wanted(scene, cameras, values, rules=INRIA):
         for name, array in vars(found).items():
             sums[name] = sums.get(name, 0) + weight * array.reshape(len(scene), -1)
     return sums
+
+
+#: The same in float64, once for all devices.
+wanted = once(in_float64, 40)
 
 
 def agree(found, exact, tolerance=1e-4):

@@ -6,6 +6,7 @@ Grouping x residency x family x workers, against one sweep of all views with all
 from __future__ import annotations
 
 import dataclasses
+import functools
 from contextlib import ExitStack, contextmanager
 
 import numpy as np
@@ -32,7 +33,7 @@ from potr_cl.views.visibility import Visibility
 from potr_cl.workers.host import HostPool
 from tests.cases.elsewhere import ElsewherePool
 from tests.cases.streets import street
-from tests.cases.sweeps import assert_same_bits
+from tests.cases.sweeps import Course
 from tests.devices import KERNELS, open_device
 
 #: How views are grouped, and the kernel families that do it.
@@ -78,6 +79,14 @@ def sweep(devices, grouping, options, scene, cameras, elsewhere=False, spared=No
     assert [device.allocated for device in devices] == [0] * len(devices), "not all memory was given back"
 
 
+@functools.cache
+def course(kernels, tolerance):
+    """What all views with all splats measure of the street on one device."""
+    scene, cameras = street()
+    with sweep([open_device(kernels)], "whole", SweepOptions(tolerance), scene, cameras) as wanted:
+        return Course.of(wanted, scene)
+
+
 @pytest.mark.parametrize(
     ("residency", "workers"),
     [
@@ -95,30 +104,23 @@ def test_the_same_bits(kernels, grouping, residency, workers):
     """While splats go and colours change. Which views are resident is another matter: so no tile may be skipped."""
     skip_unless(grouping, kernels)
     scene, cameras = street()
-    options = SweepOptions(0.0, memory=RESIDENCY[residency])
     count, elsewhere = WORKERS[workers]
     devices = [open_device(kernels) for _ in range(count)]
-    with (
-        sweep([open_device(kernels)], "whole", SweepOptions(0.0), scene, cameras) as wanted,
-        sweep(devices, grouping, options, scene, cameras, elsewhere) as got,
-    ):
+    options = SweepOptions(0.0, memory=RESIDENCY[residency])
+    with sweep(devices, grouping, options, scene, cameras, elsewhere) as got:
         if count == 1 and grouping != "whole":
             assert residency != "all" or got.resident_views == len(cameras)
             assert residency != "nothing" or got.resident_views == 0
             assert residency != "some" or 0 < got.resident_views < len(cameras)
-        assert_same_bits(wanted, got, scene, np.random.default_rng(1))
+        course(kernels, 0.0).check(got)
 
 
 @pytest.mark.parametrize("grouping", list(GROUPINGS)[1:])
 def test_the_same_tiles_are_skipped(kernels, grouping):
     skip_unless(grouping, kernels)
     scene, cameras = street()
-    options = SweepOptions(0.05)
-    with (
-        sweep([open_device(kernels)], "whole", options, scene, cameras) as wanted,
-        sweep([open_device(kernels)], grouping, options, scene, cameras) as got,
-    ):
-        assert_same_bits(wanted, got, scene, np.random.default_rng(1))
+    with sweep([open_device(kernels)], grouping, SweepOptions(0.05), scene, cameras) as got:
+        course(kernels, 0.05).check(got)
 
 
 @pytest.mark.parametrize("grouping", list(GROUPINGS)[1:])
@@ -168,7 +170,7 @@ def test_views_that_draw_nothing_are_views_too(kernels, grouping, residency):
         sweep([open_device(kernels)], "whole", SweepOptions(0.0), scene, cameras) as wanted,
         sweep([open_device(kernels)], grouping, options, scene, cameras) as got,
     ):
-        assert_same_bits(wanted, got, scene, np.random.default_rng(1))
+        Course.of(wanted, scene).check(got)
     faint = dataclasses.replace(scene, opacity_logits=np.full(len(scene), -30, np.float32))
     with sweep([open_device(kernels)], grouping, options, faint, cameras) as removal:
         effects, importances = removal.measure()

@@ -143,39 +143,30 @@ def test_the_length_of_a_picture_is_the_product_with_the_normal_matrix(device):
         assert np.sum(direction * normal) == pytest.approx(squared, rel=1e-5)
 
 
-def test_a_direction_that_is_0_changes_nothing(case):
-    with Linearised(case) as linear:
-        assert not linear.normal(np.zeros(case.scene.sh.shape)).any()
-
-
 def test_a_direction_of_any_length(case):
     direction = np.random.default_rng(0).normal(size=case.scene.sh.shape)
     with Linearised(case) as linear:
         wanted = linear.normal(direction)
         for length in (1e-12, 1e12):
             assert relative(linear.normal(length * direction), length * wanted) < 1e-6
-
-
-def test_errors_are_those_of_the_pictures(case):
-    refitted = case.solve(RefitOptions(steps=5))
-    reference = case.reference()
-    assert refitted.errors[0] == pytest.approx(reference.error(reference.start), rel=1e-5)
-    assert refitted.errors[1] == pytest.approx(reference.error(to_ycocg(refitted.sh)), rel=1e-4)
+        assert not linear.normal(0 * direction).any()
 
 
 @pytest.mark.parametrize(
-    ("degree", "lam", "prior", "background"),
-    [pytest.param(0, 0.0, 3.0, (0.0, 0.0, 0.0), marks=pytest.mark.slow), (1, 30.0, 3.0, (1.0, 0.5, 0.0)),
-     pytest.param(2, 30.0, 10.0, (0.0, 0.0, 0.0), marks=pytest.mark.slow), (3, 100.0, 10.0, (0.0, 0.0, 0.0))],
+    ("degree", "lam", "prior", "background", "most", "bound"),
+    [(1, 30.0, 3.0, (1.0, 0.5, 0.0), 300, 1e-3), (3, 100.0, 10.0, (0.0, 0.0, 0.0), 300, 1e-3),
+     # Steps end where single precision does.
+     (2, 30.0, 10.0, (0.0, 0.0, 0.0), 99, 1e-4),
+     pytest.param(0, 30.0, 10.0, (0.0, 0.0, 0.0), 99, 1e-4, marks=pytest.mark.slow)],
 )  # fmt: skip
-def test_the_solution_is_the_least_squares_one(device, degree, lam, prior, background):
+def test_the_solution_is_the_least_squares_one(device, degree, lam, prior, background, most, bound):
     other = visible_scene(60, 2, seed=7)
     with Case(device, visible_scene(40, degree), other, ring_of_cameras(3, size=40), background) as case:
         refitted = case.solve(RefitOptions(steps=300, gain=0, lam=lam, prior=prior))
         reference = case.reference(lam=lam, prior=prior)
-    solution = reference.solution()
-    x = to_ycocg(refitted.sh)
-    assert np.linalg.norm(x - solution) < 1e-3 * np.linalg.norm(solution - reference.start)
+    assert refitted.steps <= most
+    solution, x = reference.solution(), to_ycocg(refitted.sh)
+    assert np.linalg.norm(x - solution) < bound * np.linalg.norm(solution - reference.start)
     assert reference.objective(x) < 0.9 * reference.objective(reference.start)
 
 
@@ -225,17 +216,6 @@ def test_each_step_takes_the_objective_down(device):
 def test_it_stops_when_a_step_gains_too_little(case):
     assert case.solve(RefitOptions(steps=50, gain=0.05)).steps < 20
     assert case.solve(RefitOptions(steps=0)).steps == 0
-
-
-@pytest.mark.parametrize("degree", [pytest.param(0, marks=pytest.mark.slow), 2])
-def test_it_stops_where_single_precision_ends(device, degree):
-    other = visible_scene(60, 2, seed=7)
-    with Case(device, visible_scene(40, degree), other, ring_of_cameras(3, size=40)) as case:
-        refitted = case.solve(RefitOptions(steps=300, gain=0, lam=30, prior=10))
-        reference = case.reference(lam=30, prior=10)
-    assert refitted.steps < 100
-    solution = reference.solution()
-    assert np.linalg.norm(to_ycocg(refitted.sh) - solution) < 1e-4 * np.linalg.norm(solution - reference.start)
 
 
 @pytest.mark.one_runtime
@@ -321,17 +301,6 @@ def test_a_greater_price_keeps_fewer(case):
         assert np.isfinite(refitted.sh).all()
     assert kept == sorted(kept, reverse=True)
     assert kept[0] > kept[-1] == 0
-
-
-@pytest.mark.one_runtime
-@pytest.mark.parametrize(("seed", "steps", "dc"), [(0, 30, -3), (3, 8, -5), (7, 30, -3)])
-def test_a_selection_that_overshoots_is_taken_back(device, seed, steps, dc):
-    """Dark scenes without a prior: so many colours are cut at 0 on the way that the steps lead astray."""
-    scene = visible_scene(40, seed=seed)
-    scene.sh[:, 0] += dc
-    with Case(device, scene, visible_scene(60, 2, seed + 7), ring_of_cameras(3, size=40)) as case:
-        refitted = case.solve(RefitOptions(steps=steps, selection_steps=steps, gain=0, drop=1e-15, prior=0))
-    assert refitted.errors[1] <= refitted.errors[0] * (1 + 1e-6)
 
 
 @pytest.mark.parametrize(

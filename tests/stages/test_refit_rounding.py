@@ -103,19 +103,16 @@ def test_no_picture_is_looked_at_only_to_measure_what_the_next_solution_measures
 
 
 @pytest.mark.one_runtime
-@pytest.mark.parametrize("rounds", [True, False])
 @pytest.mark.parametrize(("seed", "steps", "dc"), [(0, 30, -3), (3, 8, -5), (7, 30, -3)])
-def test_a_solution_that_overshoots_is_taken_back_before_it_is_rounded(device, seed, steps, dc, rounds):
-    """Dark scenes without a prior, as below."""
+def test_a_solution_that_overshoots_is_taken_back_before_it_is_rounded(device, seed, steps, dc):
+    """Dark scenes without a prior: so many colours are cut at 0 on the way that the steps lead astray."""
     scene = visible_scene(40, seed=seed)
     scene.sh[:, 0] += dc
+    options = RefitOptions(steps=steps, selection_steps=steps, gain=0, drop=1e-15, prior=0)
     with Case(device, scene, visible_scene(60, 2, seed + 7), ring_of_cameras(3, size=40)) as case:
-        options = RefitOptions(steps=steps, selection_steps=steps, gain=0, drop=1e-15, prior=0)
-        careful = case.solve(options)
-
-        def finely(sh, refit):
-            return sh + np.float32(1e-6) if rounds else sh
-
-        refitted = refit_colours(device, scene, case.cameras, case.targets, options, fix_ac=finely)
-    assert refitted.errors[1] <= refitted.errors[0] * (1 + 1e-4)
-    assert refitted.errors[1] <= careful.errors[1] * (1 + 1e-3)
+        careful = case.solve(options).errors
+        assert careful[1] <= careful[0] * (1 + 1e-6)
+        for finely in (lambda sh, refit: sh, lambda sh, refit: sh + np.float32(1e-6)):
+            found = refit_colours(device, scene, case.cameras, case.targets, options, fix_ac=finely).errors
+            assert found[1] <= found[0] * (1 + 1e-4)
+            assert found[1] <= careful[1] * (1 + 1e-3)

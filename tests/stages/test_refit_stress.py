@@ -21,21 +21,6 @@ def of_size(camera: Camera, width: int, height: int) -> Camera:
     )
 
 
-def test_same_bits_every_time(case):
-    options = RefitOptions(steps=6, gain=0, drop=1e-7)
-    results = [case.solve(options).sh.tobytes() for _ in range(3)]
-    assert len(set(results)) == 1
-
-
-@pytest.mark.one_runtime
-@pytest.mark.parametrize("memory", [0, 40_000, 200_000])
-def test_a_small_memory_budget_changes_the_time_and_nothing_else(case, memory):
-    everything = case.solve(RefitOptions(steps=4, gain=0, drop=1e-7))
-    little = case.solve(RefitOptions(steps=4, gain=0, drop=1e-7, memory=memory))
-    assert np.array_equal(everything.sh, little.sh)
-    assert everything.errors == little.errors
-
-
 @pytest.mark.one_family
 @pytest.mark.one_runtime
 @pytest.mark.parametrize(

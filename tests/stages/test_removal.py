@@ -144,27 +144,6 @@ def test_sums_kept_over_removals_are_those_of_a_new_sweep(device, plush_excerpt,
         assert np.array_equal(a[left], b[left])
 
 
-@pytest.mark.one_family
-@pytest.mark.one_runtime
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.7])
-def test_a_small_memory_budget_changes_the_time_and_nothing_else(device, plush_excerpt, plush_excerpt_cameras, share):
-    cameras = plush_excerpt_cameras[:4]
-    results = []
-    for memory in (None, int(share * 4 * 48 * 1536)):
-        with (
-            Rasterizer(device, plush_excerpt) as rasterizer,
-            RemovalSweep(rasterizer, cameras, SweepOptions(0, 1, memory)) as removal,
-        ):
-            kept = removal.resident_views
-            removal.measure()
-            for start in (0, 5):
-                removal.remove(np.arange(start, 1500, 10))
-                effects = removal.measure()
-            results.append(np.stack(effects)[:, np.arange(1, 1500, 10)])
-    assert kept == 0 if share == 0 else kept <= 4
-    assert np.array_equal(*results)
-
-
 @pytest.mark.one_runtime
 def test_buffers_too_small_for_all_views_change_nothing(device, plush_excerpt, plush_excerpt_cameras, monkeypatch):
     """A device that allows no large buffer has fewer views at a time, and keeps them all."""

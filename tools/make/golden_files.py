@@ -17,8 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from potr_cl.codec.blocks.geometry import AnyGeometry, quantise
-from potr_cl.codec.blocks.splitting import blocks_of
+from potr_cl.codec.blocks import AnyGeometry, blocks_of, quantise
 from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.encoder import Level, code_levels
 from potr_cl.codec.quantize import HyperParameters, Preset

@@ -43,21 +43,13 @@ def formats_table() -> str:
             f"{entry.name} ({', '.join(f'`{name}`' for name in (*entry.suffixes, *entry.names))})",
             "yes",
             "no" if entry.save is None else "yes",
-            _needs(entry.extra),
             entry.note,
         )
         for entry in SCENE_FORMATS
     ]
-    cameras = [
-        (entry.name, "yes", "no", _needs(entry.extra), entry.note)
-        for entry in sorted(CAMERA_FORMATS, key=lambda entry: entry.extra is not None)
-    ]
-    columns = ["reads", "writes", "needs", "note"]
+    cameras = [(entry.name, "yes", "no", entry.note) for entry in CAMERA_FORMATS]
+    columns = ["reads", "writes", "note"]
     return "\n\n".join([table(["scenes", *columns], scenes), table(["cameras", *columns], cameras)])
-
-
-def _needs(extra: str | None) -> str:
-    return "nothing" if extra is None else f"to read: the extra `{extra}`"
 
 
 def presets_table() -> str:

@@ -28,8 +28,8 @@ import numpy as np
 from potr_cl.codec import block_values
 from potr_cl.codec.body import Body
 from potr_cl.codec.decoder import PotrFile, open_file
-from potr_cl.codec.destination import BundleTaker, SceneArrays
-from potr_cl.codec.native import arrays, bundles, functions, octree, share, values
+from potr_cl.codec.dequantizer import BundleTaker, SceneArrays
+from potr_cl.codec.native import bundles, declarations, library, octree, values
 from potr_cl.codec.native.library import LIBRARY_VARIABLE, VARIABLE, VECTORS_VARIABLE
 from potr_cl.codec.native.values import BUNDLE, PackedValues
 from potr_cl.codec.quantize import HyperParameters
@@ -135,7 +135,7 @@ _kept: list[Any] = []
 def with_exact_arrays() -> None:
     """From now on the library reads copies of exact sizes, and what threads work with is made once: what one file has
     left there must not matter to the next."""
-    untouched, made, of_thread = arrays.address, bundles.BundledFile.work, list[Any]()
+    untouched, made, of_thread = declarations.address, bundles.BundledFile.work, list[Any]()
 
     def copied(array: Any, dtype: Any, number: int, writable: bool = False) -> int:
         if not writable:
@@ -148,7 +148,7 @@ def with_exact_arrays() -> None:
             of_thread.append(made(file))
         return of_thread[0]
 
-    for module in (arrays, functions, bundles, octree, share, values):
+    for module in (library, bundles, octree, values):
         module.address = copied  # type: ignore[attr-defined]
     bundles.BundledFile.work = work  # type: ignore[assignment, method-assign]
 

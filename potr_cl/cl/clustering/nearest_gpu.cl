@@ -6,6 +6,7 @@
    On GPUs: WIDTH:4,12,24,48 GROUP=128. */
 
 #include "clustering/candidates.clh"
+#include "include/group.clh"
 
 /* Centres in local memory at a time. */
 #define TILE 64
@@ -25,7 +26,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void nearest(
 {
     local float4 rows[TILE * WIDTH / 4];
     local float offsets[TILE];
-    const size_t block = get_group_id(0);
+    const size_t block = GROUP_ID(0);
     const uint item = get_local_id(0);
     const uint member = order[block * GROUP + item];
     const size_t point = member == NO_POINT ? 0 : member;

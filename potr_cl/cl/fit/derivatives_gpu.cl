@@ -1,5 +1,5 @@
 /* The way back from pixels to splats, for GPUs, all views of a set in one launch: one work-group a tile;
-   get_group_id(1) is the view's number. See derivatives_cpu.cl, its twin, for the method, and subtile_lists.clh for how
+   GROUP_ID(1) is the view's number. See derivatives_cpu.cl, its twin, for the method, and subtile_lists.clh for how
    a tile's work is shared out.
 
    On the way back each work-item finds w and e of its own pixels for ROUND splats at a time, and leaves them in local
@@ -15,6 +15,7 @@
    On GPUs: ALPHA_CAP=0.99f TRANSMITTANCE_THRESHOLD=1e-4f NATIVE_EXP2=0,1 LARGEST_VALUE=64.0f LARGEST_GAP=1.0f
        INT64_ATOMICS=0,1. */
 
+#include "include/group.clh"
 #include "include/subtile_lists.clh"
 #include "fit/sums.clh"
 
@@ -53,7 +54,7 @@ void derivatives(
     local int ends[SUBTILES], most_rounds[2], unfinished[2];
 
     const int lid = get_local_id(0), share = lid % SHARE, group = lid / SHARE;
-    const uint tile = get_group_id(0), number = get_group_id(1);
+    const uint tile = GROUP_ID(0), number = GROUP_ID(1);
     views += number;
     const int2 picture = (int2)(views->view.width, views->view.height);
     const int columns = views->view.columns;

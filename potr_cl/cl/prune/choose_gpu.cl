@@ -9,6 +9,7 @@
 
    On GPUs: INT64_ATOMICS=0,1. */
 
+#include "include/group.clh"
 #include "include/totals.clh"
 #include "prune/removal.clh"
 
@@ -99,7 +100,7 @@ inline Cut next_cut(
     Cut cut;
     cut.digits = digits << 8 | *found;
     cut.rest = budget - (*found > 0 ? sums[*found - 1] : 0);
-    if (get_group_id(0) == 0 && lid == 0) {
+    if (GROUP_ID(0) == 0 && lid == 0) {
         global uint *now = state->cuts + digit * CUT;
         now[0] = cut.digits;
         now[1] = (uint)cut.rest;

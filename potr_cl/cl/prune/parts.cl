@@ -5,6 +5,7 @@
 
    On GPUs: INT64_ATOMICS=0,1. */
 
+#include "include/group.clh"
 #include "prune/removal.clh"
 
 /* What a part has measured is added to the scene's totals, two 64-bit integers a splat. */
@@ -36,7 +37,7 @@ void lost(global const uchar *states, global const long *totals, uint splats, vo
 {
     local long sums[LOST_ITEMS];
     const uint lid = get_local_id(0);
-    const size_t begin = (size_t)get_group_id(0) * LOST_CHUNK, end = min(begin + LOST_CHUNK, (size_t)splats);
+    const size_t begin = (size_t)GROUP_ID(0) * LOST_CHUNK, end = min(begin + LOST_CHUNK, (size_t)splats);
     long sum = 0;
     for (size_t i = begin + lid; i < end; i += LOST_ITEMS)
         if (states[i] != SPLAT_ALIVE)

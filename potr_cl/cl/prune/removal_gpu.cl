@@ -20,6 +20,7 @@
 #define PART float2
 #define ROUND 8
 #define PADDING SHARE
+#include "include/group.clh"
 #include "include/subtile_batches.clh"
 #include "prune/removal.clh"
 #include "prune/staleness_gpu.clh"
@@ -59,7 +60,7 @@ void removal(
     local int unfinished[2];
 
     const int lid = get_local_id(0), share = lid % SHARE;
-    const uint set_tile = tiles[start + get_group_id(0)];
+    const uint set_tile = tiles[start + GROUP_ID(0)];
     const uint number = view_of_tile(views, view_count, set_tile);
     views += number;
     const int2 picture = (int2)(views->view.width, views->view.height);

@@ -9,6 +9,7 @@
        WEIGHT_5=0.001f. */
 
 #define LANES 1
+#include "include/group.clh"
 #include "include/lanes.clh"
 #include "quality/similarity.clh"
 
@@ -31,7 +32,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, GROUP, 1))) void similarity(
     local float2 partial[GROUP * GROUP];
 
     const int x = get_local_id(0), y = get_local_id(1), item = y * GROUP + x;
-    const int left = get_group_id(0) * GROUP, top = get_group_id(1) * GROUP;
+    const int left = GROUP_ID(0) * GROUP, top = GROUP_ID(1) * GROUP;
     global const float *image = images + 3 * (size_t)first_image, *reference = references + 3 * (size_t)first_reference;
     const int inside = left + x < width && top + y < height;
     const size_t middle = (size_t)min(top + GROUP / 2, height - 1) * width + min(left + GROUP / 2, width - 1);
@@ -75,5 +76,5 @@ kernel __attribute__((reqd_work_group_size(GROUP, GROUP, 1))) void similarity(
             partial[item] += partial[item + step];
     }
     if (item == 0)
-        sums[first_sum + get_group_id(1) * get_num_groups(0) + get_group_id(0)] = partial[0];
+        sums[first_sum + GROUP_ID(1) * get_num_groups(0) + GROUP_ID(0)] = partial[0];
 }

@@ -15,6 +15,7 @@
    On GPUs: ALPHA_CAP=0.99f TRANSMITTANCE_THRESHOLD=1e-4f NATIVE_EXP2=0,1. */
 
 #define LANES 1
+#include "include/group.clh"
 #include "include/lanes.clh"
 #include "include/splat.clh"
 #include "include/view_set.clh"
@@ -59,7 +60,7 @@ void composite_frame(
     local int living[2];
 
     const int lid = get_local_id(0);
-    const int tile = get_group_id(0);
+    const int tile = GROUP_ID(0);
     const int columns = views->view.columns, width = views->view.width;
     const int column = tile % columns * TILE + (lid & 7) + (lid >> 2 & 8);
     const int row = tile / columns * TILE + (lid >> 3 & 3) + (lid >> 6 << 2);

@@ -1,4 +1,4 @@
-/* Composites the splats to a picture, for GPUs: one work-group a tile; get_group_id(1) is the view's number in its set.
+/* Composites the splats to a picture, for GPUs: one work-group a tile; GROUP_ID(1) is the view's number in its set.
    See subtile_lists.clh for how a tile's work is shared out. composite_cpu.cl is its twin; composite_frame_gpu.cl does
    a view alone.
 
@@ -6,6 +6,7 @@
 
    On GPUs: ALPHA_CAP=0.99f TRANSMITTANCE_THRESHOLD=1e-4f NATIVE_EXP2=0,1. */
 
+#include "include/group.clh"
 #include "include/subtile_lists.clh"
 
 kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1)))
@@ -29,7 +30,7 @@ void composite(
     local int unfinished[2];
 
     const int lid = get_local_id(0);
-    const uint tile = get_group_id(0), number = get_group_id(1);
+    const uint tile = GROUP_ID(0), number = GROUP_ID(1);
     views += number;
     const int2 picture = (int2)(views->view.width, views->view.height);
     const int columns = views->view.columns;

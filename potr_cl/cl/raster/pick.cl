@@ -7,6 +7,8 @@
 
    On GPUs: no macros. */
 
+#include "include/group.clh"
+
 #define GROUP 256
 #define ROUNDS 16
 #define CHUNK (GROUP * ROUNDS)
@@ -37,14 +39,14 @@ void count_wanted(
 {
     local uint sum;
     const uint lid = get_local_id(0);
-    wanted += (size_t)get_group_id(1) * group_count;
-    counts += (size_t)get_group_id(1) * get_num_groups(0);
+    wanted += (size_t)GROUP_ID(1) * group_count;
+    counts += (size_t)GROUP_ID(1) * get_num_groups(0);
     if (lid == 0)
         sum = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
     uint mine = 0;
     for (uint round = 0; round < ROUNDS; ++round) {
-        const size_t splat = get_group_id(0) * CHUNK + round * GROUP + lid;
+        const size_t splat = GROUP_ID(0) * CHUNK + round * GROUP + lid;
         if (splat < splats)
             mine += is_wanted(groups, wanted, states, by_state, state, splat);
     }
@@ -52,7 +54,7 @@ void count_wanted(
         atomic_add(&sum, mine);
     barrier(CLK_LOCAL_MEM_FENCE);
     if (lid == 0)
-        counts[get_group_id(0)] = sum;
+        counts[GROUP_ID(0)] = sum;
 }
 
 /* starts[w] is where the numbers of work-group w begin, `first` places further on. Of several choices of groups it is
@@ -74,9 +76,9 @@ void write_wanted(
     local uint sums[GROUP];
     const uint lid = get_local_id(0);
     wanted += (size_t)choice * group_count;
-    uint start = first + starts[(size_t)choice * get_num_groups(0) + get_group_id(0)];
+    uint start = first + starts[(size_t)choice * get_num_groups(0) + GROUP_ID(0)];
     for (uint round = 0; round < ROUNDS; ++round) {
-        const size_t splat = get_group_id(0) * CHUNK + round * GROUP + lid;
+        const size_t splat = GROUP_ID(0) * CHUNK + round * GROUP + lid;
         const uint flag = splat < splats ? is_wanted(groups, wanted, states, by_state, state, splat) : 0;
         sums[lid] = flag;
         barrier(CLK_LOCAL_MEM_FENCE);

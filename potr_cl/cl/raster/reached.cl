@@ -7,6 +7,7 @@
 
    On GPUs: ALPHA_CAP=0.99f TRANSMITTANCE_THRESHOLD=1e-4f NATIVE_EXP2=0,1. */
 
+#include "include/group.clh"
 #include "include/subtile_lists.clh"
 
 /* marks[k] = 1 for each splat k that is fetched for view `number`. The others' marks stay. */
@@ -27,7 +28,7 @@ void mark_reached(
     local int unfinished[2];
 
     const int lid = get_local_id(0);
-    const uint tile = get_group_id(0);
+    const uint tile = GROUP_ID(0);
     views += number;
     const int2 picture = (int2)(views->view.width, views->view.height);
     const int columns = views->view.columns;

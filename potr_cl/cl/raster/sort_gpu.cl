@@ -1,4 +1,4 @@
-/* The depth order of each tile's list, for GPUs, by a bitonic network: one work-group a tile; get_group_id(1) is the
+/* The depth order of each tile's list, for GPUs, by a bitonic network: one work-group a tile; GROUP_ID(1) is the
    view's number in its set. sort_cpu.cl is its twin.
 
    Every merge of size `size` begins with a mirrored step (partner = index ^ (size - 1)). So all comparisons put the
@@ -9,6 +9,7 @@
 
    On GPUs: SORT_CAPACITY:2048 COUNTER_STRIDE=8. */
 
+#include "include/group.clh"
 #include "include/splat.clh"
 #include "include/view_set.clh"
 
@@ -65,8 +66,8 @@ void sort_tiles(
 {
     local ulong piece_keys[SORT_CAPACITY];
     const uint lid = get_local_id(0);
-    const uint tile = get_group_id(0);
-    views += get_group_id(1);
+    const uint tile = GROUP_ID(0);
+    views += GROUP_ID(1);
     if (tile >= (uint)(views->view.columns * views->view.rows))
         return;
     offsets += views->first_offset + tile;

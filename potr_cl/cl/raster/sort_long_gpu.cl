@@ -9,6 +9,8 @@
 
    On GPUs: PIECE:2048. */
 
+#include "include/group.clh"
+
 #define GROUP 256
 
 /* A piece of a list: where the list begins among the keys and among the others, how long it is, and where in it the
@@ -21,7 +23,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void sort_pieces(global const Piece *pieces, global ulong *keys)
 {
     local ulong own[PIECE];
-    const Piece piece = pieces[get_group_id(0)];
+    const Piece piece = pieces[GROUP_ID(0)];
     const uint lid = get_local_id(0), n = min(piece.length - piece.start, (uint)PIECE);
     keys += piece.keys + piece.start;
     for (uint i = lid; i < PIECE; i += GROUP)
@@ -80,7 +82,7 @@ void merge_pieces(global const Piece *pieces, global ulong *keys, global ulong *
 {
     local ulong own[PIECE];
     local uint taken[2];
-    const Piece piece = pieces[get_group_id(0)];
+    const Piece piece = pieces[GROUP_ID(0)];
     const uint lid = get_local_id(0), n = min(piece.length - piece.start, (uint)PIECE);
     global const ulong *from = from_keys ? keys + piece.keys : others + piece.others;
     global ulong *to = from_keys ? others + piece.others : keys + piece.keys;
@@ -114,7 +116,7 @@ void take_pieces(
     uint from_keys,
     global uint *intersections)
 {
-    const Piece piece = pieces[get_group_id(0)];
+    const Piece piece = pieces[GROUP_ID(0)];
     const uint n = min(piece.length - piece.start, (uint)PIECE);
     global const ulong *from = from_keys ? keys + piece.keys : others + piece.others;
     for (uint i = get_local_id(0); i < n; i += GROUP)

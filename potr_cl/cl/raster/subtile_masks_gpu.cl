@@ -1,4 +1,4 @@
-/* Which sub-tiles of its tile each intersection touches, for GPUs: one work-group a tile; get_group_id(1) is the view's
+/* Which sub-tiles of its tile each intersection touches, for GPUs: one work-group a tile; GROUP_ID(1) is the view's
    number in its set. It is found once for a view, however often its lists are swept. subtile_masks_cpu.cl is its twin.
 
    Macros: none.
@@ -7,6 +7,7 @@
 
 #define LANES 1
 #define SUBTILE_WIDTH 4
+#include "include/group.clh"
 #include "include/lanes.clh"
 #include "include/splat.clh"
 #include "include/subtiles.clh"
@@ -24,12 +25,12 @@ void subtile_masks(
     global ushort *subtiles,
     uint capacity)
 {
-    const uint tile = get_group_id(0);
-    views += get_group_id(1);
+    const uint tile = GROUP_ID(0);
+    views += GROUP_ID(1);
     const int columns = views->view.columns;
     if (tile >= (uint)(columns * views->view.rows))
         return;
-    shapes += 2 * (size_t)stride * get_group_id(1);
+    shapes += 2 * (size_t)stride * GROUP_ID(1);
     offsets += views->first_offset + tile;
     const uint room = capacity - min(capacity, views->first_intersection);
     const uint end = views->first_intersection + min(offsets[1], room);

@@ -1,4 +1,5 @@
-/* Which splats reach into the picture of one view at least, and which into none, without a doubt: potr_cl/model/unseen.py
+/* Which splats reach into the picture of one view at least, and which into none, without a doubt:
+ * potr_cl/model/splat_groups.py
    asks the same in double precision, of which this is a quick part. One splat a work-item.
 
    Macros: none.

@@ -12,6 +12,7 @@
 
    On GPUs: COUNTER_STRIDE=8. */
 
+#include "include/group.clh"
 #include "include/splat.clh"
 #include "include/view_set.clh"
 
@@ -71,7 +72,7 @@ void count_tiles(
     string_rows(bounds, first, around);
     for (int row = get_local_id(0); row < first[GROUP]; row += GROUP) {
         int owner = row_owner(first, row);
-        uint splat = get_group_id(0) * GROUP + owner;
+        uint splat = GROUP_ID(0) * GROUP + owner;
         int4 tiles = convert_int4(around[owner]);
         int tile_row = tiles.z + row - first[owner];
         int2 columns = splat_tile_columns(shapes, splat, tiles, tile_row, width, height);
@@ -102,7 +103,7 @@ void fill_tiles(
     string_rows(bounds, first, around);
     for (int row = get_local_id(0); row < first[GROUP]; row += GROUP) {
         int owner = row_owner(first, row);
-        uint splat = get_group_id(0) * GROUP + owner;
+        uint splat = GROUP_ID(0) * GROUP + owner;
         int4 tiles = convert_int4(around[owner]);
         int tile_row = tiles.z + row - first[owner];
         int2 columns = splat_tile_columns(shapes, splat, tiles, tile_row, width, height);
@@ -120,7 +121,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void scan_tiles(global const SetView *views, global uint *counts, global uint *offsets)
 {
     local ulong sums[GROUP];
-    views += get_group_id(1);
+    views += GROUP_ID(1);
     scan(
         counts + COUNTER_STRIDE * (size_t)views->first_tile,
         offsets + views->first_offset,

@@ -1,5 +1,5 @@
 /* The picture as a function of the splats' colours, and the way back, for GPUs, all views of a set in one launch: one
-   work-group a tile; get_group_id(1) is the view's number. See refit_cpu.cl, its twin, for the method,
+   work-group a tile; GROUP_ID(1) is the view's number. See refit_cpu.cl, its twin, for the method,
    subtile_lists.clh for how a tile's work is shared out, and subtile_batches.clh for the second walk.
 
    Macros:
@@ -14,6 +14,7 @@
 #define SUMS (3 + WEIGHTS)
 #define PART float4
 #define ROUND 4
+#include "include/group.clh"
 #include "include/subtile_batches.clh"
 #include "refit/refit.clh"
 
@@ -42,7 +43,7 @@ void refit_sweep(
     local float item_errors[ITEMS];
 
     const int lid = get_local_id(0), share = lid % SHARE;
-    const uint tile = get_group_id(0), number = get_group_id(1);
+    const uint tile = GROUP_ID(0), number = GROUP_ID(1);
     views += number;
     const int2 picture = (int2)(views->view.width, views->view.height);
     const int columns = views->view.columns;

@@ -14,15 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.bundles.description import Fitted
-from potr_cl.codec.bundles.layout import BUNDLE, LANES, Bundles, Layout
-from potr_cl.codec.bundles.levels import Items, Levels, joined
+from potr_cl.codec.bundles.layout import BUNDLE, LANES, Bundles, Items, Layout, Levels, joined
 from potr_cl.codec.bundles.ranges import Words, decode_stream, integer_type
-from potr_cl.codec.bundles.rans import LOWEST, check_end, no_words_left
 from potr_cl.codec.bundles.sections import MAIN, ORDER, ROTATION, Section
-from potr_cl.codec.bundles.streams import band, differences, step_terms, streams_of
+from potr_cl.codec.bundles.streams import LOWEST, band, check_end, differences, no_words_left, step_terms, streams_of
 from potr_cl.codec.native.bundles import FINE, TOO_FEW_WORDS, BundledFile
-from potr_cl.codec.native.functions import Functions
-from potr_cl.codec.native.library import vectors
+from potr_cl.codec.native.library import Functions, vectors
 from potr_cl.codec.native.table import definition
 from potr_cl.codec.sections import Property
 from potr_cl.codec.steps.rule import ColourSteps

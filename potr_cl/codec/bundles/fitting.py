@@ -12,9 +12,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.bundles import rans
+from potr_cl.codec.bundles import streams
+from potr_cl.codec.bundles.description import LARGEST_SIZE, MOST_CONTEXTS, Model
 from potr_cl.codec.bundles.layout import Layout
-from potr_cl.codec.bundles.model import LARGEST_SIZE, MOST_CONTEXTS, Model
 
 I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]
@@ -118,7 +118,7 @@ def fit_model(cells: U16, alphabet: int) -> Model:
     classes = np.zeros(LARGEST_SIZE + 1, np.uint8)
     for start in starts[1:]:
         classes[start:] += 1
-    return Model(classes, np.array([rans.normalise(group) for group in groups]))
+    return Model(classes, np.array([streams.normalise(group) for group in groups]))
 
 
 def merge(starts: list[int], groups: I64) -> tuple[list[int], I64]:

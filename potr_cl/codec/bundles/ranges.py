@@ -11,11 +11,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.bundles.description import Fitted
+from potr_cl.codec.bundles.description import LARGEST_SIZE, Fitted
 from potr_cl.codec.bundles.layout import LANES, Layout
-from potr_cl.codec.bundles.model import LARGEST_SIZE
-from potr_cl.codec.bundles.rans import CONTEXT_SHIFT, LOWEST, PRECISION, TOTAL, no_words_left
-from potr_cl.codec.bundles.tokens import DIRECT, extra_bits, largest_integer
+from potr_cl.codec.bundles.streams import (
+    CONTEXT_SHIFT,
+    DIRECT,
+    LOWEST,
+    PRECISION,
+    TOTAL,
+    extra_bits,
+    largest_integer,
+    no_words_left,
+)
 
 I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]

@@ -17,9 +17,7 @@ from numpy.typing import NDArray
 from potr_cl.codec.bundles.description import Fitted, read_description, write_description
 from potr_cl.codec.bundles.layout import Bundles
 from potr_cl.codec.bundles.ranges import Words
-from potr_cl.codec.bundles.rans import LOWEST
-from potr_cl.codec.bundles.streams import streams_of
-from potr_cl.codec.bundles.tokens import largest_integer
+from potr_cl.codec.bundles.streams import LOWEST, largest_integer, streams_of
 from potr_cl.codec.native.bundles import SectionWords, StreamModel, fits
 from potr_cl.codec.sections import SH, Property
 from potr_cl.errors import DataError

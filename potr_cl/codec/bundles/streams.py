@@ -1,7 +1,9 @@
-"""Which streams a section of coder BUNDLES has, and what the contexts of each are made of.
+"""Which streams a section of coder BUNDLES has, what the contexts of each are made of, and what their integers become:
+tokens of a small alphabet with some extra bits, interleaved range coded (rANS, Duda 2013).
 
 A token has a *size*, which says how large what it stands for is. The context of a token is told by a weighted sum of
-*terms*: sizes that are known already of the same splat, or numbers made of them.
+*terms*: sizes that are known already of the same splat, or numbers made of them. Every lane of the range coder has a
+state of its own, and lanes share a stream of 16-bit words. docs/format.md, "Bundles", is the normative description.
 """
 
 from __future__ import annotations
@@ -9,15 +11,126 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.bundles.tokens import SIZES, token_floors
 from potr_cl.codec.sections import SH, Property
 from potr_cl.codec.steps.rule import CLASSES
+from potr_cl.errors import DataError
 
 I32 = NDArray[np.int32]
+I64 = NDArray[np.int64]
+U8 = NDArray[np.uint8]
+
+#: Integers of at most this many bits are tokens by themselves.
+_DIRECT_BITS = 7
+DIRECT = 1 << _DIRECT_BITS
+#: Integers have at most this many bits, once they are mapped to unsigned ones.
+MOST_BITS = 38
+#: Tokens there are: 4 for each power of two from the direct ones up.
+ALPHABET = DIRECT + 4 * (MOST_BITS - _DIRECT_BITS)
+
+
+def token_floors() -> I64:
+    """(ALPHABET,) the least of the integers, mapped to unsigned ones, that each token stands for."""
+    token = np.arange(ALPHABET)
+    above = np.maximum(token - DIRECT, 0)
+    return np.where(token < DIRECT, token, (4 + above % 4) << (_DIRECT_BITS - 2 + above // 4))
+
+
+def _size_table(signed: bool) -> I32:
+    mapped = token_floors()
+    magnitude = (mapped + 1) // 2 if signed else mapped
+    sizes: I32 = np.floor(16 * np.log2(1.0 + magnitude) + 0.5).astype(np.int32)
+    return sizes
+
+
+#: By whether integers are signed: (ALPHABET,) 16 log2(1 + magnitude) of the least integer of each token, rounded.
+SIZES = {signed: _size_table(signed) for signed in (False, True)}
+
+
+def tokens_of(mapped: NDArray[Any]) -> U8:
+    """Tokens, uint8 of the same shape, of integers of any shape, mapped to unsigned, below 2^38."""
+    tokens = mapped.astype(np.uint8)
+    large = np.flatnonzero(mapped >= DIRECT)
+    if len(large):
+        u = mapped.ravel()[large].astype(np.int64)
+        exponent = np.frexp(u.astype(np.float64))[1] - 1  # exact below 2^53
+        leading = u >> (exponent - 2)  # 4 to 7
+        tokens.ravel()[large] = DIRECT + 4 * (exponent - _DIRECT_BITS) + leading - 4
+    return tokens
+
+
+def largest_integer(token: int) -> int:
+    """The largest of the integers, mapped to unsigned ones, that a token stands for."""
+    if token < DIRECT:
+        return token
+    above = token - DIRECT
+    return ((5 + above % 4) << (_DIRECT_BITS - 2 + above // 4)) - 1
+
+
+def extra_bits(tokens: NDArray[np.integer]) -> I64:
+    """How many extra bits each of some tokens has."""
+    wide = tokens.astype(np.int64)
+    return np.where(wide < DIRECT, 0, _DIRECT_BITS - 2 + (wide - DIRECT) // 4)
+
+
+#: The frequencies of a context add up to two to the power of this.
+PRECISION = 12
+TOTAL = 1 << PRECISION
+#: A state is at or above this between steps, and below it times 2^16; coding starts and decoding ends with it.
+LOWEST = 1 << 16
+#: What divides the sums that tell contexts, as a power of two.
+CONTEXT_SHIFT = 8
+
+
+def normalise(counts: I64) -> I64:
+    """Counts of tokens to frequencies that add up to :data:`TOTAL`; no token that occurs gets 0.
+
+    Args:
+        counts: (A,), at most 256, at least one above 0.
+    """
+    present = counts > 0
+    frequencies: I64 = np.where(present, np.maximum(counts * TOTAL // int(counts.sum()), 1), 0)
+    # What rounding left over goes to the token whose code it changes most for the better, or least for the worse.
+    rest = TOTAL - int(frequencies.sum())
+    gains = np.where(present, counts / np.maximum(frequencies, 1), -1)
+    while rest > 0:
+        token = gains.argmax()
+        more = -(-rest // 4)
+        frequencies[token] += more
+        rest -= more
+        gains[token] = counts[token] / frequencies[token]
+    losses = np.where(frequencies > 1, counts / np.maximum(frequencies, 1), np.inf)
+    while rest < 0:
+        token = losses.argmin()
+        frequencies[token] -= 1
+        rest += 1
+        losses[token] = counts[token] / frequencies[token] if frequencies[token] > 1 else np.inf
+    return frequencies
+
+
+def no_words_left(what: str) -> DataError:
+    """What to raise where a lane needs a word and there is none; ``what`` is the section, for the message."""
+    return DataError(f"section '{what}' ends too early")
+
+
+def check_end(all_words: bool, states: NDArray[np.unsignedinteger], what: str) -> None:
+    """Check that all words were taken and every lane is back where its encoder began.
+
+    Args:
+        all_words: whether they were.
+        states: (lanes,) of the decoder.
+        what: was decoded, for the message.
+
+    Raises:
+        DataError: they are not.
+    """
+    if not all_words or (states != LOWEST).any():
+        raise DataError(f"section '{what}' does not end where its last token does")
+
 
 #: Size of a mask for each coefficient in it, and of a pattern with chroma.
 COUNT_SIZE, CHROMA_SIZE = 32, 128

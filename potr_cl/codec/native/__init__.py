@@ -19,5 +19,5 @@ It gives the same bits as the NumPy modules around it, which are its definition 
 ``module.c``          nothing: it makes a Python module of the library, so that it is built and found as one
 ====================  =========================================================================================
 
-:mod:`potr_cl.codec.native.functions` gives each C function NumPy arrays whose sizes it has checked.
+:mod:`potr_cl.codec.native.library` gives each C function NumPy arrays whose sizes it has checked.
 """

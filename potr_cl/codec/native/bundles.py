@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.native.arrays import address
+from potr_cl.codec.native.declarations import address
 from potr_cl.codec.steps.rule import KNOTS, ColourSteps
 
 U8 = NDArray[np.uint8]

@@ -11,8 +11,8 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.native.arrays import address
 from potr_cl.codec.native.bundles import SECTIONS, STREAMS
+from potr_cl.codec.native.declarations import address
 
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.native.arrays import address
+from potr_cl.codec.native.declarations import address
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

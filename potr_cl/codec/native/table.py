@@ -12,8 +12,6 @@ from functools import cache, wraps
 from importlib import import_module
 from typing import Any, ParamSpec, TypeVar
 
-from potr_cl.codec.native import library
-
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -21,8 +19,8 @@ R = TypeVar("R")
 TABLE = {
     "codec.block_values:bundle_share": "codec.block_values:_bundle_share_of_c",
     "codec.bundles.decoder:bundled_file": "codec.bundles.decoder:_bundled_file_by_c",
-    "codec.bundles.encoder:coded": "codec.bundles.native_encoder:encode_natively",
-    "codec.colours:quantised": "codec.colours:_quantised_by_c",
+    "codec.bundles.encoder:coded": "codec.bundles.encoder:encode_natively",
+    "codec.splat_levels:quantised": "codec.splat_levels:_quantised_by_c",
     "codec.geometry:nearest": "codec.geometry:_nearest_by_c",
     "codec.octree.builder:begin": "codec.octree.builder:_begin_by_c",
     "codec.octree.builder:leaf_order": "codec.octree.builder:_leaf_order_by_c",
@@ -30,7 +28,7 @@ TABLE = {
     "codec.quantize:canonical_rotations": "codec.quantize:_canonical_rotations_by_c",
     "codec.quantize:nonzero_levels": "codec.quantize:_nonzero_levels_by_c",
     "codec.splat_levels:splat_levels": "codec.splat_levels:_splat_levels_by_c",
-    "codec.steps.classes:colour_classes": "codec.steps.classes:_colour_classes_by_c",
+    "codec.steps.rule:colour_classes": "codec.steps.rule:_colour_classes_by_c",
     "codec.steps.prediction:to_residuals": "codec.steps.prediction:_to_residuals_by_c",
     "outputs.feedback:unit_factors": "outputs.feedback:_unit_factors_by_c",
 }
@@ -46,7 +44,9 @@ def definition(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def either(*args: P.args, **kwargs: P.kwargs) -> R:
-        functions = library.native()
+        from potr_cl.codec.native.library import native  # which itself needs definitions
+
+        functions = native()
         if functions is not None:
             found: R = resolved(twin)(functions, *args, **kwargs)
             if found is not NotImplemented:

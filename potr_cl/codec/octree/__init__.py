@@ -15,7 +15,6 @@ attribute streams is the depth-first (Morton) order of the leaves.
 """
 
 from potr_cl.codec.octree.builder import Begun, begin, build, leaf_order
-from potr_cl.codec.octree.parser import parse
-from potr_cl.codec.octree.streams import DEEPEST_LEVEL, OctreeStreams
+from potr_cl.codec.octree.parser import DEEPEST_LEVEL, OctreeStreams, parse
 
 __all__ = ["DEEPEST_LEVEL", "Begun", "OctreeStreams", "begin", "build", "leaf_order", "parse"]

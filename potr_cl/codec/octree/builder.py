@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.native.functions import Functions
-from potr_cl.codec.native.octree_build import OctreeBuilding
+from potr_cl.codec.native.library import Functions
+from potr_cl.codec.native.octree import OctreeBuilding
 from potr_cl.codec.native.table import definition
-from potr_cl.codec.octree.parser import parse
-from potr_cl.codec.octree.streams import DEEPEST_LEVEL, U8, U64, OctreeStreams, check_centres
+from potr_cl.codec.octree.parser import DEEPEST_LEVEL, U8, U64, OctreeStreams, check_centres, parse
 from potr_cl.host.threads import Run
-from potr_cl.model.morton import spread
+from potr_cl.model.order import spread
 
 #: Splats worked on at a time where each stands for itself: the temporaries of a block stay in the cache.
 _BLOCK = 1 << 15

@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.native.functions import Functions
+from potr_cl.codec.native.library import Functions
 from potr_cl.codec.native.table import definition
 from potr_cl.codec.steps.rule import CLASSES
 

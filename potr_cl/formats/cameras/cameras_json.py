@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 from potr_cl.errors import DataError
-from potr_cl.formats.cameras.points import points_beside
 from potr_cl.formats.cameras.view_files import (
     IMAGE_SUFFIXES,
     camera_of,
@@ -25,6 +24,7 @@ from potr_cl.formats.cameras.view_files import (
     image_side,
     matrix,
     number,
+    points_beside,
     read_json,
     stem,
     view_names,

@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import DataError
-from potr_cl.formats.cameras.points import points_beside
 from potr_cl.formats.cameras.view_files import (
     FoundView,
     cameras_of,
@@ -28,6 +27,7 @@ from potr_cl.formats.cameras.view_files import (
     image_name,
     image_side,
     lens_coefficients,
+    points_beside,
     read_bytes,
     view_names,
 )

@@ -1,12 +1,8 @@
-"""Scenes as compressed PLY files (SuperSplat's and splat-transform's .compressed.ply), read through the library gsply.
-
-The library unpacks without looking at the bounds of its arrays. So it never sees a header of somebody else: this module
-reads one, strictly, and hands on a header of its own with exactly the bytes that belong to it.
-"""
+"""Scenes as compressed PLY files (SuperSplat's and splat-transform's .compressed.ply). Headers are read strictly."""
 
 from __future__ import annotations
 
-import itertools
+import io
 import os
 import re
 from typing import BinaryIO
@@ -16,20 +12,19 @@ from numpy.typing import NDArray
 
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes.compressed_ply_chunks import in_chunks
 from potr_cl.formats.scenes.compressed_ply_values import (
     CHUNK,
     PackedGeometry,
     element_bytes,
+    in_chunks,
     packed_colours,
     packed_geometry,
     packed_sh,
     unpacked,
 )
-from potr_cl.formats.scenes.gsply_arrays import EXTRA, library, to_scene
-from potr_cl.formats.scenes.ply_comments import ANTIALIASED_COMMENT, marked
+from potr_cl.formats.scenes.ply_antialiasing import ANTIALIASED_COMMENT, marked
 from potr_cl.formats.scenes.scene_files import cleaned, opened, tell_of_low_pass, unit_quaternions
-from potr_cl.host.atomic_write import replacing
+from potr_cl.host.atomic_write import write_pieces
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
 
 _MAX_HEADER_BYTES = 1 << 16
@@ -55,36 +50,17 @@ def is_compressed_ply(path: str | os.PathLike[str]) -> bool:
 
 
 def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
-    """Read a scene from a compressed PLY of SH degree 0 to 3.
-
-    Args:
-        path: of the file.
-        trust: of no meaning here: nothing in a compressed PLY expands.
-
-    Raises:
-        UsageError: there is no such file, or the extra ``convert`` is not installed.
-        DataError: it is damaged, or of an older layout.
-    """
+    """The scene of a compressed PLY of SH degree 0 to 3; see :class:`potr_cl.formats.declaration.SceneLoader`."""
     with opened(path) as (file, size):
-        gsply = library(path)
-        content, comments = _canonical(path, file, size)
-        data = gsply.decompress_from_bytes(content)
-    return marked(to_scene(path, data), comments)
+        return _read(path, file, size)
 
 
 def save(path: str | os.PathLike[str], scene: Scene) -> None:
-    """Write a scene as compressed PLY; the file appears under its name only when it is whole.
-
-    Raises:
-        UsageError: ``path`` cannot be written to.
-        PotrError: the system failed to write.
-    """
+    """Write a scene as compressed PLY; see :class:`potr_cl.formats.declaration.SceneSaver`."""
     tell_of_low_pass(path, scene)
     scene = unit_quaternions(scene.subset(in_chunks(scene.means)))
     packed, colours = packed_geometry(scene), packed_colours(scene.sh[:, 0])
-    with replacing(path) as file:
-        for piece in pieces(packed, colours, packed_sh(scene.sh[:, 1:]), scene.antialiased):
-            file.write(piece)
+    write_pieces(path, pieces(packed, colours, packed_sh(scene.sh[:, 1:]), scene.antialiased))
 
 
 def pieces(
@@ -106,18 +82,8 @@ def pieces(
 
 
 def scene_of(data: bytes) -> Scene:
-    """The scene of a file that :func:`pieces` has made, without any library.
-
-    Raises:
-        DataError: it is damaged.
-    """
-    lines, comments, start = _header_lines("file in memory", data[:_MAX_HEADER_BYTES])
-    chunks, splats, rest = _counts("file in memory", lines)
-    ends = np.cumsum([start, 4 * len(_BOUNDS) * chunks, 4 * len(_VERTEX) * splats, rest * splats])
-    if len(data) != ends[-1]:
-        raise DataError(f"a compressed PLY of {len(data)} bytes should have {ends[-1]}")
-    parts = (data[first:end] for first, end in itertools.pairwise(ends))
-    return marked(cleaned("file in memory", unpacked(*parts)), comments)
+    """The scene of a file that :func:`pieces` has made."""
+    return _read("file in memory", io.BytesIO(data), len(data))
 
 
 def _header(elements: list[tuple[str, int, list[tuple[str, str]]]], comments: list[str]) -> bytes:
@@ -134,29 +100,21 @@ FORMAT = SceneFormat(
     note="of SuperSplat and splat-transform; a `.ply` with this content is read too",
     load=load,
     save=save,
-    extra=EXTRA,
     recognises=is_compressed_ply,
 )
 
 
-def _canonical(path: str | os.PathLike[str], file: BinaryIO, size: int) -> tuple[bytearray, list[str]]:
-    """A file with a header of our own, and the comments of its own.
-
-    Not as bytes: the library's kernels are compiled for arrays that can change.
-    """
+def _read(path: str | os.PathLike[str], file: BinaryIO, size: int) -> Scene:
     lines, comments, start = _header_lines(path, file.read(_MAX_HEADER_BYTES))
     chunks, splats, rest = _counts(path, lines)
-    elements = [("chunk", chunks, _BOUNDS), ("vertex", splats, _VERTEX), ("sh", splats, _coefficients(rest))]
-    whole = bytearray(_header(elements, []))
-    values = 4 * len(_BOUNDS) * chunks + (4 * len(_VERTEX) + rest) * splats
-    if size < start + values:
-        raise DataError(f"'{path}' is truncated: its header tells of {start + values} bytes, it has {size}")
+    sizes = (4 * len(_BOUNDS) * chunks, 4 * len(_VERTEX) * splats, rest * splats)
+    if size < start + sum(sizes):
+        raise DataError(f"'{path}' is truncated: its header tells of {start + sum(sizes)} bytes, it has {size}")
     file.seek(start)
-    content = file.read(values)
-    if len(content) < values:
+    elements = [file.read(nbytes) for nbytes in sizes]
+    if sum(map(len, elements)) < sum(sizes):
         raise DataError(f"'{path}' became shorter while it was read")
-    whole += content
-    return whole, comments
+    return marked(cleaned(path, unpacked(*elements)), comments)
 
 
 def _header_lines(path: str | os.PathLike[str], head: bytes) -> tuple[list[str], list[str], int]:

@@ -22,22 +22,17 @@ from numpy.typing import NDArray
 from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes import gltf_writer, spz
-from potr_cl.formats.scenes.gltf_file import Asset
-from potr_cl.formats.scenes.gltf_writer import EXTENSION as _EXTENSION
-from potr_cl.formats.scenes.gltf_writer import SPZ_EXTENSION
-from potr_cl.formats.scenes.scene_files import MOST_A_BYTE, cleaned, joined, log_of_scales, reading, shown
-from potr_cl.host.atomic_write import replacing
-from potr_cl.model.claims import check_claim
-from potr_cl.model.quaternions import quaternions_of, rotated_sh, rotation_matrices
+from potr_cl.formats.scenes import gltf_file, spz
+from potr_cl.formats.scenes.gltf_file import EXTENSION, LINEAR, POINTS, SPZ_EXTENSION, SRGB, Asset
+from potr_cl.formats.scenes.scene_files import check_splats, cleaned, joined, log_of_scales, reading, shown
+from potr_cl.host.atomic_write import write_pieces
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
+from potr_cl.model.spherical_harmonics import quaternions_of, rotated_sh, rotation_matrices
 
 _log = logging.getLogger("potr_cl")
 
-_POINTS = 0
-_SRGB, _LINEAR = "srgb_rec709_display", "lin_rec709_display"
 #: Extensions of the asset that change nothing of what is read here, or are read.
-_HARMLESS = {_EXTENSION, SPZ_EXTENSION, "KHR_mesh_quantization", "KHR_materials_unlit", "KHR_texture_transform"}
+_HARMLESS = {EXTENSION, SPZ_EXTENSION, "KHR_mesh_quantization", "KHR_materials_unlit", "KHR_texture_transform"}
 #: Every scene may have so many meshes with splats, each of which takes time.
 _MOST_PARTS = 4096
 #: Largest difference from a rotation that a node's matrix may have by rounding.
@@ -47,19 +42,10 @@ Matrix = NDArray[np.float64]
 
 
 def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
-    """Read the splats of a glTF scene.
-
-    Args:
-        path: of the .glb or .gltf file.
-        trust: whether it may hold more splats a byte than a real scene has, and so take memory out of proportion.
-
-    Raises:
-        UsageError: a file is missing.
-        DataError: it is damaged, holds no splats or too many for its size, or has them in a way that is not read.
-    """
+    """The splats of a .glb or .gltf file; see :class:`potr_cl.formats.declaration.SceneLoader`."""
     asset = Asset(path)
     with reading(path):
-        return cleaned(path, _scene(path, asset, trust))
+        return cleaned(path, _scene(asset, trust))
 
 
 def files(path: Path) -> list[Path]:
@@ -73,26 +59,17 @@ def files(path: Path) -> list[Path]:
 
 
 def save(path: str | os.PathLike[str], scene: Scene) -> None:
-    """Write a scene as glTF in one file; the file appears under its name only when it is whole.
+    """Write a .glb file, whose splats are packed as SPZ, or a .gltf file, which has them in float32.
 
-    Args:
-        path: of a .glb file, whose splats are packed as SPZ, or of a .gltf file, which has them in float32.
-        scene: to write.
-
-    Raises:
-        UsageError: ``path`` cannot be written to.
-        DataError: a position is too large for SPZ.
-        PotrError: the system failed to write.
+    See :class:`potr_cl.formats.declaration.SceneSaver`.
     """
     if Path(path).suffix.lower() != ".gltf":
-        content = gltf_writer.binary(scene, spz.content_of(path, scene))
+        content = gltf_file.binary(scene, spz.content_of(path, scene))
     else:
-        content = [gltf_writer.text(scene)]
+        content = [gltf_file.text(scene)]
         if scene.antialiased:
             _log.warning("'%s': glTF cannot say that the scene is antialiased: it will be drawn as the others", path)
-    with replacing(path) as file:
-        for piece in content:
-            file.write(piece)
+    write_pieces(path, content)
 
 
 FORMAT = SceneFormat(
@@ -107,37 +84,36 @@ FORMAT = SceneFormat(
 )
 
 
-def _scene(path: str | os.PathLike[str], asset: Asset, trust: bool) -> Scene:
+def _scene(asset: Asset, trust: bool) -> Scene:
     others = [name for name in asset.description.get("extensionsRequired", []) if name not in _HARMLESS]
     found: list[tuple[dict[str, Any], _Node]] = []
     left_out = 0
     for node in _nodes(asset):
         for primitive in asset.entry("meshes", node.entry["mesh"]).get("primitives", []):
-            if isinstance(primitive, dict) and _EXTENSION in primitive.get("extensions", {}):
+            if isinstance(primitive, dict) and EXTENSION in primitive.get("extensions", {}):
                 found.append((primitive, node))
             else:
                 left_out += 1
     if not found:
         raise DataError(
-            f"'{path}' has no Gaussian splats: no part of its scene has the extension {_EXTENSION}; it is a mesh or "
-            "a point cloud"
+            f"'{asset.path}' has no Gaussian splats: no part of its scene has the extension {EXTENSION}; it is a mesh "
+            "or a point cloud"
         )
     primitives = {id(primitive): primitive for primitive, _ in found}
     for primitive in primitives.values():
-        _check_kind(path, asset, primitive)
+        _check_kind(asset, primitive)
     if others:
-        raise DataError(f"'{path}' needs the glTF extension {shown(others[0])}, which is not supported")
+        raise DataError(f"'{asset.path}' needs the glTF extension {shown(others[0])}, which is not supported")
     counts = {number: _count(asset, primitive) for number, primitive in primitives.items()}
-    try:
-        check_claim(sum(counts[id(primitive)] for primitive, _ in found), asset.size, MOST_A_BYTE, trust)
-        if len(found) > _MOST_PARTS and not trust:
-            raise DataError(f"{len(found)} meshes with splats are more than are read without --trust (trust=True)")
-    except DataError as error:
-        raise DataError(f"'{path}': {error}") from None
+    check_splats(asset.path, sum(counts[id(primitive)] for primitive, _ in found), asset.size, trust)
+    if len(found) > _MOST_PARTS and not trust:
+        raise DataError(
+            f"'{asset.path}': {len(found)} meshes with splats are more than are read without --trust (trust=True)"
+        )
     if left_out:
-        _log.warning("'%s': left out %d parts of the scene that are no splats", path, left_out)
-    scenes = {number: _splats(path, asset, primitive, trust) for number, primitive in primitives.items()}
-    return joined([_placed(path, scenes[id(primitive)], node.matrix(asset)) for primitive, node in found])
+        _log.warning("'%s': left out %d parts of the scene that are no splats", asset.path, left_out)
+    scenes = {number: _splats(asset, primitive, trust) for number, primitive in primitives.items()}
+    return joined([_placed(asset, scenes[id(primitive)], node.matrix(asset)) for primitive, node in found])
 
 
 @dataclasses.dataclass
@@ -209,27 +185,27 @@ def _numbers(asset: Asset, node: dict[str, Any], key: str, default: list[float])
     return np.array(values, np.float64)
 
 
-def _check_kind(path: str | os.PathLike[str], asset: Asset, primitive: dict[str, Any]) -> None:
+def _check_kind(asset: Asset, primitive: dict[str, Any]) -> None:
     """That splats are of the kind that the base extension describes, which is that of 3DGS."""
-    kind = primitive["extensions"][_EXTENSION]
+    kind = primitive["extensions"][EXTENSION]
     if not isinstance(kind, dict):
-        raise asset.damaged(f"its {_EXTENSION} is not an object")
+        raise asset.damaged(f"its {EXTENSION} is not an object")
     unknown = [name for name in kind.get("extensions", {}) if name != SPZ_EXTENSION]
     if unknown:
         raise DataError(
-            f"'{path}' has its splats in the extension {shown(unknown[0])}, which cannot be read: export it without "
-            "compression, or as .spz"
+            f"'{asset.path}' has its splats in the extension {shown(unknown[0])}, which cannot be read: export it "
+            "without compression, or as .spz"
         )
     for key, default, known in (
         ("kernel", "ellipse", ("ellipse",)),
         ("projection", "perspective", ("perspective",)),
-        ("colorSpace", _SRGB, (_SRGB, _LINEAR)),
+        ("colorSpace", SRGB, (SRGB, LINEAR)),
     ):
         if kind.get(key, default) not in known:
-            raise DataError(f"'{path}' has splats whose {key} is {shown(kind[key])}: only {known[0]} can be read")
-    if kind.get("colorSpace", _SRGB) == _LINEAR:
-        _log.warning("'%s' has linear colours: they are kept as they are, and look darker than they should", path)
-    if primitive.get("mode", 4) != _POINTS:
+            raise DataError(f"'{asset.path}' has splats whose {key} is {shown(kind[key])}: only {known[0]} can be read")
+    if kind.get("colorSpace", SRGB) == LINEAR:
+        _log.warning("'%s' has linear colours: they are kept as they are, and look darker than they should", asset.path)
+    if primitive.get("mode", 4) != POINTS:
         raise asset.damaged("its splats are no points")
     if not isinstance(primitive.get("attributes"), dict):
         raise asset.damaged("its splats have no attributes")
@@ -239,14 +215,14 @@ def _count(asset: Asset, primitive: dict[str, Any]) -> int:
     return asset.count(primitive["attributes"].get("POSITION"))
 
 
-def _splats(path: str | os.PathLike[str], asset: Asset, primitive: dict[str, Any], trust: bool) -> Scene:
+def _splats(asset: Asset, primitive: dict[str, Any], trust: bool) -> Scene:
     """The splats of a primitive, in the axes of its node."""
-    packed = primitive["extensions"][_EXTENSION].get("extensions", {}).get(SPZ_EXTENSION)
+    packed = primitive["extensions"][EXTENSION].get("extensions", {}).get(SPZ_EXTENSION)
     if packed is not None:
         if not isinstance(packed, dict):
             raise asset.damaged(f"its {SPZ_EXTENSION} is not an object")
         content = asset.content(packed.get("bufferView"))
-        scene = spz.read(path, io.BytesIO(content), len(content), trust)
+        scene = spz.read(asset.path, io.BytesIO(content), len(content), trust)
         if len(scene) != _count(asset, primitive):
             raise asset.damaged("its SPZ does not hold as many splats as POSITION")
         return scene
@@ -261,24 +237,24 @@ def _splats(path: str | os.PathLike[str], asset: Asset, primitive: dict[str, Any
         return asset.values(attributes[name], parts)
 
     degree = 0
-    while degree < 3 and f"{_EXTENSION}:SH_DEGREE_{degree + 1}_COEF_0" in attributes:
+    while degree < 3 and f"{EXTENSION}:SH_DEGREE_{degree + 1}_COEF_0" in attributes:
         degree += 1
-    if f"{_EXTENSION}:SH_DEGREE_4_COEF_0" in attributes:
-        _log.warning("'%s': SH degree 4 is left out: only degrees 0 to 3 are kept", path)
+    if f"{EXTENSION}:SH_DEGREE_4_COEF_0" in attributes:
+        _log.warning("'%s': SH degree 4 is left out: only degrees 0 to 3 are kept", asset.path)
     sh = np.empty((count, SH_COEFFICIENTS[degree], 3), np.float32)
-    names = [f"{_EXTENSION}:SH_DEGREE_{k}_COEF_{n}" for k in range(degree + 1) for n in range(2 * k + 1)]
+    names = [f"{EXTENSION}:SH_DEGREE_{k}_COEF_{n}" for k in range(degree + 1) for n in range(2 * k + 1)]
     for k, name in enumerate(names):
         sh[:, k] = values(name, 3)
-    scales = values(f"{_EXTENSION}:SCALE", 3)
+    scales = values(f"{EXTENSION}:SCALE", 3)
     if (scales < 0).any():
         raise DataError(
-            f"'{path}' has negative scales: an early draft of {_EXTENSION} had logarithms there, which cannot be told "
-            "from damage: export it anew"
+            f"'{asset.path}' has negative scales: an early draft of {EXTENSION} had logarithms there, which cannot be "
+            "told from damage: export it anew"
         )
-    opacities = values(f"{_EXTENSION}:OPACITY", 1)[:, 0]
+    opacities = values(f"{EXTENSION}:OPACITY", 1)[:, 0]
     if not ((opacities >= 0) & (opacities <= 1) | np.isnan(opacities)).all():
         raise asset.damaged("there are opacities that are not between 0 and 1")
-    rotations = values(f"{_EXTENSION}:ROTATION", 4)
+    rotations = values(f"{EXTENSION}:ROTATION", 4)
     return Scene(values("POSITION", 3), log_of_scales(scales), rotations[:, [3, 0, 1, 2]], _logits(opacities), sh)
 
 
@@ -292,17 +268,17 @@ def _logits(opacities: FloatArray) -> FloatArray:
     )
 
 
-def _placed(path: str | os.PathLike[str], scene: Scene, matrix: Matrix) -> Scene:
+def _placed(asset: Asset, scene: Scene, matrix: Matrix) -> Scene:
     """Splats in the axes of the scene."""
     if np.array_equal(matrix, np.eye(4)):
         return scene
     linear = matrix[:3, :3]
     lengths = np.linalg.norm(linear, axis=0)
     if not np.isfinite(matrix).all() or not (lengths > 0).all():
-        raise DataError(f"'{path}' is damaged: a node's transform is invalid")
+        raise DataError(f"'{asset.path}' is damaged: a node's transform is invalid")
     rotation = linear / lengths
     if np.abs(rotation.T @ rotation - np.eye(3)).max() > _ROUNDING or np.linalg.det(rotation) < 0:
-        raise DataError(f"'{path}' has splats in a node that is sheared or mirrored, which splats cannot be")
+        raise DataError(f"'{asset.path}' has splats in a node that is sheared or mirrored, which splats cannot be")
     scene = dataclasses.replace(
         scene, means=(scene.means.astype(np.float64) @ linear.T + matrix[:3, 3]).astype(np.float32)
     )

@@ -1,7 +1,15 @@
-"""A glTF 2.0 asset (:class:`Asset`), .glb or .gltf: its description, its buffers, its accessors as float32.
+"""A glTF 2.0 asset: read (:class:`Asset`), .glb or .gltf, and written with KHR_gaussian_splatting (:func:`binary`,
+:func:`text`).
 
-Nothing is trusted: an accessor is only looked into once it lies within its view, the view within its buffer, and the
-buffer within its file.
+Of what is read nothing is trusted: an accessor is only looked into once it lies within its view, the view within its
+buffer, and the buffer within its file.
+
+A .glb holds its splats as SPZ, in the extension that CesiumJS reads. A .gltf has what the ratified specification has:
+attributes in float32, for SH coefficients, most of the bytes, may be nothing else. Nothing is turned: both have the
+scene's axes.
+
+Specifications: github.com/KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian_splatting (ratified), and pull request
+2531, KHR_gaussian_splatting_compression_spz_2.
 """
 
 from __future__ import annotations
@@ -12,6 +20,7 @@ import json
 import os
 import struct
 import urllib.parse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,21 +28,26 @@ import numpy as np
 
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.scenes.scene_files import opened, related, shown
-from potr_cl.model.scene import FloatArray
+from potr_cl.model.scene import FloatArray, Scene
 
+EXTENSION = "KHR_gaussian_splatting"
+SPZ_EXTENSION = f"{EXTENSION}_compression_spz_2"
+#: Colours as screens have them, and linear ones; the mode of points.
+SRGB, LINEAR, POINTS = "srgb_rec709_display", "lin_rec709_display", 0
 _MAGIC = b"glTF"
 _HEADER = struct.Struct("<4sII")
 _CHUNK = struct.Struct("<I4s")
 _JSON, _BINARY = b"JSON", b"BIN\0"
 #: Beyond what scenes need: an index that is larger is damage.
 _MOST = 2**31
+_BYTE, _FLOAT = 5121, 5126
 #: Numbers by their codes, and what a normalised one is divided by.
 _COMPONENTS: dict[int, tuple[str, float]] = {
     5120: ("i1", 127.0),
-    5121: ("u1", 255.0),
+    _BYTE: ("u1", 255.0),
     5122: ("<i2", 32767.0),
     5123: ("<u2", 65535.0),
-    5126: ("<f4", 0.0),
+    _FLOAT: ("<f4", 0.0),
 }
 _PARTS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
@@ -45,6 +59,7 @@ class Asset:
         path: of the file. The buffers of a .gltf may be in files beside it.
 
     Attributes:
+        path: as given.
         description: the JSON object.
         size: bytes of the file and of all the files that were read for it.
 
@@ -54,7 +69,7 @@ class Asset:
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        self._path = path
+        self.path = path
         self._buffers: dict[int, memoryview] = {}
         self._files: dict[Path, memoryview] = {}
         with opened(path) as (file, self.size):
@@ -81,7 +96,7 @@ class Asset:
             raise self.damaged("its buffers are no list")
         uris = [self.entry("buffers", number).get("uri") for number in range(len(buffers))]
         beside = [self._where(uri) for uri in uris if isinstance(uri, str) and not uri.startswith("data:")]
-        return list(dict.fromkeys([Path(self._path), *beside]))
+        return list(dict.fromkeys([Path(self.path), *beside]))
 
     def entry(self, kind: str, index: Any) -> dict[str, Any]:
         """One of the objects of a list of the description.
@@ -131,7 +146,7 @@ class Asset:
         packed = [name for name in view.get("extensions", {}) if "compression" in name]
         if packed:
             raise DataError(
-                f"'{self._path}' is packed with {shown(packed[0])}, which cannot be read: export it uncompressed"
+                f"'{self.path}' is packed with {shown(packed[0])}, which cannot be read: export it uncompressed"
             )
         content = self._view(view)
         count, offset = self.whole(entry, "count", least=1), self.whole(entry, "byteOffset", 0)
@@ -165,7 +180,7 @@ class Asset:
 
     def damaged(self, what: str) -> DataError:
         """The error for a file that breaks the format's rules."""
-        return DataError(f"'{self._path}' is damaged: {what}")
+        return DataError(f"'{self.path}' is damaged: {what}")
 
     def _chunks(self, content: bytes) -> tuple[memoryview, memoryview | None]:
         """The description, and the buffer that a .glb has in itself."""
@@ -173,7 +188,7 @@ class Asset:
             raise self.damaged("it is truncated")
         _, version, length = _HEADER.unpack_from(content)
         if version != 2:
-            raise DataError(f"'{self._path}' is a GLB file of version {version}, only 2 can be read")
+            raise DataError(f"'{self.path}' is a GLB file of version {version}, only 2 can be read")
         if length > len(content):
             raise self.damaged(f"it is truncated: its header tells of {length} bytes, it has {len(content)}")
         whole, at = memoryview(content), _HEADER.size
@@ -228,8 +243,8 @@ class Asset:
 
     def _where(self, uri: str) -> Path:
         if "://" in uri:
-            raise UsageError(f"'{self._path}' has a buffer elsewhere, {shown(uri)}: download it, and name it there")
-        return related(Path(self._path), urllib.parse.unquote(uri))
+            raise UsageError(f"'{self.path}' has a buffer elsewhere, {shown(uri)}: download it, and name it there")
+        return related(Path(self.path), urllib.parse.unquote(uri))
 
     def _beside(self, uri: str) -> memoryview:
         file = self._where(uri)
@@ -238,3 +253,116 @@ class Asset:
                 self._files[file] = memoryview(stream.read())
             self.size += size
         return self._files[file]
+
+
+#: The largest float32 below 1: an opacity of 1 has no logit.
+_LARGEST_OPACITY = np.float32(1 - 2.0**-24)
+
+
+def attributes(scene: Scene) -> dict[str, FloatArray]:
+    """The values of a file by the names of its attributes.
+
+    Scales are standard deviations, opacities follow the sigmoid, unit quaternions have w last.
+    """
+    lengths = np.linalg.norm(scene.quaternions.astype(np.float64), axis=1, keepdims=True)
+    with np.errstate(over="ignore"):
+        opacities = 1 / (1 + np.exp(-scene.opacity_logits.astype(np.float64)))
+        scales = np.exp(scene.log_scales.astype(np.float64))
+    values = {
+        "POSITION": scene.means,
+        f"{EXTENSION}:ROTATION": (scene.quaternions / lengths)[:, [1, 2, 3, 0]],
+        f"{EXTENSION}:SCALE": np.minimum(scales, np.finfo(np.float32).max),
+        f"{EXTENSION}:OPACITY": np.minimum(opacities, _LARGEST_OPACITY),
+    }
+    for degree in range(scene.sh_degree + 1):
+        for n in range(2 * degree + 1):
+            values[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{n}"] = scene.sh[:, degree * degree + n]
+    return {name: np.ascontiguousarray(value, "<f4") for name, value in values.items()}
+
+
+def text(scene: Scene) -> bytes:
+    """A .gltf file: text, with the values in Base64."""
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+    parts: list[bytes] = []
+    places: dict[str, int] = {}
+    start = 0
+    for name, values in attributes(scene).items():
+        data = values.tobytes()
+        accessor = _accessor(scene, name, values.shape[1] if values.ndim > 1 else 1)
+        places[name] = len(accessors)
+        accessors.append({"bufferView": len(views), **accessor})
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": len(data)})
+        parts.append(data)
+        start += len(data)
+    encoded = base64.b64encode(b"".join(parts)).decode("ascii")
+    buffer = {"byteLength": start, "uri": f"data:application/octet-stream;base64,{encoded}"}
+    return _description(places, accessors, views, buffer)
+
+
+def binary(scene: Scene, spz: Sequence[bytes]) -> list[bytes]:
+    """The bytes of a .glb file, to be written one after another.
+
+    Args:
+        scene: whose number of splats, SH degree and extent the file tells.
+        spz: the same as SPZ of version 2 or 3, in pieces.
+    """
+    # As CesiumJS asks for them: opacity is a part of the colour, which stands for the constant coefficients.
+    names = {"POSITION": 3, "COLOR_0": 4, f"{EXTENSION}:ROTATION": 4, f"{EXTENSION}:SCALE": 3}
+    for degree in range(1, scene.sh_degree + 1):
+        names |= {f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{n}": 3 for n in range(2 * degree + 1)}
+    accessors = [_accessor(scene, name, parts) for name, parts in names.items()]
+    nbytes = sum(map(len, spz))
+    views = [{"buffer": 0, "byteOffset": 0, "byteLength": nbytes}]
+    places = {name: number for number, name in enumerate(names)}
+    said = _description(places, accessors, views, {"byteLength": nbytes}, {SPZ_EXTENSION: {"bufferView": 0}})
+    said += b" " * (-len(said) % 4)
+    padding = b"\0" * (-nbytes % 4)
+    chunk = nbytes + len(padding)
+    length = _HEADER.size + _CHUNK.size + len(said) + _CHUNK.size + chunk
+    head = _HEADER.pack(_MAGIC, 2, length) + _CHUNK.pack(len(said), _JSON)
+    return [head, said, _CHUNK.pack(chunk, _BINARY), *spz, padding]
+
+
+def _accessor(scene: Scene, name: str, parts: int) -> dict[str, Any]:
+    accessor: dict[str, Any] = {
+        "componentType": _FLOAT,
+        "count": len(scene),
+        "type": next(kind for kind, each in _PARTS.items() if each == parts),
+    }
+    if name == "POSITION":
+        accessor |= {"min": scene.means.min(axis=0).tolist(), "max": scene.means.max(axis=0).tolist()}
+    if name == "COLOR_0":
+        accessor |= {"componentType": _BYTE, "normalized": True}
+    return accessor
+
+
+def _description(
+    places: dict[str, int],
+    accessors: list[dict[str, Any]],
+    views: list[dict[str, Any]],
+    buffer: dict[str, Any],
+    packed: dict[str, Any] | None = None,
+) -> bytes:
+    kind: dict[str, Any] = {
+        "kernel": "ellipse",
+        "colorSpace": SRGB,
+        "projection": "perspective",
+        "sortingMethod": "cameraDistance",
+    }
+    description: dict[str, Any] = {"asset": {"version": "2.0", "generator": "potr_cl"}, "extensionsUsed": [EXTENSION]}
+    if packed is not None:
+        kind["extensions"] = packed
+        description["extensionsUsed"] += packed
+        description["extensionsRequired"] = description["extensionsUsed"]
+    primitive = {"attributes": places, "mode": POINTS, "extensions": {EXTENSION: kind}}
+    description |= {
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "buffers": [buffer],
+        "bufferViews": views,
+        "accessors": accessors,
+    }
+    return json.dumps(description, separators=(",", ":")).encode()

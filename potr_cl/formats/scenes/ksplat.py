@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes.scene_files import cleaned, log_of_scales, logits, opened, unfilled
+from potr_cl.formats.scenes.scene_files import byte_logits, cleaned, log_of_scales, opened, unfilled
 from potr_cl.formats.scenes.splat import colours
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
 
@@ -57,16 +57,7 @@ class _Section:
 
 
 def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
-    """Read a scene from a .ksplat file.
-
-    Args:
-        path: of the file.
-        trust: of no meaning here: nothing in the file expands.
-
-    Raises:
-        UsageError: there is no such file.
-        DataError: it is damaged, or of an unknown version or compression level.
-    """
+    """The scene of a .ksplat file; see :class:`potr_cl.formats.declaration.SceneLoader`."""
     with opened(path) as (file, _):
         return cleaned(path, _read(path, file.read()))
 
@@ -104,7 +95,7 @@ def _read(path: str | os.PathLike[str], data: bytes) -> Scene:
         scene.means[block] = rows["mean"] if level == 0 else _centres(path, data, section, rows["mean"])
         scene.log_scales[block] = log_of_scales(rows["scale"].astype(np.float32))
         scene.quaternions[block] = rows["rotation"]
-        scene.opacity_logits[block] = logits(_BYTE.astype(np.float32) / np.float32(255)).take(rows["colour"][:, 3])
+        scene.opacity_logits[block] = byte_logits().take(rows["colour"][:, 3])
         scene.sh[block, 0] = colours(rows["colour"][:, :3])
         _fill_rest(scene.sh[block], rows["rest"], section.degree, bounds)
         start = block.stop

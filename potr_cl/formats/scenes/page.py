@@ -20,7 +20,7 @@ from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.host.atomic_write import replacing
+from potr_cl.host.atomic_write import write_pieces
 from potr_cl.model.scene import Scene
 from potr_cl.plain_text import plain
 
@@ -118,9 +118,7 @@ def save(
         if not len(clean):
             raise DataError("the scene has no splats")
         potr = b"".join(code_scene(clean, HyperParameters.from_quality(_QUALITY, "best")).pieces)
-    with replacing(path) as file:
-        for piece in page_around(potr, len(scene), title, author):
-            file.write(piece)
+    write_pieces(path, page_around(potr, len(scene), title, author))
 
 
 def _potr_of(source: Path) -> bytes | None:

@@ -17,12 +17,11 @@ from plyfile import PlyData, PlyElement, PlyListProperty
 
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes.filter_3d import FILTER_3D, folded
-from potr_cl.formats.scenes.ply_comments import ANTIALIASED_COMMENT, marked
+from potr_cl.formats.scenes.ply_antialiasing import ANTIALIASED_COMMENT, FILTER_3D, folded, marked
 from potr_cl.formats.scenes.ply_rows import Target, read_rows
 from potr_cl.formats.scenes.scene_files import NO_EXTENT, cleaned, unfilled
-from potr_cl.host.atomic_write import replacing
-from potr_cl.host.unchanged import unchanged
+from potr_cl.host.atomic_write import write_pieces
+from potr_cl.host.inputs import unchanged
 from potr_cl.model.scene import MIP_SPLATTING_LOW_PASS, SH_COEFFICIENTS, Scene
 
 _log = logging.getLogger("potr_cl")
@@ -55,25 +54,14 @@ class _Header:
 
 
 def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
-    """Read a trained scene from a PLY file.
+    """A trained scene from a PLY file; see :class:`potr_cl.formats.declaration.SceneLoader`.
 
     Accepted are binary files of either byte order and ASCII ones, properties in any order and of any numeric type,
     with or without normals, SH degree 0 to 3 with ``f_rest_*`` channel after channel; of degree 4, the coefficients of
     degree 4 are dropped. Splats with two scales (2DGS) are flat along their third axis. Comments tell whether the scene
-    is antialiased (:mod:`potr_cl.formats.scenes.ply_comments`), or the property ``filter_3D``, which is folded into
-    scales and opacities (:mod:`potr_cl.formats.scenes.filter_3d`). Further properties and elements are dropped. What
-    had to be dropped or mended is reported once to the logger "potr_cl".
-
-    Args:
-        path: of the PLY file.
-        trust: of no meaning here: nothing in a PLY file expands.
-
-    Returns:
-        The scene, finite throughout, every array contiguous.
-
-    Raises:
-        UsageError: there is no such file, or it cannot be opened.
-        DataError: it is no PLY file, is truncated, holds no splats, or was changed meanwhile.
+    is antialiased, or the property ``filter_3D``, which is folded into scales and opacities
+    (:mod:`potr_cl.formats.scenes.ply_antialiasing`). Further properties and elements are dropped. What
+    had to be dropped or mended is reported once to the logger "potr_cl". Every array of the scene is contiguous.
     """
     try:
         # Unbuffered: the blocks are as large as a buffer should be.
@@ -99,20 +87,10 @@ def save(path: str | os.PathLike[str], scene: Scene) -> None:
 
     Binary little-endian float32: x y z, nx ny nz (zero), f_dc_*, f_rest_* (all red, all green, all blue), opacity,
     scale_*, rot_*. The header of an antialiased scene says so in a comment, as Brush's does; one with Mip-Splatting's
-    low-pass filter also has the property filter_3D, which is 0, as nothing is left to be folded in. The file appears
-    under its name only when it is whole.
-
-    Args:
-        path: of the file to write.
-        scene: of any SH degree; its arrays may have any strides.
-
-    Raises:
-        UsageError: ``path`` cannot be written to.
-        PotrError: the system failed to write.
+    low-pass filter also has the property filter_3D, which is 0, as nothing is left to be folded in. See
+    :class:`potr_cl.formats.declaration.SceneSaver`.
     """
-    with replacing(path) as file:
-        for piece in pieces(scene):
-            file.write(piece)
+    write_pieces(path, pieces(scene))
 
 
 def pieces(scene: Scene) -> Iterator[bytes | memoryview]:
@@ -132,9 +110,7 @@ def save_parts(path: str | os.PathLike[str], parts: Iterable[Scene], splats: int
         As :func:`save`.
         DataError: the parts do not belong together, or hold another number of splats.
     """
-    with replacing(path) as file:
-        for piece in pieces_of_parts(parts, splats):
-            file.write(piece)
+    write_pieces(path, pieces_of_parts(parts, splats))
 
 
 def pieces_of_parts(parts: Iterable[Scene], splats: int) -> Iterator[bytes | memoryview]:

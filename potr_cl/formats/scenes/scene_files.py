@@ -1,10 +1,13 @@
-"""What the scene formats have in common: opening files, a library's errors as ours, clean scenes, order for writing."""
+"""What the scene formats have in common: opening files, levels of detail in paths, a library's errors as ours, clean
+scenes, order for writing.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import logging
 import os
+import re
 import stat
 from collections.abc import Iterator
 from contextvars import ContextVar
@@ -13,13 +16,13 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from potr_cl.codec import octree
 from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.errors import DataError, PotrError, UsageError
-from potr_cl.formats.lfs_pointer import refuse_lfs_pointer
 from potr_cl.host import mapped
-from potr_cl.host.unchanged import unchanged
+from potr_cl.host.inputs import check_claim, refuse_lfs_pointer, unchanged
 from potr_cl.model.scene import LOW_PASS, CleanReport, FloatArray, Scene
 
 #: Where somebody wants to know what was mended in files that are read.
@@ -35,11 +38,11 @@ _LONGEST_SAID = 60
 #: Logarithm of a standard deviation that no picture shows, for splats that are flat.
 NO_EXTENT = np.float32(np.log(1e-9))
 #: As other tools read an opacity of 0 or 1 that a byte holds.
-LEAST_OPACITY = np.float32(1e-6)
+_LEAST_OPACITY = np.float32(1e-6)
 #: The SH basis function of degree 0: of formats that hold colours.
 SH_0 = 0.28209479177387814
 #: In formats of other tools a splat takes several bytes; of more than this a byte no scene is made.
-MOST_A_BYTE = 1
+_MOST_A_BYTE = 1
 
 
 @contextlib.contextmanager
@@ -152,10 +155,42 @@ def joined(scenes: list[Scene]) -> Scene:
     )
 
 
-def logits(opacities: FloatArray) -> FloatArray:
-    """Logits of opacities from bytes, (N,); 0 and 1 become what eight bits cannot tell from them."""
-    inside = np.clip(opacities, LEAST_OPACITY, np.float32(1) - LEAST_OPACITY)
-    return natural_logarithm(inside / (np.float32(1) - inside))
+def check_splats(path: str | os.PathLike[str], splats: int, nbytes: int, trust: bool) -> None:
+    """Refuse so many splats in files of so many bytes, as :func:`potr_cl.host.inputs.check_claim` does.
+
+    Raises:
+        DataError: they are beyond belief, and the user does not vouch for the file.
+    """
+    try:
+        check_claim(splats, nbytes, _MOST_A_BYTE, trust)
+    except DataError as error:
+        raise DataError(f"'{path}': {error}") from None
+
+
+def byte_logits() -> FloatArray:
+    """(256,) float32, the logit of each byte's opacity; those of 0 and 1 are what eight bits cannot tell from them."""
+    opacities = np.clip(np.arange(256).astype(np.float32) / np.float32(255), _LEAST_OPACITY, 1 - _LEAST_OPACITY)
+    return natural_logarithm(opacities / (np.float32(1) - opacities))
+
+
+#: The parts of w, x, y, z that are stored where the largest is not, by its number.
+OTHER_PARTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+
+
+def with_largest(largest: NDArray[np.intp], others: NDArray[np.floating], places: NDArray[np.intp]) -> FloatArray:
+    """(n, 4) float32 unit quaternions of which three parts are known.
+
+    Args:
+        largest: (n,) which part is not: the largest.
+        others: (n, 3) the three, in the precision to compute with.
+        places: (4, 3) where these belong, for each number of the largest.
+    """
+    quaternions = np.empty((len(others), 4), np.float32)
+    np.put_along_axis(quaternions, places[largest], others.astype(np.float32, copy=False), axis=1)
+    squares = others * others
+    rest = np.sqrt(np.maximum(1 - (squares[:, 0] + squares[:, 1] + squares[:, 2]), 0))
+    np.put_along_axis(quaternions, largest[:, None], rest.astype(np.float32, copy=False)[:, None], axis=1)
+    return quaternions
 
 
 def log_of_scales(scales: FloatArray) -> FloatArray:
@@ -236,3 +271,21 @@ def first_line(error: BaseException) -> str:
     """What a library says of an error, for a message of one line."""
     lines = str(error).strip().splitlines()
     return lines[0][:200] if lines else type(error).__name__
+
+
+#: A path's last part, and the level behind it.
+_NAMED = re.compile(r"(.+)#(\d{1,6})", re.DOTALL)
+
+
+def path_and_level(path: str | os.PathLike[str]) -> tuple[Path, int | None]:
+    """A path without its level, and the level, None where it names none: also where such a file exists."""
+    given = Path(path)
+    named = _NAMED.fullmatch(given.name)
+    if named is None or os.path.lexists(given):
+        return given, None
+    return given.with_name(named[1]), int(named[2])
+
+
+def without_level(path: str | os.PathLike[str]) -> Path:
+    """A path without the level behind it."""
+    return path_and_level(path)[0]

@@ -19,7 +19,8 @@ import numpy as np
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes.scene_files import (
-    MOST_A_BYTE,
+    byte_logits,
+    check_splats,
     cleaned,
     file_in_folder,
     opened,
@@ -39,10 +40,15 @@ from potr_cl.formats.scenes.sog_images import (
     bundle,
     write_folder,
 )
-from potr_cl.formats.scenes.sog_palette import areas, palette_of
-from potr_cl.formats.scenes.sog_steps import in_order, opacity_logits, quantised, unpacked_means, unpacked_rotations
+from potr_cl.formats.scenes.sog_values import (
+    areas,
+    in_order,
+    palette_of,
+    quantised,
+    unpacked_means,
+    unpacked_rotations,
+)
 from potr_cl.host.atomic_write import replacing
-from potr_cl.model.claims import check_claim
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
 
 #: What is packed in a SOG file is compressed already; only its description shrinks.
@@ -54,15 +60,9 @@ _BLOCK = 1 << 16
 
 
 def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
-    """Read a scene from a SOG file or folder.
+    """The scene of a .sog, of the file meta.json in a folder, or of that folder.
 
-    Args:
-        path: of the .sog, or of the file meta.json in a folder, or of that folder.
-        trust: whether it may hold more splats a byte than a real scene has, and so take memory out of proportion.
-
-    Raises:
-        UsageError: there is no such file.
-        DataError: it is damaged, of another version, or holds too many splats for its size.
+    See :class:`potr_cl.formats.declaration.SceneLoader`.
     """
     folder = file_in_folder(path, DESCRIPTION)
     if folder is not None:
@@ -83,13 +83,10 @@ def save(path: str | os.PathLike[str], scene: Scene) -> None:
 
     Args:
         path: of the .sog, or of the file meta.json in a folder that exists.
-        scene: of any SH degree.
+        scene: as of :class:`potr_cl.formats.declaration.SceneSaver`, which tells what is raised; and:
 
     Raises:
-        UsageError: ``path`` cannot be written to.
-        DataError: the format cannot hold so many splats.
         DeviceError: no device finds the palette.
-        PotrError: the system failed to write.
     """
     tell_of_low_pass(path, scene)
     scene = in_order(unit_quaternions(scene))
@@ -226,10 +223,7 @@ class Sog:
         self.count = _whole(meta["count"])
         if not 0 < self.count < 2**31:
             raise self._damaged(f"a count of {_said(meta['count'])} splats")
-        try:
-            check_claim(self.count, size, MOST_A_BYTE, trust)
-        except DataError as error:
-            raise DataError(f"'{path}': {error}") from None
+        check_splats(path, self.count, size, trust)
 
     def scene(self) -> Scene:
         """The values of all pixels, block by block, an image after another."""
@@ -252,7 +246,7 @@ class Sog:
             scene.log_scales[block] = book.take(scales[block, :3])
         del quaternions, scales
         colours, book = self._pixels("sh0", 0), self._codebook("sh0")
-        logits = opacity_logits()
+        logits = byte_logits()
         for block in self._blocks():
             scene.sh[block, 0] = book.take(colours[block, :3])
             scene.opacity_logits[block] = logits.take(colours[block, 3])

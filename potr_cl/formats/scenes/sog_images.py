@@ -31,8 +31,6 @@ ANTIALIASED = "antialiased"
 CODEBOOK, PALETTE, PALETTE_COLUMNS = 256, 1 << 16, 64
 #: The alpha of a quaternion's pixel: this and the number of its largest part, of w, x, y, z.
 FIRST_TAG = 252
-#: The parts that are stored, by the number of the largest.
-OTHER_PARTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 #: Width and height that a WebP image can have.
 _LARGEST_SIDE = 16383

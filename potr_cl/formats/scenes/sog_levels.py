@@ -16,20 +16,19 @@ import numpy as np
 
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.levels import path_and_level
 from potr_cl.formats.scenes import sog
 from potr_cl.formats.scenes.scene_files import (
-    MOST_A_BYTE,
+    check_splats,
     cleaned,
     file_in_folder,
     joined,
     opened,
+    path_and_level,
     reading,
     related,
     shown,
 )
 from potr_cl.formats.scenes.sog import Folder, Sog
-from potr_cl.model.claims import check_claim
 from potr_cl.model.scene import Scene
 
 _log = logging.getLogger("potr_cl")
@@ -46,11 +45,10 @@ def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
     Args:
         path: of the file lod-meta.json or the folder that it is in, with "#" and the number of a level behind it; the
             finest, 0, if none is given.
-        trust: whether it may hold more splats a byte than a real scene has, and so take memory out of proportion.
+        trust: as of :class:`potr_cl.formats.declaration.SceneLoader`, which tells what is raised; and:
 
     Raises:
-        UsageError: a file is missing, or there is no such level.
-        DataError: a file is damaged, or holds too many splats for its size.
+        UsageError: there is no such level.
     """
     given, level = path_and_level(path)
     description = file_in_folder(given, DESCRIPTION) or given
@@ -69,10 +67,7 @@ def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
     for folder, where, _ in folders:
         with reading(where):
             sogs.append(Sog(where, folder.description(), folder.stored, folder.size, True))
-    try:
-        check_claim(sum(sog.count for sog in sogs), total, MOST_A_BYTE, trust)
-    except DataError as error:
-        raise DataError(f"'{path}': {error}") from None
+    check_splats(path, sum(sog.count for sog in sogs), total, trust)
     scenes = [_part(file, sog, parts) for sog, (_, file, parts) in zip(sogs, folders, strict=True)]
     if meta.levels > 1 and level is None:
         _log.warning(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes.scene_files import SH_0, cleaned, log_of_scales, logits, opened, unfilled
+from potr_cl.formats.scenes.scene_files import SH_0, byte_logits, cleaned, log_of_scales, opened, unfilled
 from potr_cl.model.scene import FloatArray, Scene
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4), ("rotation", "u1", 4)])
@@ -23,16 +23,7 @@ _BLOCK = 1 << 16
 
 
 def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
-    """Read a scene of SH degree 0 from a .splat file.
-
-    Args:
-        path: of the file.
-        trust: of no meaning here: nothing in the file expands.
-
-    Raises:
-        UsageError: there is no such file.
-        DataError: it is empty, or not a whole number of splats long.
-    """
+    """The scene of a .splat file, of SH degree 0; see :class:`potr_cl.formats.declaration.SceneLoader`."""
     with opened(path) as (file, size):
         count, left = divmod(size, _ROW.itemsize)
         if left or not count:
@@ -50,7 +41,7 @@ def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
             scene.means[block] = rows["mean"]
             scene.log_scales[block] = log_of_scales(rows["scale"])
             scene.quaternions[block] = _unit(rows["rotation"])
-            scene.opacity_logits[block] = logits(_BYTE / np.float32(255)).take(rows["colour"][:, 3])
+            scene.opacity_logits[block] = byte_logits().take(rows["colour"][:, 3])
             scene.sh[block, 0] = colours(rows["colour"][:, :3])
     return cleaned(path, scene)
 

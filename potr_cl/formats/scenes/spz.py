@@ -19,11 +19,10 @@ import zstandard
 
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes.scene_files import MOST_A_BYTE, arranged, cleaned, opened, tell_of_low_pass
+from potr_cl.formats.scenes.scene_files import arranged, check_splats, cleaned, opened, tell_of_low_pass
 from potr_cl.formats.scenes.spz_values import HALF_FLOATS, MOST_FRACTIONAL_BITS, POSITION_LIMIT, packed, unpacked
-from potr_cl.host.atomic_write import replacing
+from potr_cl.host.atomic_write import write_pieces
 from potr_cl.host.threads import thread_pool
-from potr_cl.model.claims import check_claim
 from potr_cl.model.scene import SH_COEFFICIENTS, Scene
 
 _log = logging.getLogger("potr_cl")
@@ -88,20 +87,9 @@ class _Header:
 
 
 def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
-    """Read a scene from an SPZ file of version 1 to 4; versions 1 to 3 may be gzipped or not.
+    """A scene in an SPZ file of version 1 to 4, in its axes; see :class:`potr_cl.formats.declaration.SceneLoader`.
 
-    Of SH degree 4, the coefficients of degree 4 are dropped.
-
-    Args:
-        path: of the file.
-        trust: whether it may hold more splats a byte than a real scene has, and so take memory out of proportion.
-
-    Returns:
-        The scene, finite throughout, in the axes of the file.
-
-    Raises:
-        UsageError: there is no such file.
-        DataError: it is damaged, no SPZ file, or holds too many splats for its size.
+    Versions 1 to 3 may be gzipped or not. Of SH degree 4, the coefficients of degree 4 are dropped.
     """
     with opened(path) as (file, size):
         return cleaned(path, read(path, file, size, trust))
@@ -134,25 +122,16 @@ def read(path: str | os.PathLike[str], file: BinaryIO, size: int, trust: bool) -
 
 
 def save(path: str | os.PathLike[str], scene: Scene, version: int = _VERSIONS[0]) -> None:
-    """Write a scene as SPZ; the file appears under its name only when it is whole.
+    """Write a scene as SPZ; see :class:`potr_cl.formats.declaration.SceneSaver`.
 
     Positions are stored in steps of 1/4096 unit, as every tool writes them; in a scene too large for that, coarser.
 
     Args:
-        path: of the file.
-        scene: of any SH degree.
+        path, scene: as of a SceneSaver.
         version: 2, rotations in 8 bits a part; 3, rotations in 10 bits; 4, the same content packed by zstd instead of
             gzip. docs/formats.md has a table of the readers that take them.
-
-    Raises:
-        UsageError: ``path`` cannot be written to.
-        DataError: a position is too large for SPZ.
-        PotrError: the system failed to write.
     """
-    content = content_of(path, scene, version)
-    with replacing(path) as file:
-        for piece in content:
-            file.write(piece)
+    write_pieces(path, content_of(path, scene, version))
 
 
 def content_of(path: str | os.PathLike[str], scene: Scene, version: int = _VERSIONS[0]) -> list[bytes]:
@@ -271,10 +250,7 @@ def _header(path: str | os.PathLike[str], start: bytes, versions: range, size: i
         raise DataError(f"'{path}' has no splats")
     if version != HALF_FLOATS and not 1 <= bits <= MOST_FRACTIONAL_BITS:
         raise DataError(f"'{path}' is damaged: positions with {bits} fractional bits")
-    try:
-        check_claim(splats, size, MOST_A_BYTE, trust)
-    except DataError as error:
-        raise DataError(f"'{path}': {error}") from None
+    check_splats(path, splats, size, trust)
     return _Header(version, splats, degree, bits, flags, streams)
 
 

@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.codec.quantize import canonical_rotations
-from potr_cl.formats.scenes.scene_files import unfilled
+from potr_cl.formats.scenes.scene_files import byte_logits, unfilled, with_largest
 from potr_cl.model.scene import FloatArray, Scene
 
 #: The version whose positions are half floats.
@@ -49,10 +48,7 @@ def unpacked(
         np.frombuffer(part, np.uint8).reshape(count, -1) for part in properties
     )
     scene = unfilled(count, coefficients)
-    byte = np.arange(256).astype(np.float32)
-    least = np.float32(1e-6)
-    opacity = np.clip(byte / np.float32(255), least, np.float32(1) - least)
-    logits = natural_logarithm(opacity / (np.float32(1) - opacity))
+    byte, logits = np.arange(256).astype(np.float32), byte_logits()
     dc = (byte / np.float32(255) - np.float32(0.5)) / np.float32(_COLOUR_SCALE)
     for start in range(0, count, _BLOCK):
         block = slice(start, start + _BLOCK)
@@ -85,12 +81,7 @@ def _smallest_three(stored: U8) -> FloatArray:
     magnitudes = np.float32(np.sqrt(0.5)) * ((part & _LARGEST_PART) / np.float32(_LARGEST_PART)).astype(np.float32)
     values = np.where(part > _LARGEST_PART, -magnitudes, magnitudes)
     others = np.stack([values.take((packed >> shift) & 1023) for shift in (0, 10, 20)], axis=1)
-    xyzw = np.empty((len(packed), 4), np.float32)
-    np.put_along_axis(xyzw, _STORED_PARTS[largest], others, axis=1)
-    squares = others * others
-    left = 1 - (squares[:, 0] + squares[:, 1] + squares[:, 2])
-    np.put_along_axis(xyzw, largest[:, None], np.sqrt(np.maximum(left, 0))[:, None], axis=1)
-    return xyzw[:, [3, 0, 1, 2]]
+    return with_largest(largest, others, _STORED_PARTS)[:, [3, 0, 1, 2]]
 
 
 def _xyz(stored: U8) -> FloatArray:

@@ -40,7 +40,7 @@ def views_where_few(views_of_parts: NDArray[np.int64]) -> float:
 
     Args:
         views_of_parts: (K,) how many training views show each part of the scene
-            (:meth:`potr_cl.model.placement.given_views.GivenViews.views_of_parts`), at least one.
+            (:meth:`potr_cl.model.given_views.GivenViews.views_of_parts`), at least one.
     """
     return float(np.quantile(views_of_parts, _PART))
 

@@ -13,6 +13,7 @@ import pyopencl as cl
 from potr_cl.errors import DeviceMemoryError
 from potr_cl.host import mapped
 from potr_cl.model.scene import FloatArray
+from potr_cl.opencl.ferry import Cargo, Ferry
 from potr_cl.opencl.memory import Memory, Owner, Scratch
 from potr_cl.stages.pruning.fixed_point import FixedPoint
 from potr_cl.stages.pruning.launcher import SetKernels, SweepBuffers, launcher_for
@@ -56,7 +57,7 @@ class StreamedSweep(Owner):
         #: Whether all have been measured, so that pictures are compared with.
         self._measured = False
         self._single = {number: group for group in engine.plan.groups for number in group.numbers}
-        self._memory = Memory(device)
+        self._memory, self._ferry = Memory(device), Ferry(device)
         self._scratch = [Scratch(device, what) for what in ("tiles", "staleness", "effects", "counters")]
         self._tiles, self._stale, self._unwanted, self._listed = self._scratch
         if engine.streamed:
@@ -113,13 +114,13 @@ class StreamedSweep(Owner):
                         with engine.prepared(numbers, subset, self._on_device.get(numbers)) as ready:
                             target, tiles = ready.work.target, ready.views.tiles
                             if numbers in self._on_host:
-                                device.copy(target, self._on_host[numbers])
+                                self._ferry.to_device(target, [Cargo(self._on_host[numbers])])
                             kernels = self._bound(ready, self._buffers(ready, ledger), not self._measured)
                             kernels.sweep(0, tiles)
                             device.finish()
                             if not self._measured and numbers not in self._on_device:
-                                kept = mapped.array((ready.views.pixels, 3), np.float32, "target pictures")
-                                device.copy(kept, target)
+                                kept = mapped.array((3 * ready.views.pixels,), np.float32, "target pictures")
+                                self._ferry.to_host([Cargo(kept)], target)
                                 self._on_host[numbers] = kept
                             self.tiles_swept += tiles
                     ledger.add_to(self.totals)
@@ -171,5 +172,5 @@ class StreamedSweep(Owner):
         return SweepBuffers(ledger.marks, *shared, totals, numbers)
 
     def close(self) -> None:
-        for owner in (*self._scratch, self._memory):
+        for owner in (*self._scratch, self._ferry, self._memory):
             owner.close()

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from potr_cl.host.threads import Run, in_background
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
-from potr_cl.model.splat_groups import SplatGroups
-from potr_cl.model.unseen import opacity_weighted_areas, unseen_splats
+from potr_cl.model.splat_groups import SplatGroups, opacity_weighted_areas, unseen_splats
 from potr_cl.raster.surely_seen import Seen
 from potr_cl.stages.pruning.schedule import Course, Pruned
 from potr_cl.stages.stage import State

@@ -16,8 +16,6 @@ from potr_cl.formats import load_scene, save_scene
 from potr_cl.formats.scenes import ply
 from potr_cl.formats.scenes.scene_files import joined
 from potr_cl.model.scene import LOW_PASS, MIP_SPLATTING_LOW_PASS, Scene
-from potr_cl.pipeline.encode import encode
-from potr_cl.pipeline.options import EncodeOptions
 from tests.cases.own_warnings import no_warnings
 from tests.cases.scenes import antialiased
 from tests.reference.scenes import random_scene
@@ -244,8 +242,6 @@ def test_scenes_that_are_joined(first, second, expected):
 @pytest.mark.parametrize("low_pass", [LOW_PASS, MIP_SPLATTING_LOW_PASS])
 @pytest.mark.parametrize("suffix", [".ply", ".spz", ".compressed.ply"])
 def test_what_is_written_keeps_the_mark(tmp_path, caplog, suffix, low_pass):
-    if suffix == ".compressed.ply":
-        pytest.importorskip("gsply", reason="the extra convert is not installed")
     path = tmp_path / f"a{suffix}"
     for scene in (antialiased(random_scene(300, 1), low_pass), random_scene(300, 1)):
         caplog.clear()
@@ -257,16 +253,6 @@ def test_what_is_written_keeps_the_mark(tmp_path, caplog, suffix, low_pass):
         else:  # which cannot say it
             assert back.low_pass == LOW_PASS
             assert ("cannot say" in caplog.text) == (scene.low_pass != LOW_PASS)
-
-
-@pytest.mark.parametrize("low_pass", [LOW_PASS, MIP_SPLATTING_LOW_PASS])
-def test_through_a_file_of_our_own(tmp_path, low_pass):
-    scene = antialiased(random_scene(300, 1), low_pass)
-    options = EncodeOptions.for_preset("best", prune=False, compact=False, refit=False)
-    (tmp_path / "a.potr").write_bytes(b"".join(encode(scene, None, options).pieces))
-    back = load_scene(tmp_path / "a.potr")
-    assert (back.antialiased, back.low_pass) == (True, low_pass)
-    assert load_scene(tmp_path / "a.potr", antialiased=False).antialiased is False
 
 
 def test_a_comment_does_not_hide_damage(tmp_path):

@@ -13,7 +13,7 @@ import pytest
 
 from potr_cl import DataError, Scene, UsageError
 from potr_cl.formats import load_scene, save_scene
-from potr_cl.model.claims import FREE_SPLATS
+from potr_cl.host.inputs import FREE_SPLATS
 from tests.cases.gltf import PREFIX, Attributes, attributes, described, glb, gltf
 from tests.reference.raster import rotation_matrices, sh_basis
 from tests.reference.scenes import random_scene

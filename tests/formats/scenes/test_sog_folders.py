@@ -13,7 +13,7 @@ import pytest
 from potr_cl import DataError, UsageError
 from potr_cl.formats import load_scene
 from potr_cl.formats.scenes import sog_levels
-from potr_cl.model.claims import FREE_SPLATS
+from potr_cl.host.inputs import FREE_SPLATS
 
 
 @pytest.fixture

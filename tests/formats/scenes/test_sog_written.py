@@ -13,8 +13,7 @@ from potr_cl import DataError, Scene, convert, load_scene
 from potr_cl.cli import main
 from potr_cl.formats.scenes import sog
 from potr_cl.formats.scenes.sog_images import members, write_folder
-from potr_cl.formats.scenes.sog_palette import distinct_rows, palette_of
-from potr_cl.formats.scenes.sog_steps import in_order, quantised
+from potr_cl.formats.scenes.sog_values import distinct_rows, in_order, palette_of, quantised
 from tests.cases.scenes import in_order_of, turned_by
 
 
@@ -164,7 +163,7 @@ def test_a_scene_with_another_low_pass_filter_is_told_of(tmp_path, plush_excerpt
 
 
 def test_another_reader_sees_the_same(tmp_path, plush_excerpt):
-    reader = pytest.importorskip("gsply", reason="the extra convert is not installed")
+    reader = pytest.importorskip("gsply")
     sog.save(tmp_path / "a.sog", plush_excerpt)
     ours, theirs = sog.load(tmp_path / "a.sog"), reader.sogread(tmp_path / "a.sog")
     assert np.allclose(theirs.means, ours.means, atol=1e-5)

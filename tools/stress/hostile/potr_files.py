@@ -17,8 +17,7 @@ from random import Random
 import numpy as np
 import zstandard
 
-from potr_cl.codec.blocks.geometry import GeometryOfBlocks, quantise
-from potr_cl.codec.blocks.splitting import blocks_of
+from potr_cl.codec.blocks import GeometryOfBlocks, blocks_of, quantise
 from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.encoder import Level, code_levels
 from potr_cl.codec.quantize import HyperParameters, Preset

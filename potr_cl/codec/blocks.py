@@ -1,4 +1,8 @@
-"""The quantised geometry of a scene in blocks: :class:`GeometryOfBlocks`, made by :func:`quantise`."""
+"""Scenes in blocks: cut into neighbours (:func:`blocks_of`), each quantised in an octree of its own (:func:`quantise`).
+
+So neither coding nor decoding takes memory for more than the blocks that are worked on, and a part of a scene is read
+without the rest.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +15,49 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import quantize
-from potr_cl.codec.blocks.splitting import MOST_A_BLOCK, MOST_WHOLE, blocks_of
 from potr_cl.codec.geometry import Geometry, distances_to_views, quantise_geometry, quantise_in_world_units, undecoded
 from potr_cl.codec.quantisers import QUANTISERS
 from potr_cl.codec.steps.fitting import fit_steps_of_blocks
 from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera
+from potr_cl.model.order import BITS, morton_codes
 from potr_cl.model.scene import FloatArray, Scene
+
+#: Scenes of no more splats are one block; others have blocks of so many at most. A block's own header, models and steps
+#: are a few kilobytes, and its octree begins anew: next to nothing for a million.
+MOST_WHOLE, MOST_A_BLOCK = 1 << 21, 1 << 20
+
+
+#: Of a Morton code of 63 bits, those by which most splats are told apart.
+_FIRST_BITS = 16
+
+
+def blocks_of(means: NDArray[np.float32], most_a_block: int = MOST_A_BLOCK, run: Run = map) -> list[NDArray[np.int64]]:
+    """The numbers of the splats of each block, ascending; blocks are ranges of the Morton order of the centres.
+
+    Args:
+        means: (N, 3) float32 centres, finite, N >= 1.
+        most_a_block: the most splats of a block.
+        run: in place of :func:`map`, to work with several threads.
+
+    Returns:
+        As few blocks as that allows, of about the same number of splats each.
+    """
+    n = len(means)
+    codes = morton_codes(means, run)
+    blocks = -(-n // most_a_block)
+    ends = np.array([n * (block + 1) // blocks for block in range(blocks)])
+    # Only where a block ends within those whose first bits are the same is their order needed.
+    cells = (codes >> np.uint64(3 * BITS - _FIRST_BITS)).astype(np.uint16)
+    behind = np.cumsum(np.bincount(cells, minlength=1 << _FIRST_BITS))
+    before = np.concatenate([[0], behind[:-1]])
+    blocks_of_cells = np.searchsorted(ends, before, side="right")
+    block_of = blocks_of_cells.astype(np.int32)[cells]
+    for cell in np.flatnonzero((np.searchsorted(ends, behind - 1, side="right") > blocks_of_cells) & (behind > before)):
+        members = np.flatnonzero(cells == cell)
+        members = members[np.argsort(codes[members], kind="stable")]
+        block_of[members] = np.searchsorted(ends, before[cell] + np.arange(len(members)), side="right")
+    return list(run(lambda block: np.flatnonzero(block_of == block), range(blocks)))
 
 
 @dataclass(frozen=True)
@@ -87,7 +127,7 @@ def quantise(
 
     Args:
         scene, parameters, views, run: as of :func:`potr_cl.codec.geometry.quantise_geometry`.
-        rows: of the blocks; None: as :func:`potr_cl.codec.blocks.splitting.blocks_of` has it, if there are more splats
+        rows: of the blocks; None: as :func:`potr_cl.codec.blocks.blocks_of` has it, if there are more splats
             than a block may have.
 
     Raises:

@@ -1,4 +1,6 @@
-"""A file that is read must not change meanwhile (:func:`unchanged`): a part of it would be older than another."""
+"""Checks of any file that is read: that nobody writes to it meanwhile (:func:`unchanged`), that it is no pointer of Git
+LFS (:func:`refuse_lfs_pointer`), and that it holds no more than its size lets believe (:func:`check_claim`).
+"""
 
 from __future__ import annotations
 
@@ -62,3 +64,52 @@ def refuse_changed(path: str | os.PathLike[str], before: State, after: State, er
         raise DataError(
             f"'{path}' was changed while it was read: wait until the program that writes it has finished"
         ) from error
+
+
+_START = b"version https://git-lfs.github.com/spec/"
+
+
+def is_lfs_pointer(start: bytes) -> bool:
+    """Whether a file that begins like this is a pointer of Git LFS."""
+    return start.startswith(_START)
+
+
+def refuse_lfs_pointer(path: str | os.PathLike[str]) -> None:
+    """Say what is to be done where a file is a pointer. A file that cannot be read is left to whoever reads it.
+
+    Raises:
+        DataError: it is one.
+    """
+    try:
+        if not os.path.isfile(path):
+            return
+        with open(path, "rb") as file:
+            start = file.read(len(_START))
+    except (OSError, ValueError):
+        return
+    if is_lfs_pointer(start):
+        raise DataError(f"'{path}' is a Git-LFS pointer, not the file itself: run 'git lfs pull' where it came from")
+
+
+#: Any file may hold so many: the memory that they take is nothing to worry about.
+FREE_SPLATS = 1 << 16
+
+
+def check_claim(number: int, file_bytes: int, most_a_byte: int, trust: bool, what: str = "splats") -> None:
+    """Refuse a number that no real scene would pack into so small a file.
+
+    Args:
+        number: that the file claims.
+        file_bytes: size of the file.
+        most_a_byte: the largest believable number in a byte of the format.
+        trust: whether the user vouches for the file, so that nothing is refused.
+        what: is counted, for the message.
+
+    Raises:
+        DataError: the claim is beyond belief.
+    """
+    if not trust and number > FREE_SPLATS + most_a_byte * file_bytes:
+        raise DataError(
+            f"{number} {what} in {file_bytes} bytes are more than a real scene packs into them, and could fill the "
+            "memory: if you know where the file comes from, read it with --trust (in Python: trust=True)"
+        )

@@ -1,10 +1,36 @@
-"""Points on the surfaces of a scene (:func:`points_on_splats`), which stand for what hides other things."""
+"""Points spread evenly in a cube, on a sphere and on a scene's surfaces, the same ones every time."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from potr_cl.model.placement.sampling import F64
+F64 = NDArray[np.float64]
+
+
+def low_discrepancy(count: int, dimensions: int) -> F64:
+    """(count, dimensions) evenly spread in the unit cube: the additive recurrence on the generalised golden ratio.
+
+    M. Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018.
+    """
+    ratio = 2.0
+    for _ in range(64):
+        ratio = (1 + ratio) ** (1 / (dimensions + 1))
+    return (0.5 + np.outer(np.arange(1, count + 1), ratio ** -np.arange(1.0, dimensions + 1))) % 1
+
+
+def spiral(count: int) -> F64:
+    """(count, 3) unit vectors, evenly spread: Fibonacci's spiral."""
+    step = np.arange(count) + 0.5
+    return on_sphere(np.stack([1 - step / count, (1 + np.sqrt(5)) / 2 * step], axis=1))
+
+
+def on_sphere(square: F64) -> F64:
+    """(n, 2) in the unit square to (n, 3) unit vectors, areas kept."""
+    z = 2 * square[:, 0] - 1
+    turn = 2 * np.pi * square[:, 1]
+    side = np.sqrt(np.maximum(1 - z * z, 0))
+    return np.stack([side * np.cos(turn), side * np.sin(turn), z], axis=1)
 
 
 def points_on_splats(means: F64, scales: F64, quaternions: F64, opacities: F64, local: F64) -> tuple[F64, F64]:

@@ -1,4 +1,5 @@
-"""Warnings of libraries that tell a user nothing, not shown while something is done: :func:`without_warnings`.
+"""Libraries of others: their warnings, which tell users nothing (:func:`without_warnings`), and how to install one that
+is missing (:func:`install_command`).
 
 Python has one list of filters for all threads, and :class:`warnings.catch_warnings` puts back the one that it has
 found. Where two threads use it at overlapping times, the first to end has the other's warnings shown, and the second
@@ -64,3 +65,21 @@ def whatever_warns(work: Callable[[], T]) -> T:
             continue
     with without_warnings():
         return work()
+
+
+def install_command(extra: str) -> str:
+    """What a user types to get what an extra of this package brings.
+
+    Where the package is installed, pip takes the extra's libraries from its metadata: no index need know the package.
+
+    Args:
+        extra: its name in pyproject.toml.
+    """
+    # Imported where something is missing: it takes longer than most of this package's own modules.
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        version("potr-cl")
+    except PackageNotFoundError:  # a clone that is run without being installed
+        return f'pip install ".[{extra}]" in a clone of the repository'
+    return f'pip install "potr_cl[{extra}]"'

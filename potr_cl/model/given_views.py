@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera, camera_centres
-from potr_cl.model.placement.matter import CROWDED, Matter, cell_of, frame_of, matter_of, surroundings_of
-from potr_cl.model.placement.sampling import F64
+from potr_cl.model.matter import CROWDED, Matter, cell_of, frame_of, matter_of, surroundings_of
+from potr_cl.model.sampling import F64
 from potr_cl.model.scene import Scene
 from potr_cl.model.spherical_harmonics import energy
 

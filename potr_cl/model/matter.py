@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.host.threads import Run
-from potr_cl.model.placement.sampling import F64, low_discrepancy
-from potr_cl.model.placement.surface import points_on_splats
+from potr_cl.model.sampling import F64, low_discrepancy, points_on_splats
 from potr_cl.model.scene import Scene
 from potr_cl.model.spherical_harmonics import unit_coefficients
 

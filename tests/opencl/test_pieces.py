@@ -1,0 +1,137 @@
+"""Launches in pieces, as where a watchdog ends long kernels, and devices that are smaller than they say."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+from math import prod
+
+import numpy as np
+import pytest
+
+from potr_cl.errors import DeviceError
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import Scene
+from potr_cl.opencl import limits
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import DeviceInfo, Family, choose_device
+from potr_cl.opencl.limits import LIMITS_VARIABLE, limited
+from potr_cl.opencl.pieces import Pieces, _Walk, uncut
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.options import EncodeOptions
+
+#: What a small GPU beside a CPU is like, whose launches are to be cut: of an excerpt none takes a quarter of a second.
+SMALL = {"memory": 4_000_000_000, "largest_buffer": 1_000_000_000, "integrated": True, "profiling": False}
+
+
+@pytest.mark.parametrize("grid", [(7,), (5, 3), (4, 1, 3), (1, 6)])
+@pytest.mark.parametrize("whole", [frozenset(), frozenset({0}), frozenset({1})])
+def test_pieces_cover_a_grid_once(grid: tuple[int, ...], whole: frozenset[int]) -> None:
+    for count in (1, 2, 4, 9, 100):
+        covered, walk = np.zeros(grid, int), _Walk(grid, whole)
+        while not walk.done:
+            place, size = walk.next(count)
+            at = tuple(slice(p, p + s) for p, s in zip(place, size, strict=True))
+            assert covered[at].shape == size
+            assert all(size[d] == grid[d] for d in whole if d < len(grid))
+            uncuttable = prod(grid[d] for d in whole if d < len(grid))
+            assert prod(size) <= max(count, uncuttable)
+            covered[at] += 1
+        assert (covered == 1).all()
+
+
+def test_kernels_that_ask_for_the_size_of_the_range_are_whole() -> None:
+    assert uncut(("refit/view_colours.cl", "view_colours", ())) == {1}
+    assert uncut(("refit/coefficients.cl", "dot_parts", ())) == {0}
+    assert uncut(("refit/coefficients.cl", "combine", ())) == set()
+    assert uncut(("raster/composite_gpu.cl", "composite", ())) == set()
+
+
+class Clock:
+    """A queue whose work-groups take a second each, on a clock of its own."""
+
+    now = 0.0
+
+    def __init__(self) -> None:
+        self.pieces: list[int] = []
+
+    def finish(self) -> None:
+        pass
+
+    def enqueue(self, items: tuple[int, ...], offset: tuple[int, ...]) -> None:
+        assert sum(self.pieces) == offset[0]
+        self.pieces.append(items[0])
+        self.now += items[0]
+
+
+def test_pieces_are_as_long_as_they_may_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = Clock()
+    monkeypatch.setattr("potr_cl.opencl.pieces.time.perf_counter", lambda: clock.now)
+    pieces = Pieces(seconds=100, compute_units=1)
+    pieces.launch(clock.enqueue, clock, ("raster/reached.cl", "mark_reached", ()), (300,), (1,))  # type: ignore[arg-type]
+    assert clock.pieces == [2, 8, 32, *[40] * 6, 18]
+    assert pieces.longest == {"mark_reached": 40}
+    assert pieces.cut == {"mark_reached": 1}
+
+
+@pytest.mark.parametrize("family", ["gpu", "cpu"])
+@pytest.mark.parametrize("options", [{"preset": "paper"}, {"preset": "best", "fit": {"on": True, "steps": 20}}])
+def test_an_encode_in_pieces_has_the_same_bytes(
+    plush_excerpt: Scene, plush_excerpt_cameras: list[Camera], family: Family, options: dict[str, object]
+) -> None:
+    chosen = EncodeOptions.for_preset(**options, q=0.5, prune={"iterations": 6}, cameras_anyway=True)  # type: ignore[arg-type]
+
+    def made(info: DeviceInfo) -> tuple[bytes, Device]:
+        device = Device(info, family=family)
+        return encode(plush_excerpt, plush_excerpt_cameras, chosen, device=device).data, device
+
+    whole, _ = made(choose_device())
+    cut, device = made(dataclasses.replace(choose_device(), longest_kernel=1e-9, **SMALL))
+    assert cut == whole
+    assert device.pieces is not None
+    cut_kernels = {name for name, count in device.pieces.cut.items() if count}
+    assert cut_kernels >= {"project", "removal" if options["preset"] == "best" else "compact"}
+
+
+def test_a_device_without_clocks_is_not_asked_for_times() -> None:
+    with pytest.raises(DeviceError, match="measures no times"):
+        Device(dataclasses.replace(choose_device(), profiling=False), profiling=True)
+
+
+def test_limits_of_the_environment_hold_for_every_device() -> None:
+    environment = os.environ | {LIMITS_VARIABLE: "memory=4, buffer=1,kernel=0.25,profiling=no,shared=yes"}
+    code = "import json; from potr_cl.opencl.discovery import list_devices as l; print(json.dumps(["
+    code += "(d.memory, d.largest_buffer, d.longest_kernel, d.profiling, d.shares_host_memory) for d in l()]))"
+    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    for memory, largest, longest, profiling, shared in json.loads(run.stdout):
+        assert memory <= 4e9
+        assert largest <= 1e9
+        assert (longest, profiling, shared) == (0.25, False, True)
+
+
+@pytest.mark.parametrize("text", ["memory", "memory=much", "kernel=0", "cores=4", "shared=perhaps", "buffer=-1"])
+def test_limits_that_make_no_sense_are_refused(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(LIMITS_VARIABLE, f"memory=4,{text}")
+    with pytest.raises(DeviceError, match=f"has '{text}': give memory=GB"):
+        limited(choose_device())
+
+
+class Handle:
+    """A GPU that says what it says about watchdogs."""
+
+    def __init__(self, extensions: str, watched: int = 0) -> None:
+        self.extensions, self._watched = extensions, watched
+
+    def get_info(self, _: int) -> int:
+        return self._watched
+
+
+def test_a_watchdog_is_expected_unless_the_driver_denies_it() -> None:
+    asked = "cl_khr_fp64 cl_nv_device_attribute_query"
+    assert limits.longest_kernel("gpu", Handle(asked, 0)) is None  # type: ignore[arg-type]
+    assert limits.longest_kernel("gpu", Handle(asked, 1)) == limits.WATCHED  # type: ignore[arg-type]
+    assert limits.longest_kernel("gpu", Handle("cl_khr_fp64")) == limits.WATCHED  # type: ignore[arg-type]
+    assert limits.longest_kernel("cpu", Handle("cl_khr_fp64")) is None  # type: ignore[arg-type]
