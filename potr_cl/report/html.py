@@ -82,8 +82,8 @@ def html_report(report: dict[str, Any], pictures: Sequence[PicturePair]) -> str:
     source = report["source"]
     sections = [
         _headline(report),
-        _section("Where the bytes are", _sizes(report)),
         _section("Pictures", _PICTURES + "".join(map(_pair, pictures))) if pictures else "",
+        _section("Where the bytes are", _sizes(report)),
         _section("Quality by view", _quality(report["quality"])),
         _section("Photographs", _photographs(report["photographs"])) if report.get("photographs") else "",
         _section("Pruning", _pruning(report)) if report["pruning"] is not None else "",
