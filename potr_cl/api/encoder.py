@@ -20,7 +20,7 @@ from potr_cl.api.views import log_placed
 from potr_cl.errors import DeviceError, PotrError, UsageError
 from potr_cl.formats.ladder import DESCRIPTION, Ladder, Rung
 from potr_cl.formats.registry import stem_of_scene
-from potr_cl.host.atomic_write import replacing
+from potr_cl.host.atomic_write import make_folder, replacing
 from potr_cl.host.mapped import bounded
 from potr_cl.host.threads import in_background
 from potr_cl.model.camera import Camera, within_photographs
@@ -371,10 +371,7 @@ class Encoder:
         for file in (*files, description):
             if file.is_dir():
                 raise UsageError(f"cannot write '{file}': it is a directory; write the ladder elsewhere")
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UsageError(f"cannot make the folder '{folder}': {error.strerror}") from None
+        make_folder(folder)
         rungs = []
         # A folder that takes no file is reported before the work.
         with replacing(description) as target, self._prepared(source, progress) as job:

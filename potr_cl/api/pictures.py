@@ -31,9 +31,9 @@ from potr_cl.api.inputs import (
     scene_of,
 )
 from potr_cl.api.views import Viewpoints, describe_views, warn_of_frame
-from potr_cl.errors import DataError, DeviceError, UsageError
+from potr_cl.errors import DataError, DeviceError
 from potr_cl.formats.images import Colour, to_8_bits, write_png
-from potr_cl.host.atomic_write import replacing
+from potr_cl.host.atomic_write import make_folder, replacing
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
@@ -365,18 +365,6 @@ def file_name(view: str, windows: bool = os.name == "nt") -> str:
         if re.fullmatch(r"(con|prn|aux|nul|(com|lpt)[0-9¹²³]) *(\..*)?", name, re.IGNORECASE):
             name = f"_{name}"
     return name
-
-
-def make_folder(folder: Path) -> None:
-    """Make a folder unless it is there.
-
-    Raises:
-        UsageError: it cannot be made.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"cannot make the folder '{folder}': {error.strerror}") from None
 
 
 def written_pictures(rasterizer: Renderer, cameras: Sequence[Camera], paths: Sequence[Path]) -> Iterator[Path]:
