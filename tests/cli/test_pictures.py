@@ -76,7 +76,7 @@ def test_render_bad_calls(tmp_path, scene_path, cameras_path, capsys):
     out = tmp_path / "out"
     render = ["render", scene_path, "--cameras", cameras_path, "-o", out]
     fails(capsys, ["render", tmp_path / "none.ply", *render[2:]], 2, "none.ply")
-    fails(capsys, ["render", cameras_path, *render[2:]], 2, "cameras.json", "unknown kind of scene")
+    fails(capsys, ["render", cameras_path, *render[2:]], 2, "cameras.json", "holds cameras, not a scene")
     fails(capsys, [*render[:3], tmp_path / "none.json", *render[4:]], 2, "none.json")
     fails(capsys, [*render, "--views", "view_9"], 2, "'view_9'", "0 ('view_0') to 7 ('view_7')")
     fails(capsys, [*render, "--views", "8"], 2, "'8'")
