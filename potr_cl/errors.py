@@ -46,7 +46,11 @@ class UnwritableError(WriteError, UsageError):
 
 
 class DeviceError(PotrError):
-    """An OpenCL device is missing, failed to build a program, or ran out of memory."""
+    """An OpenCL device is missing, failed to build a program, or ran out of memory.
+
+    Whatever takes a device's memory or runs on it can raise this: inside the package docstrings say so only where there
+    is more to it.
+    """
 
 
 class DeviceMemoryError(DeviceError):

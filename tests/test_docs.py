@@ -220,7 +220,7 @@ def test_recipes_can_be_followed(tmp_path: Path) -> None:
         shutil.copy(ROOT / file, tmp_path)
     # A quirk has no file of its own: it is an entry of quirks.py. Type checkers need the keywords of options by name,
     # and what a stage has found out.
-    lists = {"potr_cl/opencl/quirks.py", "potr_cl/api/choices.py", "potr_cl/stages/learnt.py"}
+    lists = {"potr_cl/opencl/quirks.py", "potr_cl/api/choices.py", "potr_cl/stages/stage.py"}
     tests, run = [], []
     for title, checks in RECIPES.items():
         blocks = recipe(title)

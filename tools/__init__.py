@@ -13,7 +13,6 @@ bench.refit            what does the re-fit of the colours bring, and what does 
 bench.fit              how fast are the fit's steps?
 bench.decode           how fast does a file decode, by compiled code, NumPy or OpenCL, and in how much memory?
 bench.codec            speed, memory and size of the codec alone
-bench.virtual_cameras  what does encoding without cameras cost, and what is left of places?
 bench.paired           are whole encodes faster or slower than those of another checkout?
 bench.scaling          time and memory against splats, views and workers: with which exponents?
 bench.web              how fast is the browser's decoder against native C, and in how much memory?
@@ -33,6 +32,7 @@ What happens at the limits (``stress``):
 stress.run          every kernel against float64 on the worst inputs: what error is the kernel's own?
 stress.platforms    the rasterizer, the metrics and the re-fit on every OpenCL runtime of this machine
 stress.offline      do all GPU programs build for AMD's, Intel's and Apple's GPUs, and do any spill registers?
+stress.limits       encodes on a device that is told to be small and watched: do they fit, how long are kernels?
 stress.simulated    does Oclgrind see a race, an access out of bounds or an uninitialised read in any kernel?
 stress.fuzz         does any changed file do more than be refused or decode to finite numbers?
 stress.bombs        what do files take that unpack to far more than they are, or claim to?
@@ -52,6 +52,7 @@ make.readme_picture   the picture at the top of the README
 make.other_tools      splats in the formats of six tools, and how splat-transform reads them
 make.golden_files     files that every later decoder must read to the same values
 make.native           the compiled part of the decoder, in the checkout
+make.wheels          wheels for Linux, Windows and macOS, whose compiled part Zig builds here
 make.web              the decoder for browsers, and the viewer of pages
 make.docs             the pages and tables of README and docs that are made from the code (see CONTRIBUTING.md)
 make.benchmarks       the tables and plots of docs/benchmarks, from the results beside them

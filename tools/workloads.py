@@ -13,16 +13,12 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
-import numpy as np
-
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model.camera import Camera, resized
-from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.pipeline.run import Run
-from potr_cl.pipeline.stopwatch import Stopwatch
-from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.pipeline.run import Run, Stopwatch
 from potr_cl.stages.code import Code
 from potr_cl.stages.stage import State
 
@@ -111,12 +107,6 @@ def reduced(scene: Scene, views: Sequence[Camera], options: EncodeOptions, devic
     """What all stages but the coder leave of a scene, and the views that they have looked at."""
     before_coding = [type(stage) for stage in options.stages if not isinstance(stage, Code)]
     return Run(options, Stopwatch(), device).stages(State.of(scene, views), before_coding)
-
-
-def pictures(device: Device, scene: Scene, views: Sequence[Camera]) -> list[FloatArray]:
-    """Renders, (H, W, 3) float32, clamped to [0, 1]."""
-    with Rasterizer(device, scene) as rasterizer:
-        return [np.clip(rasterizer.render(view)[0], 0, 1) for view in views]
 
 
 def scaled(camera: Camera, factor: float) -> Camera:

@@ -26,7 +26,7 @@ from potr_cl.stages.code import Code
 from potr_cl.stages.stage import Flag as Flag
 from potr_cl.stages.stage import Stage as Stage
 from potr_cl.stages.stage import flags as flags
-from potr_cl.workers.opening import ClusterSource
+from potr_cl.workers.host import ClusterSource
 
 #: The stages whose options may be chosen.
 STAGES = stages_of(DEFAULT)

@@ -50,7 +50,7 @@ from potr_cl.quality.photographs import find_ground_truth, missing_photographs
 from potr_cl.raster.rules import RULES, RasterRules
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.report.labels import U8, comparison_picture, shrunk
-from potr_cl.workers.opening import ClusterSource, DevicesSource, Workers, open_workers
+from potr_cl.workers.host import ClusterSource, DevicesSource, Workers, open_workers
 
 if TYPE_CHECKING:
     from potr_cl.outputs.output import CodedScene

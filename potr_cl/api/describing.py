@@ -11,7 +11,7 @@ from potr_cl.api.inputs import SceneSource, bytes_of_source, encoded_bytes, hold
 from potr_cl.codec.decoder import PotrFile, open_file
 from potr_cl.formats import load_scene, registry
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes.potr import FORMAT as POTR
+from potr_cl.formats.scenes.page import POTR
 from potr_cl.formats.scenes.scene_files import noting_mends, without_level
 from potr_cl.formats.streams import plain
 from potr_cl.model.scene import CleanReport, Scene

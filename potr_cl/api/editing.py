@@ -42,27 +42,26 @@ from potr_cl.model.scene import Scene
 from potr_cl.model.views_between import views_between as place_between
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.fallback import on_device
+from potr_cl.pipeline.encode import check_frame
+from potr_cl.pipeline.fallback import with_fallback
 from potr_cl.pipeline.forecast import log_forecast
-from potr_cl.pipeline.frame import check_frame
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.pipeline.run import Run
-from potr_cl.pipeline.stopwatch import Stopwatch
+from potr_cl.pipeline.run import Run, Stopwatch
 from potr_cl.pipeline.target import as_bytes
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.quality.photographs import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.compact import Compact as Compact
 from potr_cl.stages.fitting.fit import FitOptions as FitOptions
-from potr_cl.stages.fitting.fit import Fitted, fit_scene
-from potr_cl.stages.guarded import Unresolved
+from potr_cl.stages.fitting.fit import fit_scene
+from potr_cl.stages.fitting.fitted import Fitted
 from potr_cl.stages.prune import Prune as Prune
 from potr_cl.stages.pruning.schedule import Pruned
-from potr_cl.stages.pruning.unseen import Unseen
 from potr_cl.stages.refitting.refit import active_coefficients, refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions as RefitOptions
 from potr_cl.stages.refitting.refit_options import Refitted
 from potr_cl.stages.stage import Progress, Stage, State
+from potr_cl.stages.unseen import Unresolved, Unseen
 from potr_cl.views.targets import PhotographTargets, RenderedTargets
 
 if TYPE_CHECKING:
@@ -307,7 +306,7 @@ class _Work:
     def done(self, name: str, work: Callable[[Device, int | None], _T]) -> tuple[_T, Device]:
         """What a function makes on a device, with how much of its memory; again where that is too much."""
         self.progress(name, 0.0)
-        made = on_device(self.opened, self.memory, work)
+        made = with_fallback(self.opened, self.memory, work)
         self.progress(name, 1.0)
         return made
 
@@ -370,7 +369,7 @@ def prune(
         ranks = stack.enter_context(replacing(order)) if order is not None else None
         work = _Work(scene, cameras, how, options)
         state, used = work.stage(Prune, options)
-        pruned, unseen = state.learnt.pruned, state.learnt.unseen
+        pruned, unseen = state.results.pruned, state.results.unseen
         assert pruned is not None
         assert unseen is not None
         work.write(state.scene)

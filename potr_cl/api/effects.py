@@ -20,13 +20,12 @@ from potr_cl.api.inputs import (
 from potr_cl.api.views import views_or_placed
 from potr_cl.model.camera import train_views
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.fallback import on_device
-from potr_cl.pipeline.frame import check_frame
+from potr_cl.pipeline.encode import check_frame
+from potr_cl.pipeline.fallback import with_fallback
 from potr_cl.pipeline.target import as_bytes
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.pruning.fixed_point import FixedPoint
 from potr_cl.stages.pruning.removal import RemovalSweep
-from potr_cl.stages.pruning.staleness import SweepOptions
+from potr_cl.stages.pruning.sweep import FixedPoint, SweepOptions
 from potr_cl.stages.stage import Progress
 
 _Totals = list[NDArray[np.int64]]
@@ -99,7 +98,7 @@ def removal_effects(
                     found.append(sweep.measure_totals())
             return found
 
-    totals, _ = on_device(opened, budget, work)
+    totals, _ = with_fallback(opened, budget, work)
     tell("removal effects", 1.0)
     values = FixedPoint.of_views(views).values
     names = [view.name for view in views]

@@ -26,23 +26,22 @@ from potr_cl.host.threads import in_background
 from potr_cl.model.camera import Camera, within_photographs
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.encode import cameras_or_virtual
+from potr_cl.pipeline.encode import cameras_or_virtual, frame_checked_beside
 from potr_cl.pipeline.encode import encode as run_stages
 from potr_cl.pipeline.encoded import Encoded, Proved, SharedOut, proved
 from potr_cl.pipeline.forecast import log_forecast
-from potr_cl.pipeline.frame import frame_checked_beside
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.pipeline.run import Stopwatch, added_up
 from potr_cl.pipeline.search import encode_to_target
-from potr_cl.pipeline.stopwatch import Stopwatch, added_up
 from potr_cl.pipeline.target import Target
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator, judge_by_photographs
 from potr_cl.quality.photographs import GroundTruth
-from potr_cl.raster.kept_scene import KeptScene
+from potr_cl.raster.resident import ResidentScene
 from potr_cl.report.html import PicturePair, html_report, views_to_show
 from potr_cl.report.summary import decibels, encode_report, photographs_report, quality_report, search_report
 from potr_cl.stages.refit import Refit
 from potr_cl.stages.stage import Progress
-from potr_cl.workers.opening import ClusterSource, DevicesSource, Workers, open_workers
+from potr_cl.workers.host import ClusterSource, DevicesSource, Workers, open_workers
 from potr_cl.workers.pool import Pool, Traffic
 
 if TYPE_CHECKING:
@@ -70,7 +69,7 @@ class _Job:
     cameras: Sequence[Camera] | None
     judging: EvaluationViews | None
     workers: Workers | None
-    kept: KeptScene | None
+    kept: ResidentScene | None
     seconds: dict[str, float]
 
     @property
@@ -108,7 +107,7 @@ class Encoder:
         cameras: or their file; None: virtual ones are placed where a stage looks at views.
         beside: whether each scene has cameras of its own, see :meth:`look_from`.
         virtual_views: how many views to place without cameras.
-        device, cluster: see :func:`potr_cl.workers.opening.open_workers`.
+        device, cluster: see :func:`potr_cl.workers.host.open_workers`.
         judge: whether to render and compare what was encoded.
         trust, antialiased: as of :func:`potr_cl.load_scene`.
 
@@ -198,7 +197,7 @@ class Encoder:
                 workers = self.workers if looks else None
                 if workers is not None and self._target is None:
                     others = () if workers.pool is None else workers.pool.devices
-                    kept = stack.enter_context(KeptScene(workers.device, scene, options.memory, others))
+                    kept = stack.enter_context(ResidentScene(workers.device, scene, options.memory, others))
             if workers is not None:
                 if cameras is None:
                     cameras = self._placed(source, scene, options, watch, workers.device)

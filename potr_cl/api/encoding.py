@@ -17,7 +17,7 @@ from potr_cl.pipeline.encoded import Encoded
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.target import Target
 from potr_cl.stages.stage import Progress
-from potr_cl.workers.opening import DevicesSource
+from potr_cl.workers.host import DevicesSource
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -92,7 +92,8 @@ def view(
     def exhibit(source: SceneSource) -> Exhibit:
         scene = scene_of(source, trust, antialiased)
         nbytes = bytes_of_source(source)
-        return Exhibit(scene, name_of(source).name, scene.nbytes if nbytes is None else nbytes)
+        path = Path(source) if isinstance(source, (str, os.PathLike)) and Path(source).is_file() else None
+        return Exhibit(scene, name_of(source).name, scene.nbytes if nbytes is None else nbytes, path)
 
     first = None if isinstance(a, Ladder) or (b is None and ladder is not None) else exhibit(a)
     second = None if b is None or ladder is not None or isinstance(b, Ladder) else exhibit(b)

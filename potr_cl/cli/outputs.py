@@ -98,9 +98,9 @@ def check_name(path: WrittenFile, option: str = "-o") -> None:
         UsageError: it does.
     """
     if isinstance(path, WrittenScene):
-        from potr_cl.formats.registry import writer_of  # imported on use: few commands need all formats
+        from potr_cl.formats.registry import written_format  # imported on use: few commands need all formats
 
-        writer_of(path)
+        written_format(path)
     elif isinstance(path, WrittenEncoded):
         from potr_cl.outputs.registry import output_of
 

@@ -15,17 +15,24 @@ All choices are made in a fixed order: a device gives the same bits on every run
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.clustering.comparison import U32, Lists, Points, sorted_by_label
-from potr_cl.clustering.rows import centres_of_sums, errors_at_zero, rows_of_points
+from potr_cl.clustering.comparison import (
+    U32,
+    Lists,
+    Points,
+    centres_of_sums,
+    errors_at_zero,
+    rows_of_points,
+    sorted_by_label,
+)
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Owner
 
 _F64 = NDArray[np.float64]
 
@@ -70,13 +77,7 @@ class Clusters:
 
 
 def cluster(
-    device: Device,
-    points: FloatArray,
-    weights: FloatArray,
-    entries: int,
-    rate: Rate | None = None,
-    steps: int = STEPS,
-    progress: Callable[[float], None] = lambda done: None,
+    device: Device, points: FloatArray, weights: FloatArray, entries: int, rate: Rate | None = None
 ) -> Clusters:
     """Find centres from which the points are little away, by the weighted sum of their squared distances.
 
@@ -87,23 +88,11 @@ def cluster(
         weights: (N, G) float32, 0 or more.
         entries: K, the most centres there may be, 1 or more.
         rate: what entries and labels take; None: nothing.
-        steps: of Lloyd's algorithm.
-        progress: called with the part of the work that is done.
-
-    Raises:
-        DeviceError: the device failed, or has too little memory.
     """
-    progress(0.0)
-    finder = _Finder(device, points, weights, entries, rate)
-    try:
-        for step in range(steps):
-            finder.improve(refill=rate is None and step < steps - 1)
-            progress((step + 1) / (steps + 1))
-        clusters = finder.clusters()
-    finally:
-        finder.close()
-    progress(1.0)
-    return clusters
+    with _Finder(device, points, weights, entries, rate) as finder:
+        for step in range(STEPS):
+            finder.improve(refill=rate is None and step < STEPS - 1)
+        return finder.clusters()
 
 
 def assigned(
@@ -115,9 +104,6 @@ def assigned(
         device, points, weights: as of :func:`cluster`.
         centres: (K, G, C).
         bits: (K,) what each label takes; None: nothing.
-
-    Raises:
-        DeviceError: the device failed, or has too little memory.
     """
     cells = _cells(device, centres, np.ones(centres.shape[:2], np.float32), len(centres))
     return _in_parts(device, points, weights, _Homed.of(device, centres, bits, cells))
@@ -166,7 +152,7 @@ class _Homed:
         return self.numbers[labels].astype(np.uint32), scores
 
 
-class _Finder:
+class _Finder(Owner):
     """Centres of some points, step by step."""
 
     def __init__(
@@ -181,8 +167,8 @@ class _Finder:
         self._taken, self._constants = taken, errors_at_zero(taken, mass)
         count = min(entries, len(taken))
         cells = _cells(device, taken, mass, count)
-        self._at = Points(device, rows_of_points(taken, mass))
-        try:
+        with device.all_or_nothing():
+            self._at = Points(device, rows_of_points(taken, mass))
             cell_of, scores = self._at.nearest(cells)
             errors = np.maximum(self._constants + scores, 0)
             errors += errors.mean() * 1e-3 or 1.0  # where all points are alike, too
@@ -194,9 +180,6 @@ class _Finder:
                 self._held = 0
                 self._centres[0] = 0
             self._bits = None if rate is None else np.full(count, math.log2(count), np.float32)
-        except BaseException:
-            self.close()
-            raise
 
     def improve(self, refill: bool) -> None:
         """One step: each point to its best centre, each centre to the mean of its points.
@@ -233,7 +216,6 @@ class _Finder:
         return Clusters(self._centres, _in_parts(self._device, self._points, self._weights, homed))
 
     def close(self) -> None:
-        """Give the device's memory back."""
         self._at.close()
 
 

@@ -21,7 +21,7 @@ from potr_cl.codec.bundles.sections import MAIN
 from potr_cl.codec.bundles.streams import largest_integer
 from potr_cl.codec.container import Block
 from potr_cl.codec.native.bundles import BEYOND_TABLE
-from potr_cl.codec.native.library import Functions
+from potr_cl.codec.native.declarations import CFunctions
 from potr_cl.codec.native.table import definition
 from potr_cl.codec.native.values import BundleShare, Tables, ValueArrays
 from potr_cl.codec.sections import Property
@@ -218,11 +218,7 @@ class BlockValues:
         )
 
     def _by_numpy(self, bundles: range, wanted: Wanted, arrays: ValueArrays) -> None:
-        """Fill arrays with the values of some bundles, which are decoded side by side.
-
-        Raises:
-            DataError: damaged.
-        """
+        """Fill arrays with the values of some bundles, which are decoded side by side. Raises DataError if damaged."""
         levels = self.reader.levels(bundles.start, bundles.stop, wanted)
         dequantizer.fill(arrays, self.block, levels, self.reader.steps, self.activation)
 
@@ -244,8 +240,8 @@ def bundle_share(bundles: int) -> BundleShare | None:
     return None
 
 
-def _bundle_share_of_c(functions: Functions, bundles: int) -> BundleShare:
-    return functions.bundle_share(bundles)
+def _bundle_share_of_c(c: CFunctions, bundles: int) -> BundleShare:
+    return BundleShare(c, bundles)
 
 
 class _Helpers:

@@ -107,11 +107,7 @@ class Body:
         return planar.transpose(2, 0, 1)
 
     def colour_steps(self) -> ColourSteps | None:
-        """What fits the steps of colours to each splat; None if all are the same.
-
-        Raises:
-            DataError: damaged.
-        """
+        """What fits the steps of colours to each splat; None if all are the same. Raises DataError if damaged."""
         if self.block.find(Property.STEPS) is None:
             return None
         return ColourSteps.from_bytes(self._raw(Property.STEPS).tobytes(), self.block.splats)

@@ -204,22 +204,14 @@ def is_sound(data: bytes | memoryview, section: Section) -> bool:
 
 
 def stored_bytes(data: bytes | memoryview, section: Section) -> memoryview:
-    """A section's bytes as they are stored.
-
-    Raises:
-        DataError: they are damaged.
-    """
+    """A section's bytes as they are stored. Raises DataError if they are damaged."""
     if not is_sound(data, section):
         raise DataError(f"section '{section.title}' is damaged (its checksum does not match): get the file again")
     return unchecked_bytes(data, section)
 
 
 def read_section(data: bytes | memoryview, section: Section) -> NDArray[np.uint8]:
-    """A section's content: (raw_bytes,) uint8.
-
-    Raises:
-        DataError: the stored bytes are damaged.
-    """
+    """A section's content: (raw_bytes,) uint8. Raises DataError if the stored bytes are damaged."""
     stored, size = stored_bytes(data, section), section.raw_bytes
     return np.frombuffer(stored if len(stored) == size else inflated(stored, size, section.title), np.uint8)
 

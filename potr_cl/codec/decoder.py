@@ -26,7 +26,6 @@ from potr_cl.codec.body import Body
 from potr_cl.codec.container import FIXED_BYTES, Block, FileHeader, header_bytes_of
 from potr_cl.codec.sections import Property
 from potr_cl.errors import DataError, UsageError
-from potr_cl.host import mapped
 from potr_cl.host.inputs import State, refuse_changed, state_of, unchanged
 from potr_cl.model.box import Box
 from potr_cl.model.scene import Scene, joined, most_coefficients
@@ -191,14 +190,15 @@ class PotrFile:
                 return joined(parts)
             if len(own) == 1:
                 return self.of(self._level(level)[0], lambda body: body.scene(threads, sh_degree), sh_degree)
-            whole = _empty(own[0], splats, count)
-            first = 0
+            whole, first = None, 0
             for part in self.parts(threads, sh_degree, None, level):
+                whole = whole or Scene.blank(splats, count, part)
                 whole.put(first, part)
                 first += len(part)
         except MemoryError:
             needed = splats * (11 + 3 * count) * 4
             raise DataError(f"the scene needs {needed / 1e9:.1f} GB of memory, more than there is") from None
+        assert whole is not None  # a level has a block
         return whole
 
     def _level(self, level: int) -> list[int]:
@@ -229,18 +229,6 @@ def _some_of(body: Body, threads: int, sh_degree: int | None, box: Box | None) -
     some = body.scene(threads, sh_degree).subset(inside)
     # Each SH coefficient contiguous in memory, as a decoder leaves them.
     return replace(some, sh=np.ascontiguousarray(some.sh.transpose(1, 2, 0)).transpose(2, 0, 1))
-
-
-def _empty(block: Block, splats: int, count: int) -> Scene:
-    return Scene(
-        np.empty((splats, 3), np.float32),
-        np.empty((splats, 3), np.float32),
-        np.empty((splats, 4), np.float32),
-        np.empty(splats, np.float32),
-        mapped.array((count, 3, splats), np.float32, "SH coefficients").transpose(2, 0, 1),
-        block.antialiased,
-        block.low_pass,
-    )
 
 
 def open_file(source: bytes | str | os.PathLike[str], trust: bool = False) -> PotrFile:
@@ -314,10 +302,7 @@ def _read(path: Path, state: State, offset: int, nbytes: int) -> bytes:
 
 
 def decode(
-    source: bytes | str | os.PathLike[str],
-    trust: bool = False,
-    sh_degree: int | None = None,
-    box: Box | None = None,
+    source: bytes | str | os.PathLike[str], trust: bool = False, sh_degree: int | None = None, box: Box | None = None
 ) -> Scene:
     """Decode a .potr file, given as bytes or as a path.
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -21,7 +22,6 @@ from potr_cl.codec.container import Block
 from potr_cl.codec.native.values import PackedValues, ValueArrays, packing_rooms
 from potr_cl.codec.steps.prediction import from_residuals
 from potr_cl.codec.steps.rule import ColourSteps, colour_classes, factors
-from potr_cl.host import mapped
 from potr_cl.model.scene import Scene
 
 F32 = NDArray[np.float32]
@@ -96,14 +96,10 @@ class SceneArrays(Fillable):
     """
 
     def __init__(self, block: Block, sh_count: int) -> None:
-        n = block.splats
-        self._block = block
-        self._means = np.empty((0, 3), np.float32)
+        scene = Scene.blank(block.splats, sh_count)
+        self._scene = replace(scene, antialiased=block.antialiased, low_pass=block.low_pass)
         self._values = ValueArrays(
-            np.empty((n, 3), np.float32),
-            np.empty((n, 4), np.float32),
-            np.empty(n, np.float32),
-            mapped.array((sh_count, 3, n), np.float32, "SH coefficients"),
+            scene.log_scales, scene.quaternions, scene.opacity_logits, scene.sh.transpose(1, 2, 0)
         )
 
     @property
@@ -112,25 +108,12 @@ class SceneArrays(Fillable):
         return self._values
 
     def take_means(self, means: F32) -> None:
-        self._means = means
+        self._scene = replace(self._scene, means=means)
 
     @property
     def scene(self) -> Scene:
         """The scene, once everything was taken."""
-        values, block = self._values, self._block
-        assert values.log_scales is not None
-        assert values.quaternions is not None
-        assert values.logits is not None
-        assert values.sh is not None
-        return Scene(
-            self._means,
-            values.log_scales,
-            values.quaternions,
-            values.logits,
-            values.sh.transpose(2, 0, 1),
-            block.antialiased,
-            block.low_pass,
-        )
+        return self._scene
 
 
 #: Splats worked on at a time: a multiple of the runs in which DC is predicted; predictions take a call for each splat
@@ -139,11 +122,7 @@ _AT_A_TIME = 1 << 16
 
 
 def fill(
-    arrays: ValueArrays,
-    block: Block,
-    levels: Levels,
-    steps: ColourSteps | None,
-    activation: Activation | None = None,
+    arrays: ValueArrays, block: Block, levels: Levels, steps: ColourSteps | None, activation: Activation | None = None
 ) -> None:
     """Values of some splats' levels into the arrays that there are.
 

@@ -217,10 +217,7 @@ def _in_bundles(
 def _narrowed(integers: NDArray[np.int64]) -> NDArray[np.signedinteger]:
     """The same in the smallest type that the coders take."""
     largest = max(int(integers.max(initial=0)), -int(integers.min(initial=0)) - 1)
-    for dtype in (np.int16, np.int32):
-        if largest <= np.iinfo(dtype).max:
-            return integers.astype(dtype)
-    return integers
+    return integers.astype(quantize.level_type(largest), copy=False)
 
 
 def _box(geometry: Geometry) -> Box:

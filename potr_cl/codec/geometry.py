@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import octree, quantize
-from potr_cl.codec.native.library import Functions
+from potr_cl.codec.native import quantising
+from potr_cl.codec.native.declarations import CFunctions
 from potr_cl.codec.native.table import definition
 from potr_cl.codec.quantisers import QUANTISERS
 from potr_cl.codec.splat_levels import BLOCK, SplatLevels, splat_levels
@@ -335,9 +336,7 @@ def nearest(points: NDArray[np.float32], others: NDArray[np.float64]) -> NDArray
     return distances
 
 
-def _nearest_by_c(
-    functions: Functions, points: NDArray[np.float32], others: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _nearest_by_c(c: CFunctions, points: NDArray[np.float32], others: NDArray[np.float64]) -> NDArray[np.float64]:
     least = np.empty(len(points))
-    functions.quantising.nearest(np.ascontiguousarray(points, np.float32), others, least)
+    quantising.nearest(c, np.ascontiguousarray(points, np.float32), others, least)
     return least

@@ -87,90 +87,6 @@ def encode(
     return coded if all(coded) else None
 
 
-class Reader:
-    """A block's integers; what it offers is that of :class:`potr_cl.codec.bundles.decoder.Reader`.
-
-    Args:
-        splats: n of the block.
-        open_section: gives the content of a section, None if the block has none; called when it is needed.
-        open_steps: gives the steps of colours, None if the block has none; called when they are needed.
-    """
-
-    def __init__(
-        self,
-        splats: int,
-        open_section: Callable[[Property], U8 | None],
-        open_steps: Callable[[], ColourSteps | None],
-    ) -> None:
-        self.bundles = Bundles(splats)
-        self._open, self._open_steps = open_section, open_steps
-        self._planes: dict[Property, list[U8]] = {}
-
-    @cached_property
-    def steps(self) -> ColourSteps | None:
-        """The steps of colours. Raises DataError if damaged."""
-        return self._open_steps()
-
-    def open(self, sh_count: int, scales: bool, rotations: bool) -> None:
-        """Unpack what :meth:`levels` will be asked for. Raises DataError if damaged."""
-        degrees = SH[: round(sh_count**0.5)]
-        if degrees and self.steps is not None:
-            scales = True
-        shapes = [*([Property.SCALE] if scales else []), *([Property.ROTATION] if rotations else [])]
-        for prop in (Property.OPACITY, *shapes, *degrees):
-            self._planes[prop] = self._planes.get(prop) or self._streams(prop)
-        if degrees:
-            _ = self._dc
-
-    def _streams(self, prop: Property) -> list[U8]:
-        """The planes of each stream of a property."""
-        raw = self._open(prop)
-        if raw is None:
-            return [np.empty((0, self.bundles.splats), np.uint8)] * prop.streams
-        widths = raw[: prop.streams].astype(np.int64)
-        if (
-            len(widths) < prop.streams
-            or int(widths.max()) > MOST_PLANES
-            or len(raw) != prop.streams + self.bundles.splats * int(widths.sum())
-        ):
-            raise DataError(f"section '{prop.title}' does not hold an integer of each splat")
-        parts = np.split(raw[prop.streams :], np.cumsum(widths)[:-1] * self.bundles.splats)
-        return [part.reshape(-1, self.bundles.splats) for part in parts]
-
-    @cached_property
-    def _dc(self) -> list[NDArray[np.int64]]:
-        """(n,) Y, Co, Cg: sums of what is stored."""
-        return [
-            np.cumsum(unpack(planes, True, 0, self.bundles.splats), dtype=np.int64)
-            for planes in self._planes[Property.SH0]
-        ]
-
-    def levels(self, first: int, last: int) -> Levels:
-        """Of some bundles: the first one, and the one behind the last; what was opened of them."""
-        start, stop = first * BUNDLE, min(last * BUNDLE, self.bundles.splats)
-
-        def some(prop: Property) -> list[Integers]:
-            return [unpack(planes, prop.signed, start, stop) for planes in self._planes.get(prop, [])]
-
-        levels = Levels(start, stop, some(Property.OPACITY)[0], predicted=False)
-        levels.scales, levels.rotations = some(Property.SCALE) or None, some(Property.ROTATION) or None
-        if Property.SH0 in self._planes:
-            levels.dc = [channel[start:stop] for channel in self._dc]
-        rest = [stream for prop in SH[1:] for stream in some(prop)]
-        levels.dense = [rest[m : m + 3] for m in range(0, len(rest), 3)]
-        return levels
-
-
-def opened(data: bytes | memoryview, block: container.Block, open_steps: Callable[[], ColourSteps | None]) -> Reader:
-    """Of a block's bytes."""
-
-    def content(prop: Property) -> U8 | None:
-        section = block.find(prop)
-        return None if section is None else container.read_section(data, section)
-
-    return Reader(block.splats, content, open_steps)
-
-
 #: Bundles that a thread works on at a time, and threads that do: integers may be wide, and take memory.
 _AT_A_TIME, _MOST_THREADS = 3, 2
 
@@ -184,17 +100,12 @@ class PlainValues:
     open_steps: Callable[[], ColourSteps | None]
     activation: Activation | None = None
 
-    @cached_property
-    def reader(self) -> Reader:
-        """Of the integers."""
-        return opened(self.data, self.block, self.open_steps)
-
     def fill(self, arrays: ValueArrays, threads: int = 1, beside: Callable[[], None] | None = None) -> None:
         """As :meth:`potr_cl.codec.block_values.BlockValues.fill`."""
         with thread_pool(min(threads, _MOST_THREADS)) as pool:
             other = None if beside is None else pool.submit(beside)
-            reader = self._opened(arrays)
-            list(pool.map(lambda first: self._fill(reader, self._bundles(first), arrays), self._starts))
+            self._open(arrays)
+            list(pool.map(lambda bundles: self._fill(bundles, arrays), self._parts))
             if other is not None:
                 other.result()
 
@@ -204,30 +115,72 @@ class PlainValues:
         """As :meth:`potr_cl.codec.block_values.BlockValues.pack`."""
         destination.expect_bundles()
         destination.take_means(means())
-        reader: Reader | None = None
-        for first in self._starts:
-            bundles = self._bundles(first)
+        for bundles in self._parts:
 
             def filled(arrays: ValueArrays, bundles: range = bundles) -> None:
-                nonlocal reader
-                reader = reader or self._opened(arrays)
-                self._fill(reader, bundles, arrays)
+                self._open(arrays)
+                self._fill(bundles, arrays)
 
             dequantizer.pack(destination, self.block, sh_count, bundles, filled)
 
-    def _opened(self, arrays: ValueArrays) -> Reader:
-        """The integers that some arrays are made of."""
-        reader, rotations = self.reader, arrays.quaternions is not None
-        reader.open(0 if arrays.sh is None else len(arrays.sh), rotations or arrays.log_scales is not None, rotations)
-        return reader
-
-    def _fill(self, reader: Reader, bundles: range, arrays: ValueArrays) -> None:
-        levels = reader.levels(bundles.start, bundles.stop)
-        dequantizer.fill(arrays, self.block, levels, reader.steps, self.activation)
-
     @property
-    def _starts(self) -> range:
-        return range(0, self.reader.bundles.number, _AT_A_TIME)
+    def _parts(self) -> list[range]:
+        number = Bundles(self.block.splats).number
+        return [range(first, min(first + _AT_A_TIME, number)) for first in range(0, number, _AT_A_TIME)]
 
-    def _bundles(self, first: int) -> range:
-        return range(first, min(first + _AT_A_TIME, self.reader.bundles.number))
+    @cached_property
+    def _steps(self) -> ColourSteps | None:
+        return self.open_steps()
+
+    @cached_property
+    def _planes(self) -> dict[Property, list[U8]]:
+        """Of each property that was opened, the planes of each stream."""
+        return {}
+
+    @cached_property
+    def _dc(self) -> list[NDArray[np.int64]]:
+        """(n,) Y, Co, Cg: sums of what is stored."""
+        return [
+            np.cumsum(unpack(planes, True, 0, self.block.splats), dtype=np.int64)
+            for planes in self._planes[Property.SH0]
+        ]
+
+    def _open(self, arrays: ValueArrays) -> None:
+        """Unpack what some arrays are made of. Raises DataError if damaged."""
+        degrees = SH[: 0 if arrays.sh is None else round(len(arrays.sh) ** 0.5)]
+        rotations = arrays.quaternions is not None
+        scales = rotations or arrays.log_scales is not None or bool(degrees and self._steps is not None)
+        shapes = [*([Property.SCALE] if scales else []), *([Property.ROTATION] if rotations else [])]
+        for prop in (Property.OPACITY, *shapes, *degrees):
+            self._planes[prop] = self._planes.get(prop) or self._streams(prop)
+        if degrees:
+            _ = self._dc
+
+    def _streams(self, prop: Property) -> list[U8]:
+        section, splats = self.block.find(prop), self.block.splats
+        if section is None:
+            return [np.empty((0, splats), np.uint8)] * prop.streams
+        raw = container.read_section(self.data, section)
+        widths = raw[: prop.streams].astype(np.int64)
+        if (
+            len(widths) < prop.streams
+            or int(widths.max()) > MOST_PLANES
+            or len(raw) != prop.streams + splats * int(widths.sum())
+        ):
+            raise DataError(f"section '{prop.title}' does not hold an integer of each splat")
+        parts = np.split(raw[prop.streams :], np.cumsum(widths)[:-1] * splats)
+        return [part.reshape(-1, splats) for part in parts]
+
+    def _fill(self, bundles: range, arrays: ValueArrays) -> None:
+        start, stop = bundles.start * BUNDLE, min(bundles.stop * BUNDLE, self.block.splats)
+
+        def some(prop: Property) -> list[Integers]:
+            return [unpack(planes, prop.signed, start, stop) for planes in self._planes.get(prop, [])]
+
+        levels = Levels(start, stop, some(Property.OPACITY)[0], predicted=False)
+        levels.scales, levels.rotations = some(Property.SCALE) or None, some(Property.ROTATION) or None
+        if Property.SH0 in self._planes:
+            levels.dc = [channel[start:stop] for channel in self._dc]
+        rest = [stream for prop in SH[1:] for stream in some(prop)]
+        levels.dense = [rest[m : m + 3] for m in range(0, len(rest), 3)]
+        dequantizer.fill(arrays, self.block, levels, self._steps if arrays.sh is not None else None, self.activation)

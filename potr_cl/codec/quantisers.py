@@ -8,10 +8,9 @@ follows from the hyper-parameters (:class:`potr_cl.codec.quantize.HyperParameter
 
 from __future__ import annotations
 
-import abc
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import ClassVar
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,8 +53,8 @@ Levels = NDArray[np.integer]
 ANTIALIASED_SCALE_STEPS = 2
 
 
-class Quantiser(abc.ABC):
-    """What sets a quantiser apart.
+class Paper:
+    """The paper's: uniform steps of every activated value, lengths in world units.
 
     Attributes:
         number: that stands in the file.
@@ -65,11 +64,10 @@ class Quantiser(abc.ABC):
             whether coder BUNDLES is for it.
     """
 
-    number: ClassVar[int]
-    absolute_leaf_levels: ClassVar[bool]
-    colour_steps: ClassVar[bool]
+    number = 0
+    absolute_leaf_levels = False
+    colour_steps = False
 
-    @abc.abstractmethod
     def in_world_units(
         self, parameters: HyperParameters, scene: Scene, nearest: F64, run: Run = map
     ) -> HyperParameters:
@@ -81,64 +79,33 @@ class Quantiser(abc.ABC):
             nearest: (N,) float64 distance of each splat to the nearest view, world units; 0 where there is no view.
             run: in place of :func:`map`, to work with several threads.
         """
-
-    @abc.abstractmethod
-    def quantize_rotations(
-        self, imaginary: F64, scales: Sequence[Levels], sf_rotation: float, run: Run
-    ) -> Iterable[Integers]:
-        """(N, 3) imaginary parts of unit quaternions to levels of x, y and z, (N,) each; ``scales`` as quantised."""
-
-    @staticmethod
-    @abc.abstractmethod
-    def rotation_factors(scales: Sequence[Levels], sf_rotation: float) -> F32:
-        """Scale factors of the rotations of some splats, for :func:`potr_cl.codec.quantize.dequantize_rotations`.
-
-        Args:
-            scales: levels of the scales, (N,) for each axis.
-            sf_rotation: scale factor.
-
-        Returns:
-            float32: (N,), or (1,) if all are the same.
-        """
-
-    @staticmethod
-    @abc.abstractmethod
-    def quantize_opacities(logits: F64, sf_opacity: float) -> Integers:
-        """(N,) logits of opacities to levels, >= 0."""
-
-    @staticmethod
-    @abc.abstractmethod
-    def dequantize_opacities(levels: Levels, sf_opacity: float) -> F32:
-        """(N,) levels to logits of opacities."""
-
-
-class Paper(Quantiser):
-    """The paper's: uniform steps of every activated value, lengths in world units."""
-
-    number = 0
-    absolute_leaf_levels = False
-    colour_steps = False
-
-    def in_world_units(
-        self, parameters: HyperParameters, scene: Scene, nearest: F64, run: Run = map
-    ) -> HyperParameters:
         return parameters
 
     def quantize_rotations(
         self, imaginary: F64, scales: Sequence[Levels], sf_rotation: float, run: Run
     ) -> Iterable[Integers]:
+        """(N, 3) imaginary parts of unit quaternions to levels of x, y and z, (N,) each; ``scales`` as quantised."""
         return run(lambda part: quantize.quantize_rotations(part, sf_rotation), imaginary.T)
 
     @staticmethod
     def rotation_factors(scales: Sequence[Levels], sf_rotation: float) -> F32:
+        """Scale factors of :func:`potr_cl.codec.quantize.dequantize_rotations`, float32: (N,), or (1,) if all are one.
+
+        Args:
+            scales: levels of the scales, (N,) for each axis.
+            sf_rotation: scale factor.
+        """
         return np.full(1, sf_rotation, np.float32)
 
     quantize_opacities = staticmethod(quantize.quantize_opacities)
     dequantize_opacities = staticmethod(quantize.dequantize_opacities)
 
 
-class Balanced(Quantiser):
-    """Steps of equal worth: finer rotations for longer splats, opacities as logits, lengths in sizes of a splat."""
+class Balanced:
+    """Steps of equal worth: finer rotations for longer splats, opacities as logits, lengths in sizes of a splat.
+
+    What it offers is that of :class:`Paper`.
+    """
 
     number = 1
     absolute_leaf_levels = True
@@ -192,5 +159,6 @@ class Balanced(Quantiser):
 _ROWS = 1 << 15
 
 
+Quantiser: TypeAlias = Paper | Balanced
 #: All of them, by their number.
 QUANTISERS: dict[int, Quantiser] = {quantiser.number: quantiser for quantiser in (Paper(), Balanced())}

@@ -18,9 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.logarithm import natural_logarithm
-from potr_cl.codec.native.library import Functions
+from potr_cl.codec.native import quantising
+from potr_cl.codec.native.declarations import CFunctions
 from potr_cl.codec.native.table import definition
 from potr_cl.errors import DataError, UsageError
+from potr_cl.model.spherical_harmonics import rotation_matrices
 
 Integers = NDArray[np.signedinteger]
 F32 = NDArray[np.float32]
@@ -191,17 +193,10 @@ def level_type(largest: float) -> type[np.signedinteger]:
 
 
 def quantize_scales(log_scales: F64, sf_scale: float) -> Integers:
-    """Natural logarithms of standard deviations to levels, in steps of 1 / SF of the standard deviations themselves.
+    """Natural logarithms of standard deviations, float64 of any shape, to levels >= 0 of the same shape.
 
-    Args:
-        log_scales: float64, of any shape.
-        sf_scale: steps a world unit.
-
-    Returns:
-        Integers >= 0 of the same shape.
-
-    Raises:
-        DataError: one is too large for a file.
+    In steps of 1 / SF world units of the standard deviations themselves. Raises DataError if one is too large for a
+    file.
     """
     with np.errstate(over="ignore"):
         return _to_levels(np.exp(log_scales), sf_scale, "standard deviation")
@@ -281,17 +276,7 @@ def _octahedral_rotations() -> tuple[F64, NDArray[np.intp]]:
                 g[i], g[j] = np.sqrt(0.5), sign * np.sqrt(0.5)
                 quaternions.append(g)
     table = np.array(quaternions)
-    permutations = []
-    for w, x, y, z in table:
-        matrix = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
-        permutations.append(np.abs(matrix).argmax(axis=0))
-    return table, np.array(permutations)
+    return table, np.abs(rotation_matrices(table)).argmax(axis=1)
 
 
 _GROUP, _PERMUTATIONS = _octahedral_rotations()
@@ -330,11 +315,7 @@ def canonical_rotations(quaternions: F32, log_scales: F32, order: NDArray[np.int
     gw, gx, gy, gz = _GROUP[best].T
     w, x, y, z = q.T
     product = np.stack(
-        [
-            w * gx + x * gw + y * gz - z * gy,
-            w * gy - x * gz + y * gw + z * gx,
-            w * gz + x * gy - y * gx + z * gw,
-        ],
+        [w * gx + x * gw + y * gz - z * gy, w * gy - x * gz + y * gw + z * gx, w * gz + x * gy - y * gx + z * gw],
         axis=1,
     )
     product[np.take_along_axis(real, best[:, None], axis=1)[:, 0] < 0] *= -1
@@ -342,11 +323,12 @@ def canonical_rotations(quaternions: F32, log_scales: F32, order: NDArray[np.int
 
 
 def _canonical_rotations_by_c(
-    functions: Functions, quaternions: F32, log_scales: F32, order: NDArray[np.int64] | None = None
+    c: CFunctions, quaternions: F32, log_scales: F32, order: NDArray[np.int64] | None = None
 ) -> tuple[F64, F32]:
     order = np.arange(len(quaternions)) if order is None else order
     imaginary, turned = np.empty((len(order), 3)), np.empty((len(order), 3), np.float32)
-    functions.quantising.canonical(
+    quantising.canonical(
+        c,
         np.ascontiguousarray(quaternions, np.float32),
         np.ascontiguousarray(log_scales, np.float32),
         np.ascontiguousarray(order, np.int64),
@@ -369,28 +351,17 @@ def rotation_factors(scales: Sequence[NDArray[np.integer]], sf_rotation: float) 
 
 
 def quantize_rotations(imaginary: F64, factor: float | F32) -> Integers:
-    """One imaginary part of unit quaternions to levels, in steps of 1 / factor.
+    """One imaginary part of unit quaternions, (N,) float64, to signed levels, (N,).
 
-    Args:
-        imaginary: (N,) float64, -1 to 1.
-        factor: steps a unit, one for all splats or (N,).
-
-    Returns:
-        (N,) signed integers.
-
-    Raises:
-        DataError: one is too large for a file.
+    In steps of 1 / factor, which is one for all splats or (N,). Raises DataError if one is too large for a file.
     """
     return _to_levels(imaginary, factor, "quaternion component")
 
 
 def dequantize_rotations(levels: Sequence[NDArray[np.integer]], factor: float | F32, out: F32) -> None:
-    """Three times (N,) levels, of x, y, z, to unit quaternions w, x, y, z in ``out``; w ≥ 0 is computed from the rest.
+    """Levels of x, y and z, (N,) each, to unit quaternions w, x, y, z in ``out``, (N, 4) float32.
 
-    Args:
-        levels: of x, y and z, (N,) each.
-        factor: steps a unit, one for all splats or (N,).
-        out: (N, 4) float32, to be filled.
+    ``factor``: steps a unit, one for all splats or (N,). w ≥ 0 is computed from the rest.
     """
     rest = np.ones(len(out), np.float32)
     factor = np.asarray(factor, np.float32)
@@ -436,10 +407,10 @@ def nonzero_levels(sh: F32, sf_sh: float) -> NDArray[np.bool_]:
     return planar.transpose(2, 0, 1)
 
 
-def _nonzero_levels_by_c(functions: Functions, sh: F32, sf_sh: float) -> Any:
+def _nonzero_levels_by_c(c: CFunctions, sh: F32, sf_sh: float) -> Any:
     if not (sh.flags.c_contiguous and sh.dtype == np.float32):
         return NotImplemented
-    found = functions.quantising.nonzero_levels(sh, sf_sh, _LARGEST)
+    found = quantising.nonzero_levels(c, sh, sf_sh, _LARGEST)
     return NotImplemented if found is None else found.transpose(2, 0, 1)
 
 

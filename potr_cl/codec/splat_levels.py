@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import quantize
-from potr_cl.codec.native.library import Functions
+from potr_cl.codec.native import quantising
+from potr_cl.codec.native.declarations import CFunctions
 from potr_cl.codec.native.table import definition
 from potr_cl.codec.quantisers import QUANTISERS, Balanced
 from potr_cl.codec.steps.rule import factors
@@ -64,9 +65,7 @@ def splat_levels(scene: Scene, order: I64, world: quantize.HyperParameters, run:
     return SplatLevels(scales, list(rotations), opacities)
 
 
-def _splat_levels_by_c(
-    functions: Functions, scene: Scene, order: I64, world: quantize.HyperParameters, run: Run = map
-) -> Any:
+def _splat_levels_by_c(c: CFunctions, scene: Scene, order: I64, world: quantize.HyperParameters, run: Run = map) -> Any:
     """Not where a level has more than 32 bits, which NumPy has to say or to hold."""
     if not isinstance(QUANTISERS[world.quantiser], Balanced):
         return NotImplemented
@@ -83,9 +82,10 @@ def _splat_levels_by_c(
     def quantise(start: int) -> NDArray[np.int32] | None:
         rows = order[start : start + BLOCK]
         own = sizes[start : start + BLOCK]
-        return functions.quantising.splat_levels(
-            quaternions, own, logits, rows, *quantize.AXIS_ROTATIONS, factors, quantize.RANGE_OF_LOGITS, start, levels
-        )
+        return quantising.splat_levels(
+            c, quaternions, own, logits, rows, *quantize.AXIS_ROTATIONS, factors, quantize.RANGE_OF_LOGITS, start,
+            levels,
+        )  # fmt: skip
 
     list(run(exponentials, range(0, len(order), _MANY)))
     found = list(run(quantise, range(0, len(order), BLOCK)))
@@ -195,12 +195,12 @@ def quantised(
 
 
 def _quantised_by_c(
-    functions: Functions, columns: FloatArray, rows: NDArray[np.int64], dc: _Factor, ac: _Factor, start: int,
+    c: CFunctions, columns: FloatArray, rows: NDArray[np.int64], dc: _Factor, ac: _Factor, start: int,
     levels: NDArray[Any],
 ) -> Any:  # fmt: skip
     planar, sh = columns.flags.c_contiguous, columns.transpose(2, 0, 1)
     if columns.dtype != np.float32 or not (planar or sh.flags.c_contiguous):
         return NotImplemented
     of_dc, of_ac = (np.broadcast_to(np.asarray(each, np.float64), rows.shape).copy() for each in (dc, ac))
-    fit = functions.quantising.colour_levels(columns if planar else sh, planar, rows, of_dc, of_ac, start, levels)
+    fit = quantising.colour_levels(c, columns if planar else sh, planar, rows, of_dc, of_ac, start, levels)
     return [] if fit else NotImplemented

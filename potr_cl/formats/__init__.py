@@ -6,7 +6,6 @@ import logging
 import math
 import os
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -44,8 +43,8 @@ def load_scene(path: str | os.PathLike[str], trust: bool = False, antialiased: b
         UsageError: the file cannot be opened, or its extension is unknown.
         DataError: its content is damaged, or it holds too many splats for its size.
     """
-    with _silent_overflows(), streams.plain(Path(path), trust) as file:
-        return registry.reader_of(file)(file, trust).rendered(antialiased)
+    with np.errstate(all="ignore"), streams.plain(Path(path), trust) as file:
+        return registry.format_of(file).load(file, trust).rendered(antialiased)
 
 
 def scene_writer(path: str | os.PathLike[str], **choices: Any) -> Callable[[Scene], None]:
@@ -61,7 +60,7 @@ def scene_writer(path: str | os.PathLike[str], **choices: Any) -> Callable[[Scen
             such choice or version.
     """
     path = Path(path)
-    entry, save = registry.written_format(path), registry.writer_of(path)
+    entry = registry.written_format(path)
     if "source" not in entry.choices:
         choices.pop("source", None)
     given = {name: value for name, value in choices.items() if value is not None}
@@ -72,7 +71,8 @@ def scene_writer(path: str | os.PathLike[str], **choices: Any) -> Callable[[Scen
         raise UsageError(f"'{path}': {entry.name} {has}, not {version}")
     for name in given.keys() - {"version", *entry.choices}:
         raise UsageError(f"'{path}': {entry.name} has no {name} to choose")
-    return partial(save, path, **given)
+    assert entry.save is not None
+    return partial(entry.save, path, **given)
 
 
 def save_scene(path: str | os.PathLike[str], scene: Scene, **choices: Any) -> None:
@@ -107,7 +107,7 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
     path = Path(path)
     refuse_lfs_pointer(path)
     try:
-        with _silent_overflows():
+        with np.errstate(all="ignore"):  # what overflows is dropped or refused by name
             cameras = _from_folder(path) if path.is_dir() else _from_file(path)
     except OSError as error:
         raise UsageError(f"cannot read '{error.filename or path}': {error.strerror or error}") from error
@@ -129,11 +129,6 @@ def _tell_of_wide_views(path: Path, cameras: list[Camera]) -> None:
             "'%s': %d of %d views are very wide, up to %.0f degrees: are their focal lengths in pixels of %d x %d?",
             path, len(wide), len(cameras), degrees, one.width, one.height,
         )  # fmt: skip
-
-
-def _silent_overflows() -> AbstractContextManager[Any]:
-    """Of a block in which numpy gives no warnings: what overflows is dropped or refused by name."""
-    return np.errstate(all="ignore")
 
 
 def _from_file(path: Path) -> list[Camera]:

@@ -121,6 +121,11 @@ def _opened_photograph(path: Path) -> Iterator[Image.Image]:
         raise DataError(f"'{path}' is damaged or of another kind: {reason}") from None
 
 
+def _refuse_deep(path: Path, image: Image.Image) -> None:
+    if image.mode in _DEEP_MODES:
+        raise DataError(f"'{path}' has more than 8 bits a channel: convert it to an 8-bit image")
+
+
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image file, from its header alone.
 
@@ -147,8 +152,7 @@ def read_ground_truth(path: Path, background: Colour = (0.0, 0.0, 0.0)) -> Float
         DataError: it is no PNG, JPEG or WebP image, is damaged, or has other than 8 bits a channel or too many pixels.
     """
     with _opened_photograph(path) as image:
-        if image.mode in _DEEP_MODES:
-            raise DataError(f"'{path}' has more than 8 bits a channel: convert it to an 8-bit image")
+        _refuse_deep(path, image)
         transparent = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
         pixels = np.asarray(image.convert("RGBA" if transparent else "RGB"), dtype=np.float32) / np.float32(255)
     if not transparent:
@@ -172,8 +176,7 @@ def read_thumbnail(path: Path, width: int, height: int, shape: float, tolerance:
         As :func:`read_ground_truth`; and DataError if it has another shape.
     """
     with _opened_photograph(path) as image:
-        if image.mode in _DEEP_MODES:
-            raise DataError(f"'{path}' has more than 8 bits a channel: convert it to an 8-bit image")
+        _refuse_deep(path, image)
         if abs(image.width / image.height / shape - 1) > tolerance:
             raise DataError(f"'{path}' has another shape than its view")
         image.draft("RGB", (2 * width, 2 * height))  # a JPEG is decoded no finer than that

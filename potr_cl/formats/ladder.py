@@ -97,11 +97,7 @@ class Ladder:
         return (json.dumps(self.document(), indent=1) + "\n").encode()
 
     def save(self) -> None:
-        """Write the description; it appears only when it is whole.
-
-        Raises:
-            UsageError: it cannot be written there.
-        """
+        """Write the description; it appears only when it is whole. Raises UsageError if it cannot be written there."""
         with replacing(self.path) as file:
             file.write(self.encoded())
 

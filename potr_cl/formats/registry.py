@@ -17,9 +17,9 @@ from pathlib import Path
 from potr_cl.errors import DataError, PotrError, UsageError
 from potr_cl.formats.cameras import cameras_json, colmap, transforms
 from potr_cl.formats.cameras.view_files import read_json
-from potr_cl.formats.declaration import CameraFormat, SceneFormat, SceneLoader, SceneSaver
+from potr_cl.formats.declaration import CameraFormat, SceneFormat
 from potr_cl.formats.ladder import ladder_at
-from potr_cl.formats.scenes import compressed_ply, gltf, ksplat, page, ply, potr, sog, sog_levels, splat, spz
+from potr_cl.formats.scenes import compressed_ply, gltf, ksplat, page, ply, sog, sog_levels, splat, spz
 from potr_cl.formats.scenes.scene_files import without_level
 
 _GSPLAT = "export it as PLY, by gsplat's simple_trainer.py with --save-ply or by gsplat.export_splats"
@@ -30,7 +30,7 @@ _CHECKPOINTS = {".pt": _GSPLAT, ".pth": _GSPLAT, ".ckpt": _NERFSTUDIO}
 #: In the order in which people are told of them.
 SCENE_FORMATS: tuple[SceneFormat, ...] = (
     ply.FORMAT,
-    potr.FORMAT,
+    page.POTR,
     compressed_ply.FORMAT,
     spz.FORMAT,
     sog.FORMAT,
@@ -52,20 +52,7 @@ _GZIP = b"\x1f\x8b"
 
 #: In the order in which a folder is searched for them. cameras.json stands before transforms.json, for it lists just
 #: the views that a scene was trained with, as they were.
-CAMERA_FORMATS: tuple[CameraFormat, ...] = (
-    colmap.FORMAT,
-    cameras_json.FORMAT,
-    transforms.FORMAT,
-)
-
-
-def reader_of(path: Path) -> SceneLoader:
-    """What reads a scene; see :func:`format_of`.
-
-    Raises:
-        UsageError: no format has this extension.
-    """
-    return format_of(path).load
+CAMERA_FORMATS: tuple[CameraFormat, ...] = (colmap.FORMAT, cameras_json.FORMAT, transforms.FORMAT)
 
 
 def format_of(path: Path) -> SceneFormat:
@@ -199,11 +186,7 @@ def read_suffix(suffix: str) -> str:
 
 
 def written_suffix(suffix: str) -> str:
-    """The same for a format that is to be written.
-
-    Raises:
-        UsageError: no format has it, or it is only read.
-    """
+    """The same for a format that is to be written. Raises UsageError if no format has it, or it is only read."""
     wanted = read_suffix(suffix)
     written_format(Path(f"scene{wanted}"))
     return wanted
@@ -228,17 +211,6 @@ def suffix_of_name(path: Path) -> str | None:
     """The longest suffix of a format that a file's name ends in, ".compressed.ply" rather than ".ply"; None: no one."""
     fitting = [suffix for suffix in _scene_suffixes(SCENE_FORMATS) if path.name.lower().endswith(suffix)]
     return max(fitting, key=len, default=None)
-
-
-def writer_of(path: Path) -> SceneSaver:
-    """What writes a scene in the format that the suffixes of the file to be written ask for.
-
-    Raises:
-        UsageError: no format has this suffix, or it is only read.
-    """
-    save = written_format(path).save
-    assert save is not None
-    return save
 
 
 def written_format(path: Path) -> SceneFormat:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import partial
 from itertools import islice
 from typing import Any, Generic, TypeVar
 
@@ -86,72 +86,31 @@ class Ahead(Generic[S, T]):
         self._pool.shutdown(cancel_futures=True)
 
 
-class SharedWork:
-    """Tasks that some threads take one by one, each the next that nobody has taken.
+class Spare(Generic[T]):
+    """Memory that threads work in and leave for whoever comes next: what was written to before is there at once.
 
-    A task may share out parts of its own work (:meth:`run`): these come before all other tasks, and the thread that
-    shares them out does what nobody else takes, so that it never waits for a thread to be free.
+    Args:
+        make: new memory, where none is left.
+        most: so much of it is kept.
     """
 
-    def __init__(self) -> None:
-        self._tasks: deque[_Task] = deque()
+    def __init__(self, make: Callable[[], T], most: float = math.inf) -> None:
+        self._make, self._most = make, most
+        self._free: list[T] = []
 
-    def add(self, work: Callable[[], Any]) -> Future[Any]:
-        """A task behind all others; what it returns or raises is the future's."""
-        self._tasks.append(task := _Task(work))
-        return task.future
-
-    def do(self) -> None:
-        """A thread's share: tasks until none are left that nobody has taken. What they raise is in their futures."""
-        while True:
-            try:
-                task = self._tasks.popleft()
-            except IndexError:
-                return
-            task.do()
-
-    def run(self, work: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
-        """Call a function with each item, with the help of threads that do their share meanwhile (:data:`Run`).
-
-        Raises:
-            What one of the calls raises; others may not have been made then.
-        """
-        tasks = [_Task(partial(work, item)) for item in items]
-        self._tasks.extendleft(reversed(tasks))
-        for task in tasks:
-            task.do()
-        return [task.future.result() for task in tasks]
-
-    def forget(self) -> None:
-        """Leave what nobody has taken undone."""
-        self._tasks.clear()
-
-
-class _Task:
-    """Something to be done once, by whoever comes first."""
-
-    def __init__(self, work: Callable[[], Any]) -> None:
-        self._work = work
-        self._mine = deque((True,))  # what is popped is nobody else's
-        self.future: Future[Any] = Future()
-
-    def do(self) -> None:
+    @contextmanager
+    def taken(self) -> Iterator[T]:
+        """Some of it, for the block alone."""
         try:
-            self._mine.pop()
-        except IndexError:
-            return
+            memory = self._free.pop()
+        except IndexError:  # whatever other threads do meanwhile
+            memory = self._make()
         try:
-            self.future.set_result(self._work())
-        except Exception as error:  # the one who asks for the result is told
-            self.future.set_exception(error)
-        except BaseException as error:  # Ctrl-C
-            self.future.set_exception(error)
-            raise
+            yield memory
+        finally:
+            if len(self._free) < self._most:
+                self._free.append(memory)
 
-
-def first_error(futures: Iterable[Future[Any]]) -> BaseException | None:
-    """Wait until all is done, or until something raised: what the first in their order has raised, or None."""
-    futures = list(futures)
-    done, _ = wait(futures, return_when=FIRST_EXCEPTION)
-    errors = (future.exception() for future in futures if future in done)
-    return next((error for error in errors if error is not None), None)
+    def all(self) -> list[T]:
+        """All that was made, while nobody is at work and none was too much."""
+        return self._free

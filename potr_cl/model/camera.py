@@ -122,11 +122,7 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
 
 
 def train_views(cameras: Sequence[Camera]) -> list[Camera]:
-    """The views that the encoder may look at.
-
-    Raises:
-        UsageError: there is none.
-    """
+    """The views that the encoder may look at. Raises UsageError if there is none."""
     views = [c for c in cameras if c.split == "train"]
     if not views:
         raise UsageError("none of the cameras is a training view: encoding looks at training views only")

@@ -121,19 +121,13 @@ def matter_of(scene: Scene, frame: Frame, targets: int = _TARGETS, occluders: in
     )
 
 
-def surroundings(camera_centre: F64, matter: Matter) -> tuple[F32, float]:
-    """What is around ``camera centre``.
+def surroundings_of(places: F64, matter: Matter) -> tuple[F32, list[float]]:
+    """What is around some places, (V, 3).
 
     Returns:
-        Distance of the nearest point in each cell of the cube map, infinite where there is none; and the part of all
-        directions that matter within arm's length takes up.
+        (V, cells) distance of the nearest point in each cell of the cube map, infinite where there is none; and of each
+        place the part of all directions that matter within arm's length takes up.
     """
-    horizons, (blocked,) = surroundings_of(camera_centre[None], matter)
-    return horizons[0], blocked
-
-
-def surroundings_of(places: F64, matter: Matter) -> tuple[F32, list[float]]:
-    """The same of some places, (V, 3): horizons (V, cells), and what is taken up of each."""
     rays = matter.occluders[:, None] - places.T.astype(np.float32)[:, :, None]
     x, y, z = rays
     squared = x * x

@@ -161,7 +161,4 @@ def _turn(axes: F64) -> str:
 
 #: What people and programs do to scenes, the usual first. Axes of OpenGL and of COLMAP differ by half a turn about x,
 #: "z up" and "y up" by a quarter; units by powers of ten.
-LIKELY_MOTIONS = (
-    *(Motion(axes, 1.0) for axes in _all_axes()[1:]),
-    *(Motion(np.eye(3), factor) for factor in _FACTORS),
-)
+LIKELY_MOTIONS = (*(Motion(axes, 1.0) for axes in _all_axes()[1:]), *(Motion(np.eye(3), factor) for factor in _FACTORS))

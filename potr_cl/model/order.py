@@ -5,13 +5,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from queue import Empty, SimpleQueue
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.host.threads import Run
+from potr_cl.host.threads import Run, Spare
 
 #: So many numbers are put into ranges first, which threads sort; numbers of a range, on the average, and how many
 #: ranges there are at most (their numbers take a byte).
@@ -131,31 +130,27 @@ def morton_codes(means: NDArray[np.float32], run: Run = map) -> NDArray[np.uint6
     codes = np.empty(len(means), np.uint64)
     table = spread(np.arange(1 << _TABLED, dtype=np.uint64))
 
-    spare: SimpleQueue[_Room] = SimpleQueue()
+    spare = Spare(lambda: _Room(min(_ROWS, len(means))))
 
     def place(start: int) -> None:
-        try:
-            room = spare.get_nowait()
-        except Empty:
-            room = _Room(min(_ROWS, len(means)))
         own = means[start : start + _ROWS]
         count = slice(len(own))
-        within, cells = room.within[:, count], room.cells[:, count]
-        some = within.view(np.int64)  # when the places are not needed any more
-        bits, more = room.bits[:, count], room.more[:, count]
-        np.subtract(own.T, corner[:, None], out=within)
-        np.multiply(within, (1 << BITS) / side, out=within)
-        np.clip(within, 0, (1 << BITS) - 1, out=within)
-        cells[:] = within
-        np.bitwise_and(cells, (1 << _TABLED) - 1, out=some)
-        np.take(table, some, out=bits, mode="clip")
-        np.right_shift(cells, _TABLED, out=cells)
-        np.take(table, cells, out=more, mode="clip")
-        np.left_shift(more, np.uint64(3 * _TABLED), out=more)
-        np.bitwise_or(bits, more, out=bits)
-        np.left_shift(bits, np.arange(3, dtype=np.uint64)[:, None], out=bits)
-        np.bitwise_or.reduce(bits, axis=0, out=codes[start : start + _ROWS])
-        spare.put(room)
+        with spare.taken() as room:
+            within, cells = room.within[:, count], room.cells[:, count]
+            some = within.view(np.int64)  # when the places are not needed any more
+            bits, more = room.bits[:, count], room.more[:, count]
+            np.subtract(own.T, corner[:, None], out=within)
+            np.multiply(within, (1 << BITS) / side, out=within)
+            np.clip(within, 0, (1 << BITS) - 1, out=within)
+            cells[:] = within
+            np.bitwise_and(cells, (1 << _TABLED) - 1, out=some)
+            np.take(table, some, out=bits, mode="clip")
+            np.right_shift(cells, _TABLED, out=cells)
+            np.take(table, cells, out=more, mode="clip")
+            np.left_shift(more, np.uint64(3 * _TABLED), out=more)
+            np.bitwise_or(bits, more, out=bits)
+            np.left_shift(bits, np.arange(3, dtype=np.uint64)[:, None], out=bits)
+            np.bitwise_or.reduce(bits, axis=0, out=codes[start : start + _ROWS])
 
     list(run(place, range(0, len(means), _ROWS)))
     return codes

@@ -115,12 +115,7 @@ class Scene:
         for name in _ARRAYS:
             object.__setattr__(self, name, _cast(getattr(self, name), name))
         n = len(self.means) if self.means.ndim else 0
-        wanted = {
-            "means": (n, 3),
-            "log_scales": (n, 3),
-            "quaternions": (n, 4),
-            "opacity_logits": (n,),
-        }
+        wanted = {"means": (n, 3), "log_scales": (n, 3), "quaternions": (n, 4), "opacity_logits": (n,)}
         for name, shape in wanted.items():
             array = getattr(self, name)
             if array.shape != shape:
@@ -155,17 +150,49 @@ class Scene:
         if not isinstance(other, Scene):
             return NotImplemented
         same = (self.antialiased, self.low_pass) == (other.antialiased, other.low_pass)
-        return same and all(np.array_equal(getattr(self, name), getattr(other, name)) for name in _ARRAYS)
+        return same and all(map(np.array_equal, self.arrays, other.arrays))
 
     @property
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics, 0 to 3."""
         return SH_COEFFICIENTS.index(self.sh.shape[1])
 
+    @staticmethod
+    def blank(splats: int, coefficients: int, like: Scene | None = None, by_splat: bool = False) -> Scene:
+        """A scene whose arrays are still to be filled.
+
+        Args:
+            splats: N.
+            coefficients: M, of a channel.
+            like: to be rendered as this one; None: classic.
+            by_splat: whether a splat's SH coefficients stand together, as readers fill them first of all, instead of
+                each coefficient being contiguous in memory.
+        """
+        shape = (splats, coefficients, 3) if by_splat else (coefficients, 3, splats)
+        sh = mapped.array(shape, np.float32, "SH coefficients", first=by_splat)
+        scene = Scene(
+            np.empty((splats, 3), np.float32),
+            np.empty((splats, 3), np.float32),
+            np.empty((splats, 4), np.float32),
+            np.empty(splats, np.float32),
+            sh if by_splat else sh.transpose(2, 0, 1),
+        )
+        return scene if like is None else like.of_arrays(scene.arrays)
+
+    @property
+    def arrays(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """means, log_scales, quaternions, opacity_logits and sh."""
+        return self.means, self.log_scales, self.quaternions, self.opacity_logits, self.sh
+
+    def of_arrays(self, arrays: Sequence[FloatArray]) -> Scene:
+        """A scene to be rendered like this one, of other :attr:`arrays`."""
+        means, log_scales, quaternions, opacity_logits, sh = arrays
+        return Scene(means, log_scales, quaternions, opacity_logits, sh, self.antialiased, self.low_pass)
+
     @property
     def nbytes(self) -> int:
         """Bytes of all arrays."""
-        return sum(a.nbytes for a in (self.means, self.log_scales, self.quaternions, self.opacity_logits, self.sh))
+        return sum(array.nbytes for array in self.arrays)
 
     @property
     def scales(self) -> FloatArray:
@@ -191,26 +218,17 @@ class Scene:
         """The splats that ``index`` (integers or a boolean mask) selects, in its order."""
         numbers = np.asarray(index)
         if (sh := mapped.rows(self.sh, numbers, "SH coefficients")) is not None:
-            own = self.means[numbers], self.log_scales[numbers], self.quaternions[numbers], self.opacity_logits[numbers]
-            return dataclasses.replace(
-                self, means=own[0], log_scales=own[1], quaternions=own[2], opacity_logits=own[3], sh=sh
-            )
+            return self.of_arrays([*(each[numbers] for each in self.arrays[:-1]), sh])
         # Much quicker for whole rows than indexing.
         fast = numbers.dtype.kind in "iu" and self.sh.flags.c_contiguous
         if fast and len(numbers) >= _LARGE and numbers.min() >= 0 and numbers.max() < len(self):
             return self._rows(numbers.astype(np.intp, copy=False))
-        return dataclasses.replace(
-            self,
-            means=self.means[index],
-            log_scales=self.log_scales[index],
-            quaternions=self.quaternions[index],
-            opacity_logits=self.opacity_logits[index],
-            sh=self.sh.take(numbers.astype(np.intp, copy=False), axis=0) if fast else self.sh[index],
-        )
+        sh = self.sh.take(numbers.astype(np.intp, copy=False), axis=0) if fast else self.sh[index]
+        return self.of_arrays([*(each[index] for each in self.arrays[:-1]), sh])
 
     def _rows(self, numbers: NDArray[np.intp]) -> Scene:
         """:meth:`subset` of many splats: the memory that is new takes longer than the copy, and threads share it."""
-        given = (self.means, self.log_scales, self.quaternions, self.opacity_logits, self.sh)
+        given = self.arrays
         taken = [np.empty((len(numbers), *each.shape[1:]), each.dtype) for each in given]
 
         def take(first: int) -> None:
@@ -224,10 +242,7 @@ class Scene:
         """A scene like this one of other arrays, which threads fill by runs: ``take`` gets where each begins."""
         with thread_pool() as pool:
             list(pool.map(take, range(0, len(arrays[0]), _LARGE // 8)))
-        means, log_scales, quaternions, opacity_logits, sh = arrays
-        return dataclasses.replace(
-            self, means=means, log_scales=log_scales, quaternions=quaternions, opacity_logits=opacity_logits, sh=sh
-        )
+        return self.of_arrays(arrays)
 
     def joined(self, other: Scene, order: NDArray[np.int64]) -> Scene:
         """The splats of this scene and of another one of the same SH degree, each once.
@@ -236,13 +251,7 @@ class Scene:
             other: the other one.
             order: (N,) their numbers, those of the other one's splats counted on from this one's.
         """
-        given = [
-            (self.means, other.means),
-            (self.log_scales, other.log_scales),
-            (self.quaternions, other.quaternions),
-            (self.opacity_logits, other.opacity_logits),
-            (self.sh, other.sh),
-        ]
+        given = list(zip(self.arrays, other.arrays, strict=True))
         made = [np.empty((len(order), *own.shape[1:]), np.float32) for own, _ in given[:-1]]
         made.append(mapped.array((len(order), *self.sh.shape[1:]), np.float32, "SH coefficients"))
 
@@ -264,8 +273,8 @@ class Scene:
     def put(self, first: int, part: Scene) -> None:
         """Replace the splats from number ``first`` on by those of another scene of the same SH degree, in place."""
         own = slice(first, first + len(part))
-        for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
-            getattr(self, name)[own] = getattr(part, name)
+        for array, its in zip(self.arrays, part.arrays, strict=True):
+            array[own] = its
 
     def rendered(self, antialiased: bool | None) -> Scene:
         """The scene as it is to be rendered: antialiased, classic, or, for None, as it was trained.
@@ -297,7 +306,7 @@ class Scene:
             """Block by block the temporaries stay in the cache, and one without fault is done at the first look."""
             for first in range(start, stop, _BLOCK):
                 rows = slice(first, min(first + _BLOCK, stop))
-                for array in (self.means, self.log_scales, self.quaternions, self.opacity_logits, self.sh):
+                for array in self.arrays:
                     ok = np.isfinite(array[rows])
                     if not ok.all():
                         finite[rows] &= ok.reshape(len(ok), -1).all(axis=1)
@@ -340,16 +349,7 @@ def joined(parts: Sequence[Scene]) -> Scene:
     """
     if len(parts) == 1:
         return parts[0]
-    splats, count = sum(map(len, parts)), parts[0].sh.shape[1]
-    whole = Scene(
-        np.empty((splats, 3), np.float32),
-        np.empty((splats, 3), np.float32),
-        np.empty((splats, 4), np.float32),
-        np.empty(splats, np.float32),
-        mapped.array((count, 3, splats), np.float32, "SH coefficients").transpose(2, 0, 1),
-        parts[0].antialiased,
-        parts[0].low_pass,
-    )
+    whole = Scene.blank(sum(map(len, parts)), parts[0].sh.shape[1], parts[0])
     first = 0
     for part in parts:
         whole.put(first, part)

@@ -156,11 +156,7 @@ class ViewStatistics:
 
 
 def sample(scene: Scene) -> Sample:
-    """A sample of a scene, the same on every call.
-
-    Args:
-        scene: clean, at least one splat.
-    """
+    """A sample of a scene, the same on every call; ``scene``: clean, at least one splat."""
     rows = looked_at(len(scene))
     opaque = rows[opacities_of(scene.opacity_logits[rows]) > _OPAQUE]
     scene = scene.subset(opaque if len(opaque) else rows)

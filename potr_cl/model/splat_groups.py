@@ -285,10 +285,7 @@ def bounds(camera: Camera) -> tuple[tuple[float, float], tuple[float, float]]:
     """The planes left and right of a view's picture, and above and below it, as positions at a depth of 1."""
     x, y = (
         ((-_PIXELS_OF_ONE - centre) / focal, (pixels + _PIXELS_OF_ONE - centre) / focal)
-        for focal, centre, pixels in (
-            (camera.fx, camera.cx, camera.width),
-            (camera.fy, camera.cy, camera.height),
-        )
+        for focal, centre, pixels in ((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height))
     )
     return x, y
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+import re
 import threading
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
@@ -205,6 +206,13 @@ class Device:
                         self._built_before[text, tuple(options)] = program
                     self._programs[wanted] = program
         return self._programs[wanted]
+
+    def compiler_log(self) -> list[str]:
+        """What the compiler has warned of in the programs built so far, each line once."""
+        log = cl.program_build_info.LOG
+        said = [self._programs[each].get_build_info(self.info.handle, log) for each in sorted(self._programs)]
+        lines = (line.strip() for text in said for line in text.splitlines())
+        return list(dict.fromkeys(line for line in lines if re.search(r"\b(?:warning|error)\b", line, re.IGNORECASE)))
 
     def kernel(self, source: str, name: str, **defines: str | int | float) -> Kernel:
         """A new kernel object of :meth:`program`; keep it, making one is slow.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from contextlib import ExitStack
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
@@ -19,12 +19,18 @@ if TYPE_CHECKING:
 MARGIN = 1.25
 
 
-class Owner(ABC):
-    """Something that holds device memory until it is closed: ``with Rasterizer(…) as rasterizer:``."""
+class Owner:
+    """Something that holds device memory until it is closed: ``with Rasterizer(…) as rasterizer:``.
 
-    @abstractmethod
+    What it has is in its ``_memory``, or in a stack of its own, ``_owned``; or it says in :meth:`close` where.
+    """
+
+    _memory: Memory
+    _owned: ExitStack
+
     def close(self) -> None:
         """Give all device memory back; the object is of no use afterwards. Closing twice does no harm."""
+        (self._owned if hasattr(self, "_owned") else self._memory).close()
 
     def __enter__(self) -> Self:
         return self

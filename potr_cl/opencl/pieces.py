@@ -13,12 +13,12 @@ are not cut along that dimension.
 from __future__ import annotations
 
 import re
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
 from math import prod
 from pathlib import Path
+from time import perf_counter
 
 import pyopencl as cl
 
@@ -114,10 +114,10 @@ class Pieces:
             place, size = walk.next(max(count, 1))
             offset = tuple(p * u for p, u in zip(place, unit, strict=True))
             wide = tuple(min(s * u, n - o) for s, u, n, o in zip(size, unit, items, offset, strict=True))
-            began = time.perf_counter()
+            began = perf_counter()
             enqueue(wide, offset)
             queue.finish()
-            took = time.perf_counter() - began
+            took = perf_counter() - began
             self.longest[name] = max(took, self.longest.get(name, 0.0))
             rate = took / prod(size)
             known = self._known[kernel] = _Known(

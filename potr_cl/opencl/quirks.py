@@ -102,7 +102,7 @@ SIMULATOR = Quirk(
 )
 
 #: Work-groups of the CPU kernels have one work-item, and those of the kernels on splats a fixed size
-#: (raster/launch_cpu.py, raster/scene_buffers.py, stages/pruning/launcher.py). Harmless elsewhere, so nobody asks.
+#: (raster/launcher.py, raster/scene_buffers.py, stages/pruning/sweep.py). Harmless elsewhere, so nobody asks.
 SMALL_GROUPS = Quirk(
     vendor="PoCL",
     versions="3.0 and 3.1",

@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import json
 import os
 import signal
 import subprocess
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import platformdirs
 
@@ -45,7 +46,18 @@ def kept(info: DeviceInfo) -> tuple[bool, str | None]:
 
 def tried(info: DeviceInfo) -> str | None:
     """Try a device, and keep the verdict where the user's cache can be written: what is wrong, None if nothing is."""
-    decided, fault = _trial(info)
+    return _settled(info, *_trial(info)[:2])
+
+
+def measured(info: DeviceInfo) -> tuple[str | None, dict[str, Any]]:
+    """The same, and what :func:`potr_cl.pipeline.trial.measured` finds; nothing of a device that fails."""
+    decided, fault, said = _trial(info, "--measure")
+    with suppress(ValueError):
+        return _settled(info, decided, fault), json.loads(said)
+    return _settled(info, decided, fault), {}
+
+
+def _settled(info: DeviceInfo, decided: bool, fault: str | None) -> str | None:
     path = _file(info)
     with suppress(OSError):
         if not decided:
@@ -55,9 +67,9 @@ def tried(info: DeviceInfo) -> str | None:
     return fault
 
 
-def _trial(info: DeviceInfo) -> tuple[bool, str | None]:
-    """Whether a trial came to an end, and what it found."""
-    command = [sys.executable, "-m", _MODULE, str(info.index)]
+def _trial(info: DeviceInfo, *how: str) -> tuple[bool, str | None, str]:
+    """Whether a trial came to an end, what is wrong, and what it printed."""
+    command = [sys.executable, "-m", _MODULE, str(info.index), *how]
     folders = os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])])
     environment = os.environ | {TRUST_VARIABLE: "1", "PYTHONPATH": folders}
     try:
@@ -70,15 +82,15 @@ def _trial(info: DeviceInfo) -> tuple[bool, str | None]:
             check=False,
         )
     except subprocess.TimeoutExpired:
-        return True, f"its self-check did not end within {_PATIENCE / 60:.0f} minutes"
+        return True, f"its self-check did not end within {_PATIENCE / 60:.0f} minutes", ""
     except OSError:
-        return False, None  # where no process can be started
+        return False, None, ""  # where no process can be started
     if run.returncode in (0, -signal.SIGINT, -signal.SIGTERM, -9):  # -9: killed, perhaps as memory was short
-        return run.returncode == 0, None
+        return run.returncode == 0, None, run.stdout.decode("utf-8", "replace")
     if run.returncode < 0 or run.returncode >= 1 << 30:  # a signal, or an exception of Windows
-        return True, "its driver crashes while an encode runs"
+        return True, "its driver crashes while an encode runs", ""
     lines = run.stderr.decode("utf-8", "replace").strip().splitlines()
-    return True, lines[-1] if lines else f"its self-check ended with exit code {run.returncode}"
+    return True, lines[-1] if lines else f"its self-check ended with exit code {run.returncode}", ""
 
 
 def _file(info: DeviceInfo) -> Path:

@@ -15,7 +15,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from potr_cl.codec.native.library import Functions
+from potr_cl.codec.native import quantising
+from potr_cl.codec.native.declarations import CFunctions
 from potr_cl.codec.native.table import definition
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray
@@ -100,8 +101,8 @@ def unit_factors(packed: FloatArray, splats: slice) -> FloatArray:
     return columns
 
 
-def _unit_factors_by_c(functions: Functions, packed: FloatArray, splats: slice) -> FloatArray:
+def _unit_factors_by_c(c: CFunctions, packed: FloatArray, splats: slice) -> FloatArray:
     count = math.isqrt(2 * len(packed))
     columns = np.empty((count * (count - 1) // 2, packed[:, splats].shape[1]), np.float32)
-    functions.quantising.unit_factors(packed, splats.start, DAMPING, columns)
+    quantising.unit_factors(c, packed, splats.start, DAMPING, columns)
     return columns

@@ -30,7 +30,7 @@ from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
-from potr_cl.raster.carried import Carried
+from potr_cl.raster.resident import SceneHandle
 from potr_cl.raster.scene_buffers import Drawable
 
 
@@ -275,7 +275,7 @@ class ColourGrid:
 
 
 @dataclass(frozen=True)
-class CodedScene(Carried):
+class CodedScene(SceneHandle):
     """Each device decodes it for itself, to the same bits: a file is many times smaller than what it decodes to.
 
     Attributes:
@@ -293,7 +293,7 @@ class CodedScene(Carried):
         return len(self.data)
 
     def on(self, device: Device) -> AbstractContextManager[Drawable]:
-        """See :meth:`potr_cl.raster.carried.Carried.on`.
+        """See :meth:`potr_cl.raster.resident.SceneHandle.on`.
 
         Raises:
             DataError: nobody can read it.

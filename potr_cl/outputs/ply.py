@@ -16,7 +16,7 @@ from potr_cl.codec.encoder import Coded
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes import compressed_ply, compressed_ply_values, ply
 from potr_cl.formats.scenes.compressed_ply_values import in_chunks
-from potr_cl.formats.scenes.scene_files import unfilled, unit_quaternions
+from potr_cl.formats.scenes.scene_files import unit_quaternions
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import LOW_PASS, SH_COEFFICIENTS, FloatArray, Scene
 from potr_cl.outputs.feedback import rounded_in_turn
@@ -165,7 +165,7 @@ class CompressedPly(_WholeDegrees):
     def geometry(self, scene: Scene, request: Request) -> CompressedPlyRounded:
         """Round within the bounds of 256 neighbours."""
         order = in_chunks(scene.means, request.threads)
-        seen = unfilled(len(scene), 1)
+        seen = Scene.blank(len(scene), 1, by_splat=True)
 
         def rounded(start: int) -> compressed_ply_values.PackedGeometry:
             rows = order[start : start + _PACKED]

@@ -20,14 +20,15 @@ from potr_cl.codec.quantize import HyperParameters
 from potr_cl.codec.sections import ORDER, SH, Property
 from potr_cl.errors import DeviceError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes import page, potr
+from potr_cl.formats.scenes import page
+from potr_cl.formats.scenes.page import POTR
 from potr_cl.host.mapped import bounded
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
 from potr_cl.ondevice.decode import decode_to_device
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import ColourGrid, Output, Request, Rounded
-from potr_cl.raster.kept_scene import large_for
+from potr_cl.raster.resident import large_for
 from potr_cl.raster.scene_buffers import Drawable
 
 _NAMES = {
@@ -45,7 +46,7 @@ _NAMES = {
 class Potr(Output):
     """A .potr file: :mod:`potr_cl.codec`. AC coefficients are rounded to steps finer than one sees."""
 
-    format: ClassVar[SceneFormat] = potr.FORMAT
+    format: ClassVar[SceneFormat] = POTR
     choices: ClassVar[frozenset[str]] = frozenset(
         {"entropy", "zstd_level"} | {each.name for each in fields(HyperParameters)}
     )

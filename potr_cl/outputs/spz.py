@@ -15,7 +15,6 @@ from potr_cl.codec.quantize import ZERO_SCALE, HyperParameters, canonical_rotati
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes import gltf, gltf_file, spz, spz_values
-from potr_cl.formats.scenes.scene_files import unfilled
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.outputs.feedback import rounded_in_turn
@@ -77,7 +76,7 @@ class Spz(Output):
         bits, positions = self._positions(scene, np.maximum(world.gamma, world.beta * nearest))
         order = self._order(positions)
         scales, opacities = _scales(world), _opacities(world)
-        seen = unfilled(len(scene), 1)
+        seen = Scene.blank(len(scene), 1, by_splat=True)
         properties = [np.empty((len(scene), width), np.uint8) for width in _widths(self.version)]
 
         def fill(start: int) -> None:

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 
 from potr_cl.host.mapped import bounded
+from potr_cl.host.threads import in_background
+from potr_cl.model.agreement import require_agreement
 from potr_cl.model.camera import Camera, train_views, within_photographs
 from potr_cl.model.scene import Scene
+from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encoded import Encoded
-from potr_cl.pipeline.fallback import on_device
-from potr_cl.pipeline.frame import check_frame, frame_checked_beside
+from potr_cl.pipeline.fallback import with_fallback
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.pipeline.run import Run
-from potr_cl.pipeline.stopwatch import Stopwatch
+from potr_cl.pipeline.run import Run, Stopwatch
 from potr_cl.placement.virtual import place_cameras
-from potr_cl.raster.kept_scene import KeptScene
+from potr_cl.quality.evidence import evidence_of
+from potr_cl.raster.resident import ResidentScene
 from potr_cl.stages.stage import Progress, State
 from potr_cl.workers.pool import Pool
 
@@ -31,7 +33,7 @@ def encode(
     progress: Progress | None = None,
     device: Device | None = None,
     antialiased: bool | None = None,
-    kept: KeptScene | None = None,
+    kept: ResidentScene | None = None,
     in_frame: bool = False,
     pool: Pool | None = None,
     tell: Callable[[str], None] | None = None,
@@ -48,7 +50,7 @@ def encode(
             is not enough, a CPU does the work. A warning says so.
         antialiased: whether to take it as an antialiased scene; None: as what it says that it is.
         kept: the scene on the device, if it will be needed there afterwards.
-        in_frame: whether :func:`potr_cl.pipeline.frame.check_frame` has found the cameras to be in the scene's frame.
+        in_frame: whether :func:`check_frame` has found the cameras to be in the scene's frame.
         pool: workers that views are shared out to, of which ``device`` is the first; None: the device does all.
         tell: told a line for every round of a fit.
 
@@ -70,7 +72,7 @@ def encode(
             cameras = cameras_or_virtual(scene, cameras, options, watch, in_frame=True, device=device)
             if kept is None and cameras and device is not None and options.look_at_views(scene):
                 others = () if pool is None else pool.devices
-                kept = stack.enter_context(KeptScene(device, scene, options.memory, others))
+                kept = stack.enter_context(ResidentScene(device, scene, options.memory, others))
         run = Run(options, watch, device, kept, pool)
         encoded = run.finished(run.stages(State.of(scene, train_views(cameras) if cameras else [])))
     tell_left_out(scene, encoded)
@@ -116,10 +118,35 @@ def cameras_or_virtual(
     check_frame(scene, cameras, options.cameras_anyway or in_frame)
     if cameras is None and options.look_at_views(scene):
         watch("place cameras", 0.0)
-        cameras, _ = on_device(
+        cameras, _ = with_fallback(
             device or Device(), options.memory, lambda opened, _: place_cameras(scene, count, device=opened)
         )
         watch("place cameras", 1.0)
     if cameras is not None and any(getattr(stage, "ground_truth", None) is not None for stage in options.stages):
         return within_photographs(cameras)
     return cameras
+
+
+def check_frame(scene: Scene, cameras: Sequence[Camera] | None, anyway: bool) -> None:
+    """Refuse cameras that are probably not in the scene's frame, but virtual ones and those that are wanted anyway.
+
+    Raises:
+        UsageError: they are not in it, or there is no training view among them.
+    """
+    if cameras and not anyway and not is_virtual(cameras):
+        views = train_views(cameras)
+        require_agreement(scene, views, evidence_of(scene, views))
+
+
+@contextmanager
+def frame_checked_beside(scene: Scene, cameras: Sequence[Camera] | None, anyway: bool) -> Iterator[None]:
+    """:func:`check_frame` in another thread, while this one opens and fills a device; a wrong frame is told first.
+
+    Raises:
+        As :func:`check_frame`, when the context ends.
+    """
+    checked = in_background(check_frame, scene, cameras, anyway)
+    try:
+        yield
+    finally:
+        checked.result()

@@ -21,13 +21,11 @@ from potr_cl.outputs.output import CodedScene
 from potr_cl.outputs.registry import OUTPUTS
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.scene_buffers import Drawable
-from potr_cl.stages.fit import LeftOut
-from potr_cl.stages.fitting.fit import Fitted
-from potr_cl.stages.guarded import Unresolved
+from potr_cl.stages.fitting.fitted import Fitted, LeftOut
+from potr_cl.stages.held_out import PhotographChoice
 from potr_cl.stages.pruning.schedule import Pruned
-from potr_cl.stages.pruning.unseen import Unseen
-from potr_cl.stages.refitting.photographs import PhotographChoice
 from potr_cl.stages.refitting.refit_options import Refitted
+from potr_cl.stages.unseen import Unresolved, Unseen
 from potr_cl.stages.views_between import Added
 from potr_cl.workers.pool import Pool, Traffic
 

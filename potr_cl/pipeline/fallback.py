@@ -1,11 +1,9 @@
-"""If a scene does not fit a device (:func:`attempts`): keep less in its memory, then let a CPU do the work."""
+"""If a scene does not fit a device (:func:`with_fallback`): keep less in its memory, then let a CPU do the work."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import TypeVar
 
 from potr_cl.errors import DeviceError, DeviceMemoryError
@@ -22,63 +20,36 @@ T = TypeVar("T")
 _LESS = 8
 
 
-@dataclass
-class Attempt:
-    """One way to do work that may not fit a device.
+def with_fallback(device: Device, memory: int | None, work: Callable[[Device, int | None], T]) -> tuple[T, Device]:
+    """Do work that may not fit a device: if it does not, with less memory, and in the end on a CPU.
 
-    Attributes:
-        device: to do it on. memory: how many bytes of its memory may be filled with views; None: as by default.
-    """
-
-    device: Device
-    memory: int | None
-    _ways: Iterator[tuple[Device, int | None]]
-    next: tuple[Device, int | None] | None = None
-
-    @contextmanager
-    def made(self) -> Iterator[None]:
-        """Do it inside this block, which ends quietly if it did not fit, and there is another way."""
-        try:
-            # A failure may leave buffers behind that nobody owns any more.
-            with self.device.all_or_nothing(), self.device.errors("failed while encoding"):
-                yield
-        except DeviceMemoryError:
-            self.next = next(self._ways, None)
-            if self.next is None:
-                raise
-
-
-def attempts(device: Device, memory: int | None) -> Iterator[Attempt]:
-    """Ways to do work that may not fit a device: if it does not, with less memory, and in the end on a CPU.
-
-    A warning says so each time::
-
-        for attempt in attempts(device, memory):
-            with attempt.made():
-                result = work(attempt.device, attempt.memory)
+    A warning says so each time.
 
     Args:
         device: the first to be tried.
         memory: how many bytes of its memory may be filled with views; None: :func:`default_memory`.
+        work: is given the device, and the bytes.
+
+    Returns:
+        What the work returned, and the device that it was done on.
 
     Raises:
         DeviceMemoryError: the work fits no device that there is.
         DeviceError: the device failed for another reason.
     """
     ways = _ways(device, memory)
-    way: tuple[Device, int | None] | None = next(ways)
-    while way is not None:
-        attempt = Attempt(*way, ways)
-        yield attempt
-        way = attempt.next
-
-
-def on_device(device: Device, memory: int | None, work: Callable[[Device, int | None], T]) -> tuple[T, Device]:
-    """Do work in one of these ways; returns what ``work`` returned, and the device that it was done on."""
-    for attempt in attempts(device, memory):
-        with attempt.made():
-            return work(attempt.device, attempt.memory), attempt.device
-    raise AssertionError("the last attempt returns or raises")
+    way = next(ways)
+    while True:
+        opened, room = way
+        try:
+            # A failure may leave buffers behind that nobody owns any more.
+            with opened.all_or_nothing(), opened.errors("failed while encoding"):
+                return work(opened, room), opened
+        except DeviceMemoryError:
+            following = next(ways, None)
+            if following is None:
+                raise
+            way = following
 
 
 def _ways(device: Device, memory: int | None) -> Iterator[tuple[Device, int | None]]:

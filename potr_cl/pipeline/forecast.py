@@ -16,14 +16,12 @@ from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.resident import ResidentScene
 from potr_cl.raster.scene_buffers import Drawable
-from potr_cl.stages.between.amount import most_needed
 from potr_cl.stages.fit import Fit
 from potr_cl.stages.fitting.fit import FitOptions
-from potr_cl.stages.fitting.memory import fit_bytes
-from potr_cl.stages.views_between import Between
+from potr_cl.stages.views_between import Between, most_needed
 from potr_cl.views.budget import default_memory
 from potr_cl.views.visibility import LEAST_SPLATS
 
@@ -39,7 +37,7 @@ _PIXEL, _SUM = 12, 8
 
 
 def log_forecast(
-    device: Device, scene: Scene, cameras: Sequence[Camera], options: EncodeOptions, kept: KeptScene | None = None
+    device: Device, scene: Scene, cameras: Sequence[Camera], options: EncodeOptions, kept: ResidentScene | None = None
 ) -> None:
     """Report the device and its kernels; and where the work may take long, roughly its memory.
 
@@ -69,11 +67,7 @@ def log_forecast(
 
 
 def memory_needed(
-    scene: Scene,
-    cameras: Sequence[Camera],
-    options: EncodeOptions,
-    device: Device,
-    kept: KeptScene | None = None,
+    scene: Scene, cameras: Sequence[Camera], options: EncodeOptions, device: Device, kept: ResidentScene | None = None
 ) -> float:
     """Bytes at the peak: the whole process's on a CPU, the device's on a GPU; roughly.
 
@@ -127,3 +121,34 @@ def _lists(scene: Drawable, camera: Camera, device: Device, options: EncodeOptio
         with rasterizer.prepare_set([camera]) as views:
             sums = _SUM * views.views[0].intersection_count if device.family == "cpu" else 0
             return device.allocated - before + sums
+
+
+#: Buffers of all parameters: the rasterizer's, the gradient, the parameters, the best ones, averages, two moments.
+_VECTORS = 7
+#: Bytes of a splat in each view of a batch besides the prepared view: its sums, its bounds.
+_OF_SPLAT = 72 + 8
+#: Bytes of a splat in what a rasterizer keeps to render pictures one by one: its projection, and a list of four
+#: intersections with their sort keys.
+_FRAME = 144
+#: Bytes of a pixel's colour.
+_TARGET_PIXEL = 12
+
+
+def fit_bytes(
+    splats: int, source: int, sh_columns: int, together: int, views: int, view: float, pixels: float, room: float
+) -> float:
+    """Bytes of the device's memory that a fit takes at its peak, about.
+
+    Args:
+        splats: that are fitted. source: of the scene that renders the targets.
+        sh_columns: SH coefficients of a splat, all channels.
+        together: views that are prepared at a time: a batch on GPUs, one on CPUs.
+        views: in all.
+        view: bytes of a prepared view.
+        pixels: of a view.
+        room: bytes that target pictures may take.
+    """
+    parameters = 4 * (11 + sh_columns)
+    prepared = together * (view + splats * _OF_SPLAT)
+    pictures = min(views * _TARGET_PIXEL * pixels, room) + (together + 2) * _TARGET_PIXEL * pixels
+    return splats * (parameters * _VECTORS + _FRAME) + source * (parameters + _FRAME) + prepared + pictures

@@ -34,11 +34,10 @@ from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import CodedScene
 from potr_cl.pipeline.encode import cameras_or_virtual, tell_left_out, tell_losses
 from potr_cl.pipeline.encoded import Encoded
-from potr_cl.pipeline.fallback import on_device
+from potr_cl.pipeline.fallback import with_fallback
 from potr_cl.pipeline.growth import FASTEST, SLOWEST, FinenessAxis, Typical, meet, with_colour_steps, with_steps
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.pipeline.run import Run, as_done
-from potr_cl.pipeline.stopwatch import Stopwatch
+from potr_cl.pipeline.run import Run, Stopwatch, as_done
 from potr_cl.pipeline.target import KINDS, Found, Target, Try
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.stages.code import Code
@@ -119,7 +118,7 @@ def encode_to_target(
         ) as search:  # fmt: skip
             return search.run()
 
-    found, _ = on_device(device or (Device() if pool is None else pool.first), options.memory, work)
+    found, _ = with_fallback(device or (Device() if pool is None else pool.first), options.memory, work)
     tell_left_out(scene, found.encoded)
     return found
 
@@ -259,7 +258,7 @@ class _Search(AbstractContextManager["_Search"]):
 
     def _mind_interrupts(self, thinned: State) -> None:
         """Fit no more where someone has interrupted a fit."""
-        fitted = thinned.learnt.fitted
+        fitted = thinned.results.fitted
         if fitted is not None and fitted.ended_early:
             self._options = self._options.changed(fit=False)
 

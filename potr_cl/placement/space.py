@@ -14,6 +14,8 @@ from potr_cl.model.scene import Scene
 
 F32 = NDArray[np.float32]
 
+#: The renderer's near plane in world units, with room to spare: nothing nearer than this is ever seen.
+NEAR = 0.25
 #: Splats that are looked at at most, evenly taken; and points on them besides one for each, as far as this from their
 #: centres, in standard deviations.
 _TAKEN, _POINTS, _WIDE = 400_000, 400_000, 1.5

@@ -18,8 +18,7 @@ from potr_cl.quality.compare import Comparison, comparing, comparison_of, mean_v
 from potr_cl.quality.figures import ViewFigures
 from potr_cl.quality.judging import Judging, Looks
 from potr_cl.quality.photographs import GroundTruth, PhotographFigures
-from potr_cl.raster.carried import Carried
-from potr_cl.raster.kept_scene import KeptScene
+from potr_cl.raster.resident import ResidentScene, SceneHandle
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.workers.pool import Pool
 
@@ -108,7 +107,7 @@ class Evaluator(Judging):
     def __init__(
         self,
         device: Device,
-        scene: Drawable | KeptScene,
+        scene: Drawable | ResidentScene,
         views: EvaluationViews,
         background: Colour,
         pool: Pool | None = None,
@@ -121,7 +120,7 @@ class Evaluator(Judging):
         self,
         candidate: Drawable,
         most: int | None = None,
-        coded: Carried | None = None,
+        coded: SceneHandle | None = None,
         progress: Callable[[float], None] = lambda done: None,
     ) -> float:
         """Mean over the views of the PSNR against the uncompressed scene's pictures, in decibels.
@@ -138,7 +137,7 @@ class Evaluator(Judging):
         return _mean_psnr(self.figures(candidate, views if most is None else _evenly(views, most), coded, progress))
 
     def judge(
-        self, candidate: Drawable, progress: Callable[[str, float], None], coded: Carried | None = None
+        self, candidate: Drawable, progress: Callable[[str, float], None], coded: SceneHandle | None = None
     ) -> tuple[Comparison, float | None]:
         """PSNR and SSIM from every view, and the mean PSNR from the training views beside them, if there are any.
 
@@ -159,7 +158,7 @@ def _mean_psnr(views: Sequence[ViewFigures]) -> float:
 def judge_by_photographs(
     ground_truth: GroundTruth,
     cameras: Sequence[Camera],
-    scenes: tuple[Scene | KeptScene, Drawable],
+    scenes: tuple[Scene | ResidentScene, Drawable],
     device: Device,
     background: Colour = (0.0, 0.0, 0.0),
     pool: Pool | None = None,

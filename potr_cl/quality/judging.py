@@ -26,17 +26,15 @@ from potr_cl.quality.figures import Against, ViewFigures
 from potr_cl.quality.metrics import Lpips, psnr
 from potr_cl.quality.metrics_device import in_batches
 from potr_cl.quality.photographs import GroundTruth
-from potr_cl.raster.carried import Carried, HostScene, LentScene
-from potr_cl.raster.kept_scene import KeptScene, lying_on
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.resident import DeviceScene, HostScene, ResidentScene, SceneHandle, scene_on
 from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
 from potr_cl.views.pictures import SeenRasterizer, groups_worth_it, rasterizer_of
 from potr_cl.views.targets import RenderedTargets, Room, TargetPictures
-from potr_cl.workers.dealing import shares
 from potr_cl.workers.helping import Helping
 from potr_cl.workers.parts import Each, Parts
-from potr_cl.workers.pool import Part, Pool
+from potr_cl.workers.pool import Part, Pool, shares
 
 #: Bytes of the uncompressed scene's pictures that are kept from one candidate to the next; others are rendered again.
 CACHED_PICTURES = 1 << 30
@@ -83,7 +81,7 @@ class JudgingPart(Part):
         self,
         device: Device,
         memory: int | None,
-        reference: Drawable | KeptScene | Carried,
+        reference: Drawable | ResidentScene | SceneHandle,
         looks: Looks,
         views: Sequence[Camera],
         groups: SplatGroups | None = None,
@@ -94,12 +92,12 @@ class JudgingPart(Part):
         self._candidate: Rasterizer | SeenRasterizer | None = None
         self._reference: Rasterizer | SeenRasterizer | None = None
         with ExitStack() as owned:
-            self._scene = owned.enter_context(lying_on(device, reference))
+            self._scene = owned.enter_context(scene_on(device, reference))
             room = min(CACHED_PICTURES, device.info.memory // 16) if looks.remember else 0
             self._pictures = owned.enter_context(TargetPictures(device, views, Room(room), self))
             self._owned = owned.pop_all()
 
-    def take(self, candidate: Drawable | Carried, groups: SplatGroups | None = None) -> None:
+    def take(self, candidate: Drawable | SceneHandle, groups: SplatGroups | None = None) -> None:
         """Judge a candidate from now on, until :meth:`forget`.
 
         Args:
@@ -111,7 +109,7 @@ class JudgingPart(Part):
         """
         self.forget()
         with ExitStack() as stack:
-            scene = stack.enter_context(lying_on(self._device, candidate))
+            scene = stack.enter_context(scene_on(self._device, candidate))
             self._candidate = self._rasterizer(stack, scene, groups)
             self._taken = stack.pop_all()
 
@@ -207,18 +205,18 @@ class Judging(Owner):
     def __init__(
         self,
         device: Device,
-        reference: Drawable | KeptScene,
+        reference: Drawable | ResidentScene,
         views: Sequence[Camera],
         looks: Looks,
         pool: Pool | None = None,
         anyway: bool = False,
-        coded: Carried | None = None,
+        coded: SceneHandle | None = None,
     ) -> None:
         self.device, self._reference, self._views, self._looks = device, reference, list(views), looks
         self._pool = pool if pool is not None and pool.first is device else None
         self._anyway, self._coded = anyway, coded
-        kept = reference if isinstance(reference, KeptScene) else None
-        here = reference if not isinstance(reference, KeptScene) else reference.drawable(device, reference.scene)
+        kept = reference if isinstance(reference, ResidentScene) else None
+        here = reference if not isinstance(reference, ResidentScene) else reference.drawable(device, reference.scene)
         self._groups: SplatGroups | None = None
         if kept is not None:
             there, large = isinstance(here, SceneBuffers), kept.is_large_for(device)
@@ -233,7 +231,7 @@ class Judging(Owner):
         self,
         candidate: Drawable,
         numbers: Sequence[int] | None = None,
-        coded: Carried | None = None,
+        coded: SceneHandle | None = None,
         progress: Callable[[float], None] = lambda done: None,
     ) -> list[ViewFigures]:
         """The figures of a candidate from some views, in their order.
@@ -267,7 +265,7 @@ class Judging(Owner):
     def _groups_of(self, candidate: Drawable) -> SplatGroups | None:
         """Those of a candidate that is too large for what a user allows, where views see little of it."""
         reference = self._reference
-        if not isinstance(candidate, Scene) or not isinstance(reference, KeptScene) or self._groups is None:
+        if not isinstance(candidate, Scene) or not isinstance(reference, ResidentScene) or self._groups is None:
             return None
         if not self.device.info.shares_host_memory or not reference.is_large_for(self.device, candidate):
             return None
@@ -278,7 +276,7 @@ class Judging(Owner):
         command: str,
         candidate: Drawable,
         numbers: Sequence[int] | None,
-        coded: Carried | None,
+        coded: SceneHandle | None,
         progress: Callable[[float], None],
         *args: Any,
     ) -> list[Any]:
@@ -327,12 +325,12 @@ class Judging(Owner):
         now = [[each[first : first + some] for each in dealt] for first in range(0, most, some)]
         return [(mine, theirs) for *theirs, mine in now]
 
-    def _for_others(self, candidate: Drawable, coded: Carried | None) -> Carried | None:
+    def _for_others(self, candidate: Drawable, coded: SceneHandle | None) -> SceneHandle | None:
         """What other devices are given of a candidate; None: nothing that they could use."""
         if self._pool is None:
             return None
         if self._pool.in_process:
-            return LentScene(candidate) if isinstance(candidate, SceneBuffers) else HostScene(candidate)
+            return DeviceScene(candidate) if isinstance(candidate, SceneBuffers) else HostScene(candidate)
         if coded is not None or isinstance(candidate, SceneBuffers):
             return coded
         return HostScene(candidate, travels=True)
@@ -354,16 +352,16 @@ class Judging(Owner):
 
         return None if shared is None else self._helping.open(opened)
 
-    def _shared(self, pool: Pool) -> Scene | KeptScene | Carried | None:
+    def _shared(self, pool: Pool) -> Scene | ResidentScene | SceneHandle | None:
         """What other devices are given of the uncompressed scene; None: they had better do without."""
         reference = self._reference
         if pool.in_process:
-            return LentScene(reference) if isinstance(reference, SceneBuffers) else reference
+            return DeviceScene(reference) if isinstance(reference, SceneBuffers) else reference
         if self._looks.lpips is not None or self._looks.ground_truth is not None:
             return None  # they are read, or computed, here
         if self._coded is not None:
             return self._coded
-        scene = reference.scene if isinstance(reference, KeptScene) else reference
+        scene = reference.scene if isinstance(reference, ResidentScene) else reference
         if isinstance(scene, SceneBuffers):
             return None
         there = pool.has(scene) or scene.nbytes <= _SENT_ANYWAY

@@ -68,9 +68,6 @@ class Picker(Owner):
     Attributes:
         device: as given. splats: N.
         groups: as given, in the device's memory. count, write: the kernels.
-
-    Raises:
-        DeviceError: the device has no room.
     """
 
     def __init__(self, device: Device, groups: NDArray[np.uint32]) -> None:
@@ -94,9 +91,6 @@ class Picker(Owner):
 
         Returns:
             The numbers, uint32, ascending, and how many they are.
-
-        Raises:
-            DeviceError: the device has no room.
         """
         with Memory(self.device) as own:
             picks = IndexSubsets(own, self, wanted[None], states, state)
@@ -104,9 +98,6 @@ class Picker(Owner):
             with self.device.errors("failed while computing"):
                 self.device.queue.finish()
         return numbers, picks.counts[0]
-
-    def close(self) -> None:
-        self._memory.close()
 
 
 class IndexSubsets:
@@ -120,18 +111,10 @@ class IndexSubsets:
 
     Attributes:
         counts: of each choice's splats.
-
-    Raises:
-        DeviceError: the device has no room.
     """
 
     def __init__(
-        self,
-        memory: Memory,
-        picker: Picker,
-        wanted: NDArray[np.bool_],
-        states: cl.Buffer | None = None,
-        state: int = 0,
+        self, memory: Memory, picker: Picker, wanted: NDArray[np.bool_], states: cl.Buffer | None = None, state: int = 0
     ) -> None:
         choices, groups = wanted.shape
         chunks = max(-(-picker.splats // _CHUNK), 1)
@@ -159,9 +142,6 @@ class IndexSubsets:
         Args:
             memory: that owns them.
             choice: its number.
-
-        Raises:
-            DeviceError: the device has no room.
         """
         found = memory.allocate(4 * self.counts[choice], "the numbers of a view's splats")
         self.numbers_into(found, 0, choice)

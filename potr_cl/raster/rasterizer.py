@@ -29,14 +29,12 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
-from potr_cl.raster.launcher import launcher_for
-from potr_cl.raster.pictures_in_sets import render_in_sets
-from potr_cl.raster.preparation import Preparation
+from potr_cl.raster.launcher import RasterLauncher
+from potr_cl.raster.preparation import Preparation, Projection
 from potr_cl.raster.preparing_memory import PreparingMemory
-from potr_cl.raster.projection import Projection
 from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers, uploaded
-from potr_cl.raster.view_set import View, ViewSet
+from potr_cl.raster.view_set import ViewSet
 
 #: Least room for intersections before anything is known of a view, and as a multiple of the splats.
 _FIRST_CAPACITY, _FIRST_CAPACITY_A_SPLAT = 1 << 16, 4
@@ -86,7 +84,7 @@ class Rasterizer(Owner):
                 self._scene, self._owns = scene, False
             else:
                 self._scene, self._owns = uploaded(device, scene), True
-            self._launcher = launcher_for(device, rules)
+            self._launcher = RasterLauncher(device, rules)
             self._projection = Projection(device, self._scene, rules, self._launcher.lanes)
         self._preparation = Preparation(device, self._scene.stride, self._projection, self._launcher, preparing)
         memory = self._preparation.memory
@@ -151,16 +149,13 @@ class Rasterizer(Owner):
                     return self._image.buffer, self._transmittance.buffer
                 views.make_room([count + count // 4])
 
-    def render_into(
-        self, cameras: Sequence[Camera], target: cl.Buffer, start: int = 0, memory: Memory | None = None
-    ) -> None:
+    def render_into(self, cameras: Sequence[Camera], target: cl.Buffer, start: int = 0) -> None:
         """Render views one behind the other into a buffer; on a GPU, several at a time.
 
         Args:
             cameras: of the views.
             target: takes (pixels, 3) float32.
             start: byte where they begin.
-            memory: on a GPU, to prepare views in, as of :meth:`prepare_set`.
         """
         device = self.device
 
@@ -176,7 +171,7 @@ class Rasterizer(Owner):
         if self._launcher.whole_sets:
             room = (device.info.memory - device.allocated) // 512
             most = int(max(min(room, _PROJECTED) // self.stride, 1))
-            render_in_sets(self._preparation, composited, cameras, most, memory)
+            self._preparation.in_sets(composited, cameras, most)
             return
         for camera in cameras:
             image, _ = self.render_device(camera)
@@ -187,17 +182,6 @@ class Rasterizer(Owner):
         self._enqueue_composite(views)
         cl.enqueue_copy(self.device.queue, target, self._image.buffer, byte_count=12 * views.pixels, dst_offset=start)
 
-    def prepare(self, camera: Camera) -> View:
-        """Find projection, tile lists and depth order of a view, which :meth:`composite` can use any number of times.
-
-        Returns:
-            The view, with buffers of its own, which are no larger than needed; the caller closes it.
-
-        Raises:
-            DeviceError: it does not fit the device.
-        """
-        return self.prepare_set([camera]).views[0]
-
     @contextmanager
     def preparing_many(self) -> Iterator[None]:
         """Inside the block, memory that sets are prepared in is kept for the next one: drivers take long to give it."""
@@ -205,7 +189,9 @@ class Rasterizer(Owner):
             yield
 
     def prepare_set(self, cameras: Sequence[Camera], memory: Memory | None = None) -> ViewSet:
-        """:meth:`prepare` several views, and wait for the device only once. CPU kernels take one view at a time.
+        """Find projection, tile lists and depth order of views, which :meth:`composite` can use any number of times.
+
+        The device is waited for only once, and buffers are no larger than needed. CPU kernels take one view at a time.
 
         Args:
             cameras: of the views.
@@ -250,17 +236,17 @@ class Rasterizer(Owner):
             DeviceMemoryError: they do not fit the device.
         """
         views = former
-        if views is None or not views.aim_all(cameras):
+        if views is None or not views.aim(cameras):
             if views is not None:
                 views.close()
             views = self._preparation.new_views(cameras)
         self.project(views)
         return views
 
-    def composite(self, view: View) -> tuple[FloatArray, FloatArray]:
-        """The picture of a prepared view; returns what :meth:`render` returns."""
-        self._enqueue_composite(view.owner)
-        return self._pictures(view.camera)
+    def composite(self, views: ViewSet) -> tuple[FloatArray, FloatArray]:
+        """The picture of a prepared set's only view; returns what :meth:`render` returns."""
+        self._enqueue_composite(views)
+        return self._pictures(views.views[0].camera)
 
     def project(
         self,
@@ -307,7 +293,7 @@ class Rasterizer(Owner):
         old = self._frame
         capacity = max(_FIRST_CAPACITY_A_SPLAT * self.splats, _FIRST_CAPACITY)
         if old is not None:
-            if old.aim(camera):
+            if old.views[0].camera is camera or old.aim([camera]):
                 return old
             capacity = max(capacity, old.capacity)
             old.close()

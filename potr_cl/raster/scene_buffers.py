@@ -74,17 +74,13 @@ class SceneBuffers(Owner):
         Raises:
             DeviceError: the scene does not fit the device.
         """
-        sh_count = self.sh_count
-        try:
+        with self.device.all_or_nothing():
             self.means = self._columns(3, 0, "the centres")
             self.scales = self._columns(3, 0, "the scales")
             self.quaternions = self._columns(4, 0, "the rotations")
             # The padding has an opacity of 0: it is not drawn.
             self.log2_opacities = self._columns(1, -np.inf, "the opacities")
-            self.sh = self._columns(3 * sh_count, 0, "the SH coefficients")
-        except BaseException:
-            self.close()
-            raise
+            self.sh = self._columns(3 * self.sh_count, 0, "the SH coefficients")
 
     def __len__(self) -> int:
         return self.splats
@@ -102,8 +98,12 @@ class SceneBuffers(Owner):
     @property
     def parameters(self) -> dict[str, cl.Buffer]:
         """All parameters by their names; of devices of all kinds they have the same size."""
-        names = ("means", "scales", "quaternions", "log2_opacities", "sh")
-        return {name: getattr(self, name) for name in names}
+        return {name: getattr(self, name) for name in self._widths}
+
+    @property
+    def _widths(self) -> dict[str, int]:
+        """Columns of each parameter."""
+        return {"means": 3, "scales": 3, "quaternions": 4, "log2_opacities": 1, "sh": 3 * self.sh_count}
 
     @property
     def geometry(self) -> dict[str, Any]:
@@ -194,41 +194,6 @@ class SceneBuffers(Owner):
                 turn.bind(rows=room, first=start + first, width=width, stride=self.stride, result=parameter)
                 turn.launch((len(some),))
 
-    def write_columns(
-        self,
-        parameter: cl.Buffer,
-        first: int,
-        columns: FloatArray,
-        pending: list[cl.Event] | None = None,
-        own: slice | None = None,
-    ) -> None:
-        """Set some columns of a parameter, from number ``first`` on.
-
-        Args:
-            parameter: one of the buffers.
-            first: number of the first column.
-            columns: (columns, N) float32, C order.
-            pending: as of :meth:`potr_cl.opencl.device.Device.upload`.
-            own: of these splats only; None: of all.
-        """
-        start, stop, _ = (own or slice(None)).indices(self.splats)
-        if columns.shape[1] != self.splats:
-            raise ValueError(f"columns of {columns.shape[1]} values are not those of {self.splats} splats")
-        with self.device.errors("cannot take a scene"):
-            event = cl.enqueue_copy(
-                self.device.queue,
-                parameter,
-                columns,
-                buffer_origin=(4 * start, first, 0),
-                host_origin=(4 * start, 0, 0),
-                region=(4 * (stop - start), len(columns), 1),
-                buffer_pitches=(4 * self.stride, 0),
-                host_pitches=(4 * self.splats, 0),
-                is_blocking=pending is None,
-            )
-        if pending is not None:
-            pending.append(event)
-
     def write_part(self, part: SceneBuffers, first: int) -> None:
         """Set the parameters of some splats to those of another scene on the same device.
 
@@ -241,9 +206,8 @@ class SceneBuffers(Owner):
         """
         if first + part.splats > self.splats or part.sh_count != self.sh_count:
             raise ValueError(f"{part.splats} splats from number {first} on do not fit {self.splats} splats")
-        names = {"means": 3, "scales": 3, "quaternions": 4, "log2_opacities": 1, "sh": 3 * self.sh_count}
         with self.device.errors("cannot take a part of a scene"):
-            for name, columns in names.items():
+            for name, columns in self._widths.items():
                 cl.enqueue_copy(
                     self.device.queue,
                     getattr(self, name),
@@ -268,10 +232,9 @@ class SceneBuffers(Owner):
         """
         device = self.device
         gather = device.shared_kernel("raster/gather_columns.cl", "gather_columns")
-        columns = {"means": 3, "scales": 3, "quaternions": 4, "log2_opacities": 1, "sh": 3 * self.sh_count}
         with Memory(device) as memory:
             numbers = memory.upload(splats.astype(np.uint32), "the numbers of some splats")
-            for name, count in columns.items():
+            for name, count in self._widths.items():
                 gather.bind(
                     columns=getattr(scene, name),
                     stride=scene.stride,
@@ -362,7 +325,18 @@ class SceneBuffers(Owner):
         """
         planar = sh.transpose(1, 2, 0)
         if planar.flags.c_contiguous and planar.dtype == np.float32:  # as a decoder leaves them
-            self.write_columns(parameter, 0, planar.reshape(3 * self.sh_count, self.splats))
+            with self.device.errors("cannot take a scene"):
+                cl.enqueue_copy(
+                    self.device.queue,
+                    parameter,
+                    planar,
+                    buffer_origin=(0, 0, 0),
+                    host_origin=(0, 0, 0),
+                    region=(4 * self.splats, 3 * self.sh_count, 1),
+                    buffer_pitches=(4 * self.stride, 0),
+                    host_pitches=(4 * self.splats, 0),
+                    is_blocking=True,
+                )
         else:
             self.write_rows(parameter, sh.reshape(self.splats, -1), "the SH coefficients")
 
@@ -395,9 +369,6 @@ class SceneBuffers(Owner):
         """Whether there is no memory now."""
         return not self._memory.nbytes
 
-    def close(self) -> None:
-        self._memory.close()
-
 
 def stride_of(splats: int) -> int:
     """So many splats rounded up: how long a column of values is that has one for each."""
@@ -418,12 +389,9 @@ def gathered(scene: SceneBuffers, splats: NDArray[np.int64]) -> SceneBuffers:
     Raises:
         DeviceError: they do not fit the device beside the scene.
     """
-    part = SceneBuffers(scene.device, len(splats), scene.sh_count, scene.antialiased, scene.low_pass)
-    try:
+    with scene.device.all_or_nothing():
+        part = SceneBuffers(scene.device, len(splats), scene.sh_count, scene.antialiased, scene.low_pass)
         part.gather(scene, splats)
-    except BaseException:
-        part.close()
-        raise
     return part
 
 
@@ -433,12 +401,9 @@ def uploaded(device: Device, scene: Scene) -> SceneBuffers:
     Raises:
         DeviceError: the scene does not fit the device.
     """
-    buffers = SceneBuffers(device, len(scene), scene.sh.shape[1], scene.antialiased, scene.low_pass)
-    try:
+    with device.all_or_nothing():
+        buffers = SceneBuffers(device, len(scene), scene.sh.shape[1], scene.antialiased, scene.low_pass)
         buffers.write(scene, colours=bool(scene.sh.any()))  # new ones are black
-    except BaseException:
-        buffers.close()
-        raise
     return buffers
 
 
@@ -448,12 +413,9 @@ def copied(device: Device, scene: SceneBuffers) -> SceneBuffers:
     Raises:
         DeviceError: the scene does not fit the device, or one of the two failed.
     """
-    buffers = SceneBuffers(device, scene.splats, scene.sh_count, scene.antialiased, scene.low_pass)
-    try:
+    with device.all_or_nothing():
+        buffers = SceneBuffers(device, scene.splats, scene.sh_count, scene.antialiased, scene.low_pass)
         with Relay(device) as relay:
             for name, its in scene.parameters.items():
                 relay.fetch(buffers.parameters[name], Lent(scene.device, its, its.size))
-    except BaseException:
-        buffers.close()
-        raise
     return buffers

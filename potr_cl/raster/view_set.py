@@ -50,7 +50,10 @@ class ViewSet(Owner):
         intersection_starts: where each view's intersections begin, and their end.
         found_offsets: each view's ``offsets`` on the host, as they were when its lists were prepared.
         table: where each view's part begins, ``SetView`` in cl/include/view_set.clh.
-        shapes, colours, offsets, intersections: as :class:`View` has them, and N splats a view.
+        shapes: (views, N, 8) float32, a splat's ellipse, see cl/include/splat.clh.
+        colours: (views, N, 4) float32; R, G, B of the splats that are drawn, the rest unset.
+        offsets: (columns * rows + 1,) uint32 of each view, where each tile's run of ``intersections`` begins.
+        intersections: (capacity,) uint32 splat numbers, tile by tile, front to back within a tile.
         subtiles: (capacity,), a bit for each sub-tile of its tile that an intersection touches
             (cl/include/subtiles.clh), uint32 for CPU kernels, uint16 for GPU kernels.
 
@@ -72,7 +75,7 @@ class ViewSet(Owner):
         self._memory = memory or Memory(device)
         self._subtile_bytes = subtile_bytes
         self.stride = stride
-        self.views = [View(self, camera) for camera in cameras]
+        self.views = [View(camera) for camera in cameras]
         self.tiles = sum(view.tiles for view in self.views)
         self.pixels = sum(view.pixels for view in self.views)
         self.capacity = 0
@@ -103,22 +106,7 @@ class ViewSet(Owner):
         # Nobody waits for it: an event that is replaced lets go of its table when that is there.
         self._sent = cl.enqueue_copy(self._device.queue, self.table, table, is_blocking=False)
 
-    def aim(self, camera: Camera) -> bool:
-        """Point the only view at another camera, if that has as many tiles across and down.
-
-        Returns:
-            Whether it has.
-        """
-        (view,) = self.views
-        if (view.columns, view.rows) != tile_grid(camera):
-            return False
-        if camera is not view.camera:
-            view.camera = camera
-            self.pixels = view.pixels
-            self._write_table()
-        return True
-
-    def aim_all(self, cameras: Sequence[Camera]) -> bool:
+    def aim(self, cameras: Sequence[Camera]) -> bool:
         """Point the views at other cameras, if each has as many tiles across and down as the one before it.
 
         Returns:
@@ -133,11 +121,7 @@ class ViewSet(Owner):
         return True
 
     def make_room(self, counts: Sequence[int]) -> None:
-        """Make room for this many intersections of each view. Earlier intersections are lost.
-
-        Raises:
-            DeviceMemoryError: the device has not that much, or not all in one buffer.
-        """
+        """Make room for this many intersections of each view. Earlier intersections are lost."""
         if self.capacity:
             self._memory.free(self.intersections, self.subtiles)
             self.capacity = 0
@@ -180,23 +164,18 @@ class ViewSet(Owner):
         self._geometry = ()
         self.shapes = self.colours = None
 
-    def close(self) -> None:
-        self._memory.close()
 
-
-class View(Owner):
-    """One camera's part of a :class:`ViewSet`; the only view of a set stands for the set, buffers and all.
+class View:
+    """One camera's part of a :class:`ViewSet`.
 
     Attributes:
-        owner: the set.
         camera: whose view it is.
         columns, rows: tiles across and down.
         intersection_count: number of intersections; set once it is known that the device has found them all.
         capacity: number of intersections for which there is room.
     """
 
-    def __init__(self, owner: ViewSet, camera: Camera) -> None:
-        self.owner = owner
+    def __init__(self, camera: Camera) -> None:
         self.camera = camera
         self.columns, self.rows = tile_grid(camera)
         if max(self.columns, self.rows) > _MOST_TILES:
@@ -208,41 +187,11 @@ class View(Owner):
 
     @property
     def tiles(self) -> int:
-        """Number of tiles."""
         return self.columns * self.rows
 
     @property
     def pixels(self) -> int:
-        """Number of pixels."""
         return self.camera.width * self.camera.height
-
-    @property
-    def shapes(self) -> cl.Buffer:
-        """(N, 8) float32, a splat's ellipse, see cl/include/splat.clh."""
-        return self._alone.shapes
-
-    @property
-    def colours(self) -> cl.Buffer:
-        """(N, 4) float32; R, G, B of the splats that are drawn, the rest unset."""
-        return self._alone.colours
-
-    @property
-    def offsets(self) -> cl.Buffer:
-        """(columns * rows + 1,) uint32, where each tile's run of ``intersections`` begins."""
-        return self._alone.offsets
-
-    @property
-    def intersections(self) -> cl.Buffer:
-        """(capacity,) uint32 splat numbers, tile by tile, front to back within a tile."""
-        return self._alone.intersections
-
-    @property
-    def _alone(self) -> ViewSet:
-        (_,) = self.owner.views
-        return self.owner
-
-    def close(self) -> None:
-        self._alone.close()
 
 
 @lru_cache(maxsize=4096)

@@ -2,11 +2,64 @@
 
 from __future__ import annotations
 
+import getpass
+import os
+import platform
+import re
+import sys
 from collections.abc import Sequence
+from contextlib import suppress
+from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
-from potr_cl.opencl import verdict
+from potr_cl import __version__
+from potr_cl.opencl import quirks, verdict
 from potr_cl.opencl.discovery import DeviceInfo, compiler_fault, fitting_devices, list_devices
+from potr_cl.opencl.limits import LIMITS_VARIABLE
+
+#: Paths of files, as compilers' messages have them.
+_PATH = re.compile(r"(?:\b[A-Za-z]:)?(?:[\\/][^\s\\/:'\"<>|,;()]+){2,}[\\/]?")
+
+
+def measured_report() -> dict[str, Any]:
+    """What is worth posting of this machine: its devices checked and measured, without names and paths of the user.
+
+    Simulators are left out: they would take hours.
+    """
+    measured = {info.index: verdict.measured(info) for info in list_devices() if _is_measured(info)}
+    report = device_report(False)
+    for entry, info in zip(report, list_devices(), strict=True):
+        driver, language = (getattr(info.handle, name, "") for name in ("driver_version", "opencl_c_version"))
+        entry |= {"driver": driver, "opencl_c": language, "extensions": getattr(info.handle, "extensions", "").split()}
+        entry |= {"longest_kernel": info.longest_kernel, "profiling": info.profiling}
+        if info.index in measured:
+            fault, found = measured[info.index]
+            entry |= {"check": fault or "passed", **found}
+    about = {"potr_cl": __version__, "pyopencl": version("pyopencl"), "python": platform.python_version()}
+    more = {"system": platform.system(), "machine": platform.machine(), "limits": os.environ.get(LIMITS_VARIABLE)}
+    named: dict[str, Any] = _without_names(about | more | {"devices": report})
+    return named
+
+
+def _is_measured(info: DeviceInfo) -> bool:
+    return compiler_fault(info) is None and not quirks.SIMULATOR.concerns(info.platform, info.version)
+
+
+def _without_names(value: Any) -> Any:
+    """A document whose texts have no path, nor the names of the user and of the computer."""
+    if isinstance(value, dict):
+        return {name: _without_names(each) for name, each in value.items()}
+    if isinstance(value, list):
+        return [_without_names(each) for each in value]
+    if not isinstance(value, str):
+        return value
+    names = {platform.node(), Path.home().name, Path(sys.prefix).name}
+    with suppress(OSError, KeyError, ImportError):
+        names.add(getpass.getuser())
+    for name in filter(None, names):
+        value = re.sub(rf"\b{re.escape(name)}\b", "…", value)
+    return _PATH.sub("…", value)
 
 
 def device_report(check: bool) -> list[dict[str, Any]]:

@@ -97,7 +97,7 @@ def encode_report(
             "history": [dataclasses.asdict(entry) for entry in encoded.pruned.history],
         }
     if encoded.unseen is not None:
-        report["unseen"] = {**encoded.unseen.told(), "said": str(encoded.unseen)}
+        report["unseen"] = {**encoded.unseen.facts, "said": str(encoded.unseen)}
     if encoded.fitted is not None:
         report["fit"] = {**encoded.fitted.facts, "said": str(encoded.fitted)}
     if encoded.between is not None:

@@ -121,9 +121,9 @@ class Code(Stage):
         return given
 
     def run(self, state: State, bench: Workbench) -> State:
-        """Make the file's bytes, and leave a :class:`potr_cl.codec.encoder.Coded` in ``learnt``."""
+        """Make the file's bytes, and leave a :class:`potr_cl.codec.encoder.Coded` in ``results``."""
         geometry = state.geometry
         if geometry is not None and geometry.asked != bench.parameters:
             geometry = None
         coded = bench.output.file(state.scene, geometry, bench.request(state, bench.metadata(state), self.coder))
-        return state.having_learnt(coded=coded)
+        return state.with_results(coded=coded)

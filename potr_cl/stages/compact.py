@@ -15,8 +15,8 @@ from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import standpoints
 from potr_cl.stages.compaction.ridge import ColourModel, CompactionOptions, Compactor, Weighting
 from potr_cl.stages.compaction.view_weights import ViewWeights
-from potr_cl.stages.pruning.measured import Measured, measurement
-from potr_cl.stages.pruning.staleness import SweepOptions
+from potr_cl.stages.pruning.helpers import importances_of, measurement
+from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.stages.stage import Flag, Importances, Interlude, Stage, State, Workbench, option
 
 
@@ -37,8 +37,7 @@ class Compact(Stage):
     title = "compaction of the colours"
 
     on: bool = option(
-        True,
-        Flag("--compact", "make the SH coefficients sparse, splat by splat", default="where there is no re-fit"),
+        True, Flag("--compact", "make the SH coefficients sparse, splat by splat", default="where there is no re-fit")
     )
     at: float = option(
         0.75,
@@ -87,7 +86,7 @@ class Compact(Stage):
 
     def run(self, state: State, bench: Workbench) -> State:
         """Make the colours of the state's scene sparse, unless that has been done while splats were removed."""
-        if state.learnt.compacted or state.scene.sh_degree == 0:
+        if state.results.compacted or state.scene.sh_degree == 0:
             return state
         options = CompactionOptions(
             lam=bench.parameters.lam,
@@ -99,11 +98,11 @@ class Compact(Stage):
         )
         with _importances(state, bench) as measured:
             bench.progress("compact", 0.0)
-            weights = ViewWeights.from_importances(len(state.scene), measured.view_importances())
+            weights = ViewWeights.from_importances(len(state.scene), measured)
             places = standpoints(state.views, state.source.means)
             sh = Compactor(bench.opened).compact(state.scene, places, weights, options).sh
             bench.progress("compact", 1.0)
-        return state.recoloured(sh).having_learnt(compacted=True)
+        return state.recoloured(sh).with_results(compacted=True)
 
 
 @contextmanager
@@ -115,4 +114,4 @@ def _importances(state: State, bench: Workbench) -> Iterator[Importances]:
     bench.progress("prepare views", 0.0)
     with measurement(state, bench, SweepOptions(memory=bench.memory)) as removal:
         removal.measure()
-        yield Measured(removal, np.arange(len(state.scene)))
+        yield importances_of(removal, np.arange(len(state.scene)))

@@ -10,7 +10,7 @@ import dataclasses
 import math
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 from potr_cl.errors import UsageError
 from potr_cl.host.process import first_interrupt_asks
@@ -20,22 +20,13 @@ from potr_cl.opencl.discovery import Family
 from potr_cl.quality.photographs import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Rates
-from potr_cl.stages.fitting.at_photographs import FittedToPhotographs
-from potr_cl.stages.fitting.files import TwoFiles
-from potr_cl.stages.fitting.fit import (
-    FitOptions,
-    FitProgress,
-    Fitted,
-    SupportsBool,
-    fit_scene,
-    held_out_error,
-    kept_pictures,
-)
+from potr_cl.stages.fitting.fit import FitOptions, FitProgress, SupportsBool, fit_scene, held_out_error, kept_pictures
+from potr_cl.stages.fitting.fitted import Fitted, LeftOut
 from potr_cl.stages.fitting.photographs import fit_to_photographs, longer
 from potr_cl.stages.fitting.settling import Looking, Settling, settle
-from potr_cl.stages.fitting.together import Helpers
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
+from potr_cl.views.shares import HelpFrom
 from potr_cl.views.targets import RenderedTargets, TargetPictures, Targets
 
 #: Times the threshold of pruning up to which a fit makes up for splats, about (docs/benchmarks/findings.md): for this
@@ -74,34 +65,6 @@ _LITTLE_GAIN = "on the views that were held out it gained little beyond what the
 _INTERRUPTED = "it was interrupted before it had gained enough"
 
 
-@dataclass(frozen=True)
-class LeftOut:
-    """That a fit was left out, so that the scene is as it would be without it.
-
-    Attributes:
-        why: as people are told it.
-        ended_early: whether someone has asked it to end.
-        photographs: what a fit to photographs did; None if there were none.
-        files: that were made to see whether it pays; None if it was left out before.
-    """
-
-    why: str
-    ended_early: bool = False
-    photographs: FittedToPhotographs | None = None
-    files: TwoFiles | None = None
-
-    @property
-    def facts(self) -> dict[str, Any]:
-        """All by name."""
-        photographs = None if self.photographs is None else self.photographs.facts
-        files = None if self.files is None else self.files.facts
-        return {"left_out": self.why, "ended_early": self.ended_early, "photographs": photographs, "files": files}
-
-    def __str__(self) -> str:
-        more = "".join(f"; {each}" for each in (self.files, self.photographs) if each is not None)
-        return f"no fit: {self.why}{more}"
-
-
 def _steps(text: str) -> int | Literal["auto"]:
     if text in ("auto", "off"):
         return "auto" if text == "auto" else 0
@@ -132,7 +95,7 @@ class Fit(Stage):
             "auto": as many as pay on the device.
         choosing, rounding: how far what is left is fitted once more after the choice of coefficients and the rounding
             of geometry (:class:`potr_cl.stages.fitting.settling.Settling`).
-        compared: whether two files say if it pays, where its gain is small (potr_cl/pipeline/fit_trial.py).
+        compared: whether two files say if it pays, where its gain is small (potr_cl/pipeline/run.py).
         rounds: see :class:`potr_cl.stages.fitting.fit.FitOptions`.
 
     Raises:
@@ -212,13 +175,13 @@ class Fit(Stage):
         return price * min(max(further, 1.0), _MOST_FURTHER)
 
     def run(self, state: State, bench: Workbench) -> State:
-        """Remove splats, fit, and leave a :class:`potr_cl.stages.fitting.fit.Fitted` in ``learnt``.
+        """Remove splats, fit, and leave a :class:`potr_cl.stages.fitting.fitted.Fitted` in ``results``.
 
         Or, where the state stays as it was, a :class:`LeftOut`: too few views are given for any to be held out, or
         those say that the fit does not pay.
         """
         if len(state.views) - state.added < 2:
-            return state.having_learnt(fitted=LeftOut(_TOO_FEW_VIEWS))
+            return state.with_results(fitted=LeftOut(_TOO_FEW_VIEWS))
         bench.progress("fit", 0.0)
         with ExitStack() as stack:
             stack.callback(bench.progress, "fit", 1.0)
@@ -230,18 +193,18 @@ class Fit(Stage):
             targets: Targets | TargetPictures = rendered
             if bench.memory is None:  # else pruning needs all that is allowed, between two fits
                 targets = stack.enter_context(kept_pictures(bench.opened, seen.views, rendered))
-            found = self._cycles(seen, bench, targets, asked, _helpers(bench, state))
+            found = self._cycles(seen, bench, targets, asked, _help_from(bench, state))
             found = dataclasses.replace(found, views=state.views, added=state.added)
             if bench.photographs is not None and self.photograph_steps != 0 and not asked:
                 found = self._to_photographs(found, bench, asked)
-            told = found.learnt.fitted
+            told = found.results.fitted
             # Others do not round as finely then as is known here.
             if asked or not (isinstance(told, Fitted) and told.spared):
                 return found
             if found.truth is not None:
                 rasterizer = stack.enter_context(Rasterizer(bench.opened, found.truth, background=bench.background))
                 targets = RenderedTargets(rasterizer, seen.views)
-            looking = Looking(seen.views, seen.added, targets, rasterizer, _helpers(bench, found))
+            looking = Looking(seen.views, seen.added, targets, rasterizer, _help_from(bench, found))
             return self._settled(found, bench, looking, asked)
 
     def _looking_between(self, state: State, bench: Workbench) -> State:
@@ -255,10 +218,10 @@ class Fit(Stage):
 
     def _cycles(
         self, state: State, bench: Workbench, targets: Targets | TargetPictures, asked: SupportsBool,
-        helpers: Helpers | None,
+        help_from: HelpFrom | None,
     ) -> State:  # fmt: skip
         """Remove splats and fit by turns, each time up to a higher threshold, and keep what costs least."""
-        price = state.learnt.price
+        price = state.results.price
         worth = 0.0 if price is None else _WORTH * price
         without = held_out_error(bench.opened, state.scene, state.views, targets, state.added, bench.background)
         least = plain = without + worth * len(state.scene)
@@ -278,7 +241,7 @@ class Fit(Stage):
             def progress(now: int, _steps: int, before: int = done) -> None:
                 bench.progress("fit", 0.99 * (before + now) / total)
 
-            fitted = self._fitted(last, bench, targets, steps, progress, asked, helpers)
+            fitted = self._fitted(last, bench, targets, steps, progress, asked, help_from)
             last, done = dataclasses.replace(last, scene=fitted.scene, geometry=None), done + steps
             cost = fitted.error + worth * len(fitted.scene)
             spared = len(state.scene) - len(fitted.scene)
@@ -289,8 +252,8 @@ class Fit(Stage):
                 break
         if taken is None:
             why = _INTERRUPTED if asked else _NO_GAIN if len(steps_of) > 1 else _LITTLE_GAIN
-            return state.having_learnt(fitted=LeftOut(why, bool(asked)))
-        return best.having_learnt(fitted=taken)
+            return state.with_results(fitted=LeftOut(why, bool(asked)))
+        return best.with_results(fitted=taken)
 
     def _settled(self, state: State, bench: Workbench, looking: Looking, asked: SupportsBool) -> State:
         """Choose coefficients and round geometry, with what is left fitted once more in between."""
@@ -304,9 +267,9 @@ class Fit(Stage):
             bench.progress("fit", min(done / total, 1.0) * 0.99)
 
         then, errors = settle(state, bench, looking, settling, options, asked, progress)
-        told = state.learnt.fitted
+        told = state.results.fitted
         assert isinstance(told, Fitted)
-        return then.having_learnt(fitted=dataclasses.replace(told, settled=errors))
+        return then.with_results(fitted=dataclasses.replace(told, settled=errors))
 
     def _steps_of_cycles(self, family: Family, removing: bool) -> list[int]:
         """The steps of the fit in each cycle."""
@@ -332,23 +295,23 @@ class Fit(Stage):
             asked, lambda done, steps: bench.progress("fit to photographs", done / steps),
         )  # fmt: skip
         bench.progress("fit to photographs", 1.0)
-        told = state.learnt.fitted
+        told = state.results.fitted
         assert told is not None
-        then = state.having_learnt(fitted=dataclasses.replace(told, photographs=found))
+        then = state.with_results(fitted=dataclasses.replace(told, photographs=found))
         if found.scene is None:
             return then
         return dataclasses.replace(then, scene=found.scene, truth=found.scene, geometry=None)
 
     def _sparse(self, rates: Rates, state: State) -> Rates:
         """The rates, without those that would change coefficients which compaction has chosen."""
-        return dataclasses.replace(rates, ac=0.0) if state.learnt.compacted else rates
+        return dataclasses.replace(rates, ac=0.0) if state.results.compacted else rates
 
     def _pruned(self, state: State, limit: float, bench: Workbench) -> State:
         """The state without the splats that a fit will make up for."""
         parameters = dataclasses.replace(bench.parameters, delta_mse_max=limit)
         alone = dataclasses.replace(bench, parameters=parameters, interludes=(), progress=lambda what, done: None)
         left = Prune(iterations=ITERATIONS).run(state, alone)
-        return dataclasses.replace(left, learnt=state.learnt)
+        return dataclasses.replace(left, results=state.results)
 
     def _fitted(
         self,
@@ -358,17 +321,17 @@ class Fit(Stage):
         steps: int,
         progress: FitProgress,
         asked: SupportsBool,
-        helpers: Helpers | None,
+        help_from: HelpFrom | None,
     ) -> Fitted:
         options = dataclasses.replace(self._options(bench.opened.family, bench.memory), steps=steps)
         options = dataclasses.replace(options, rates=self._sparse(options.rates, state))
         return fit_scene(
             bench.opened, state.scene, state.views, targets, options, state.added, bench.background, progress,
-            bench.tell, asked, helpers=helpers,
+            bench.tell, asked, help_from=help_from,
         )  # fmt: skip
 
 
-def _helpers(bench: Workbench, state: State) -> Helpers | None:
+def _help_from(bench: Workbench, state: State) -> HelpFrom | None:
     """Who helps to fit to the pictures of a state's goal."""
     pool, kept = bench.pool, bench.kept
     if pool is None:
@@ -376,4 +339,4 @@ def _helpers(bench: Workbench, state: State) -> Helpers | None:
     if not pool.in_process and not pool.has(state.goal) and state.goal.nbytes > _SENT_ANYWAY:
         return None
     there = kept is not None and pool.in_process and kept.is_of(state.goal)
-    return Helpers(pool, kept if kept is not None and there else state.goal)
+    return HelpFrom(pool, kept if kept is not None and there else state.goal)

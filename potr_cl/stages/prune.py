@@ -11,23 +11,16 @@ from numpy.typing import NDArray
 from potr_cl.errors import UsageError
 from potr_cl.host.threads import in_background, thread_pool
 from potr_cl.model.scene import FloatArray
-from potr_cl.raster.kept_scene import lying_on
+from potr_cl.raster.resident import scene_on
 from potr_cl.raster.scene_buffers import SceneBuffers
-from potr_cl.raster.surely_seen import surely_seen
-from potr_cl.stages.guarded import Unresolved
-from potr_cl.stages.pruning.measured import Measured, measurement
-from potr_cl.stages.pruning.on_device import prune_scene
+from potr_cl.stages.pruning.controller import prune_scene
+from potr_cl.stages.pruning.helpers import importances_of, measurement
 from potr_cl.stages.pruning.removal import LARGEST_LIMIT, RemovalSweep
 from potr_cl.stages.pruning.schedule import Course, Pruned, PruningOptions
-from potr_cl.stages.pruning.staleness import SweepOptions
-from potr_cl.stages.pruning.unseen import (
-    CHOICES,
-    Unseen,
-    as_of_whole,
-    find_unseen,
-    without_directions,
-)
+from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
+from potr_cl.stages.unseen import CHOICES, Unresolved, Unseen, as_of_whole, find_unseen, without_directions
+from potr_cl.views.reached import surely_seen
 from potr_cl.views.shares import ViewShares
 from potr_cl.views.visibility import MOST_SEEN, Visibility, groups_of_large, seen_part, visibility_of_large
 from potr_cl.workers.pool import Pool
@@ -51,9 +44,9 @@ class Prune(Stage):
         unseen: "keep" or "drop": what becomes of splats that no training view's picture reaches
             (:func:`potr_cl.model.splat_groups.unseen_splats`). With ``keep`` or ``count`` they go first in any case.
             "protect", and "keep" where views were placed: what no view has resolved stays as it is
-            (:mod:`potr_cl.placement.guard`).
+            (:mod:`potr_cl.placement.rays`).
         tolerance, turns, transmittance_threshold: of the measurements
-            (:class:`potr_cl.stages.pruning.staleness.SweepOptions`).
+            (:class:`potr_cl.stages.pruning.sweep.SweepOptions`).
 
     Raises:
         UsageError: a value is out of range.
@@ -151,47 +144,47 @@ class Prune(Stage):
         return PruningOptions(delta_mse_max, self.iterations, a=self.mapping_a, count=count, decay=self.decay)
 
     def run(self, state: State, bench: Workbench) -> State:
-        """Remove splats, and leave a :class:`potr_cl.stages.pruning.schedule.Pruned` in ``learnt``.
+        """Remove splats, and leave a :class:`potr_cl.stages.pruning.schedule.Pruned` in ``results``.
 
         And what no view sees; the price of a splat, where the number of splats is not given; and the shares, where
         workers elsewhere get what their views see.
         """
-        if state.learnt.unresolved is not None:
-            return self._guarded(state, bench, state.learnt.unresolved)
-        with thread_pool(bench.threads) as pool, lying_on(bench.opened, bench.placed(state)) as placed:
+        if state.results.unresolved is not None:
+            return self._guarded(state, bench, state.results.unresolved)
+        with thread_pool(bench.threads) as pool, scene_on(bench.opened, bench.scene_of(state)) as placed:
             quick = partial(surely_seen, placed) if isinstance(placed, SceneBuffers) else None
             part = in_background(seen_part, state.scene, state.views)  # while a device finds the unseen ones
             unseen = find_unseen(state, None, pool.map, quick) if quick else None
             likely = part.result() <= MOST_SEEN
             groups = groups_of_large(state.scene, pool.map) if likely or not unseen else None
             hidden, area = unseen or find_unseen(state, groups, pool.map)
-            sights = visibility_of_large(state.scene, state.views, groups, pool.map) if likely else None
+            visibility = visibility_of_large(state.scene, state.views, groups, pool.map) if likely else None
             groups = None
-            if sights is not None and (bench.pool is None or bench.pool.in_process):
-                sights = sights.lasting()
+            if visibility is not None and (bench.pool is None or bench.pool.in_process):
+                visibility = visibility.lasting()
         splats = int(np.count_nonzero(hidden))
         kept = self.unseen == "keep" and self.keep is None and self.count is None
-        told = state.having_learnt(unseen=Unseen(splats, len(state.scene), kept, area))
-        told = self._told(told, bench, sights)
+        told = state.with_results(unseen=Unseen(splats, len(state.scene), kept, area))
+        told = self._told(told, bench, visibility)
         if not (kept and splats):
-            return self._pruned(told, bench, sights)
+            return self._pruned(told, bench, visibility)
         # A copy of a large scene without them would take as much memory as the scene.
         if (
-            sights is not None
+            visibility is not None
             and not bench.pool
             and not bench.interludes
             and bench.parameters.delta_mse_max < LARGEST_LIMIT
         ):
-            return self._pruned(told, bench, sights, hidden=hidden)
+            return self._pruned(told, bench, visibility, hidden=hidden)
         seen = np.flatnonzero(~hidden)
         if not len(seen):
             everything = np.arange(splats)
-            return told.having_learnt(
+            return told.with_results(
                 pruned=Pruned(splats, np.full(splats, -1, np.int32), 0, lambda: Course(everything))
             )
-        if sights is not None:
-            sights = visibility_of_large(state.scene.uncoloured().subset(seen), state.views)
-        return self._pruned(told, bench, sights, seen, hidden)
+        if visibility is not None:
+            visibility = visibility_of_large(state.scene.uncoloured().subset(seen), state.views)
+        return self._pruned(told, bench, visibility, seen, hidden)
 
     def _guarded(self, state: State, bench: Workbench, unresolved: Unresolved) -> State:
         """Prune, but for what no view has resolved.
@@ -209,27 +202,27 @@ class Prune(Stage):
         with thread_pool(bench.threads) as pool:
             likely = seen_part(state.scene, state.views) <= MOST_SEEN
             groups = groups_of_large(state.scene, pool.map) if likely else None
-            sights = visibility_of_large(state.scene, state.views, groups, pool.map)
-            if sights is not None and (bench.pool is None or bench.pool.in_process):
-                sights = sights.lasting()
-        told = self._told(state, bench, sights).having_learnt(unseen=unresolved)
-        return self._pruned(told, bench, sights)
+            visibility = visibility_of_large(state.scene, state.views, groups, pool.map)
+            if visibility is not None and (bench.pool is None or bench.pool.in_process):
+                visibility = visibility.lasting()
+        told = self._told(state, bench, visibility).with_results(unseen=unresolved)
+        return self._pruned(told, bench, visibility)
 
-    def _told(self, state: State, bench: Workbench, sights: Visibility | None) -> State:
+    def _told(self, state: State, bench: Workbench, visibility: Visibility | None) -> State:
         """The state that knows what the views see, and what a splat may cost."""
         if state.scene is state.source:
-            state = replace(state, sights=sights)
-            if sights is not None and bench.kept is not None and bench.kept.is_of(state.source):
-                bench.kept.groups = sights.groups  # for who judges by pictures later
+            state = replace(state, visibility=visibility)
+            if visibility is not None and bench.kept is not None and bench.kept.is_of(state.source):
+                bench.kept.groups = visibility.groups  # for who judges by pictures later
         if self.keep is None and self.count is None:
-            state = state.having_learnt(price=bench.parameters.delta_mse_max)
+            state = state.with_results(price=bench.parameters.delta_mse_max)
         return state
 
     def _pruned(
         self,
         state: State,
         bench: Workbench,
-        sights: Visibility | None = None,
+        visibility: Visibility | None = None,
         seen: NDArray[np.int64] | None = None,
         hidden: NDArray[np.bool_] | None = None,
     ) -> State:
@@ -237,22 +230,22 @@ class Prune(Stage):
 
         Args:
             state, bench: of the stage.
-            sights: what the views see of the splats that are pruned.
+            visibility: what the views see of the splats that are pruned.
             seen: (n,) numbers of these, ascending; None: all of the state's scene, where the measurement spares hidden
                 ones.
             hidden: (N,) which splats are kept in any case, without what of their colours depends on the direction.
         """
         spared = hidden if seen is None else None
         dealt = None
-        if sights is not None and bench.pool is not None and not bench.pool.in_process:
-            dealt = _dealt(state, seen, bench.pool, sights)
-            state = state.having_learnt(shares=dealt)
-        unresolved = state.learnt.unresolved
+        if visibility is not None and bench.pool is not None and not bench.pool.in_process:
+            dealt = _dealt(state, seen, bench.pool, visibility)
+            state = state.with_results(shares=dealt)
+        unresolved = state.results.unresolved
         stays = None if unresolved is None else unresolved.among(state.survivors)
         waiting = sorted(bench.interludes, key=lambda interlude: interlude.after)
         schedule = self._schedule(bench.parameters.delta_mse_max, len(state.scene) if seen is None else len(seen))
         bench.progress("prepare views", 0.0)
-        with measurement(state, bench, self._sweep_options(bench.memory), sights, spared, dealt, seen) as removal:
+        with measurement(state, bench, self._sweep_options(bench.memory), visibility, spared, dealt, seen) as removal:
             course = _Course(state, removal, seen)
             ready = removal.resident_views >= (1 - _MADE_AGAIN) * len(state.views)
 
@@ -283,7 +276,7 @@ class Prune(Stage):
         """The state after pruning; ``seen`` and ``hidden`` as of :meth:`_pruned`."""
         survivors = pruned.survivors
         if hidden is None or seen is None:
-            left = course.left(survivors).having_learnt(pruned=pruned)
+            left = course.left(survivors).with_results(pruned=pruned)
             return left if hidden is None else without_directions(left, hidden[survivors])
         of_whole = in_background(as_of_whole, seen, hidden, pruned)
         kept = hidden.copy()
@@ -291,7 +284,7 @@ class Prune(Stage):
         numbers = np.flatnonzero(kept)
         # Nobody looked at the hidden ones from any direction.
         left = without_directions(course.having(numbers), hidden[numbers])
-        return left.having_learnt(pruned=of_whole.result())
+        return left.with_results(pruned=of_whole.result())
 
 
 def part_of_time(iterations: float, stays: bool) -> float:
@@ -304,13 +297,13 @@ def part_of_time(iterations: float, stays: bool) -> float:
     return _FIRST + (1 - _FIRST) * (1 - (1 - iterations) ** _FEWER) if stays else iterations
 
 
-def _dealt(state: State, seen: NDArray[np.int64] | None, pool: Pool, sights: Visibility) -> ViewShares:
+def _dealt(state: State, seen: NDArray[np.int64] | None, pool: Pool, visibility: Visibility) -> ViewShares:
     """The views for a pool's workers, and which of the source's splats each gets, for this stage and others."""
     workers = pool.workers()
     source, numbers = (state.source, state.survivors) if state.is_cut else (state.scene, np.arange(len(state.scene)))
     names = [worker.name for worker in workers]
     splats = numbers if seen is None else numbers[seen]
-    return ViewShares.of(state.views, sights, [1.0] * len(workers), source, splats, names)
+    return ViewShares.of(state.views, visibility, [1.0] * len(workers), source, splats, names)
 
 
 class _Course:
@@ -351,11 +344,11 @@ class _Course:
 
     def visit(self, interlude: Interlude, splats: NDArray[np.int64], bench: Workbench) -> None:
         """Have another stage work on these of the removal's splats, and go on with the colours that it gives them."""
-        given = replace(self.left(splats, interlude.afresh), importances=Measured(self._removal, splats))
+        given = replace(self.left(splats, interlude.afresh), importances=importances_of(self._removal, splats))
         then = interlude.stage.run(given, bench)
         if then is given:
             return
         if self.sh is self._state.scene.sh:  # the array of the state before, which must not change
             self.sh = self.sh.copy()
         self.sh[self._numbers(splats)] = then.scene.sh
-        self._state = replace(self._state, learnt=then.learnt)
+        self._state = replace(self._state, results=then.results)

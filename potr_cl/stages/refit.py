@@ -19,15 +19,15 @@ from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import ColourGrid, Rounded
 from potr_cl.quality.photographs import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.guarded import as_important
-from potr_cl.stages.refitting.colour_refit import ColourRefit, HelpFrom
-from potr_cl.stages.refitting.coming_scene import ComingScene
-from potr_cl.stages.refitting.photographs import PhotographChoice, hold_out
-from potr_cl.stages.refitting.placement import placed
+from potr_cl.stages.held_out import PhotographChoice, hold_out
+from potr_cl.stages.refitting.coefficients import residency_of
+from potr_cl.stages.refitting.colour_refit import ColourRefit
+from potr_cl.stages.refitting.helpers import colour_shares
 from potr_cl.stages.refitting.refit import active_coefficients, chosen_coefficients, refit_colours
-from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
-from potr_cl.stages.refitting.shared_map import colour_shares
+from potr_cl.stages.refitting.refit_options import ComingScene, RefitOptions, Refitted
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
+from potr_cl.stages.unseen import as_important
+from potr_cl.views.shares import HelpFrom
 from potr_cl.views.targets import HostTargets, PhotographTargets, PicturesAhead, Targets, targets_of
 
 #: A scene that takes more than this part of the memory that is given makes room for the re-fit.
@@ -129,15 +129,15 @@ class Refit(Stage):
         return [Interlude(after, RefitOnTheWay(steps=self.at_steps)) for after in times]
 
     def run(self, state: State, bench: Workbench) -> State:
-        """Re-fit the colours, and leave a :class:`potr_cl.stages.refitting.refit_options.Refitted` in ``learnt``.
+        """Re-fit the colours, and leave a :class:`potr_cl.stages.refitting.refit_options.Refitted` in ``results``.
 
-        With photographs, also a :class:`potr_cl.stages.refitting.photographs.PhotographChoice` as "photographs".
+        With photographs, also a :class:`potr_cl.stages.held_out.PhotographChoice` as "photographs".
         """
         bench.progress("refit", 0.0)
         parameters = bench.parameters
-        compacted = state.learnt.compacted
+        compacted = state.results.compacted
         active = active_coefficients(state.scene.sh, parameters.sf_sh) if compacted else None
-        if state.learnt.chosen == parameters:
+        if state.results.chosen == parameters:
             active = chosen_coefficients(state.scene.sh)
         options = RefitOptions(steps=self.steps, drop=parameters.drop, memory=bench.memory)
         on_grid = bench.output.on_grid(bench.request(state))
@@ -188,8 +188,8 @@ class Refit(Stage):
                 choice = PhotographChoice(len(judging), *psnrs)
                 if choice.kept:
                     refitted, geometry = found[1]
-        then = replace(state.recoloured(refitted.sh), geometry=geometry).having_learnt(refitted=refitted)
-        return then if choice is None else then.having_learnt(photographs=choice)
+        then = replace(state.recoloured(refitted.sh), geometry=geometry).with_results(refitted=refitted)
+        return then if choice is None else then.with_results(photographs=choice)
 
 
 @dataclass
@@ -235,7 +235,7 @@ def _pictures_ahead(state: State, bench: Workbench) -> Iterator[PicturesAhead | 
     numbers: dict[Device, Sequence[int]] = {device: range(len(state.views))}
     if pool is not None and (share := colour_shares(pool, len(state.views))).others:
         numbers = {device: share.own, **dict(zip(pool.devices, share.others, strict=False))}
-    with PicturesAhead(kept, bench.background, state.views, numbers, state.sights) as ahead:
+    with PicturesAhead(kept, bench.background, state.views, numbers, state.visibility) as ahead:
         yield ahead
 
 
@@ -243,7 +243,7 @@ def _pictures_ahead(state: State, bench: Workbench) -> Iterator[PicturesAhead | 
 def _pictures_of_goal(state: State, bench: Workbench, ahead: PicturesAhead | None) -> Iterator[Targets]:
     """The pictures that colours are re-fitted to; where the re-fit needs its room, they are rendered before."""
     device, views = bench.opened, state.views
-    little = placed(device, len(state.scene), state.scene.sh.shape[1], bench.memory).slice is not None
+    little = residency_of(device, len(state.scene), state.scene.sh.shape[1], bench.memory).slice is not None
     little = little or (bench.memory is not None and state.source.nbytes > _LARGE * bench.memory)
     with _rendered(state, state.goal, bench) as targets:
         if ahead is not None:
@@ -258,8 +258,8 @@ def _pictures_of_goal(state: State, bench: Workbench, ahead: PicturesAhead | Non
 
 def _rendered(state: State, scene: Scene, bench: Workbench) -> AbstractContextManager[Targets]:
     """The pictures of a scene in a state's views, which are rendered when they are asked for."""
-    sights = state.sights if scene is state.source else None
-    return targets_of(bench.opened, bench.drawable(scene), state.views, bench.background, sights)
+    visibility = state.visibility if scene is state.source else None
+    return targets_of(bench.opened, bench.drawable(scene), state.views, bench.background, visibility)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +27,8 @@ from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import Output, Request, Rounded
 from potr_cl.outputs.potr import Potr
-from potr_cl.raster.kept_scene import KeptScene, PartOfKept
+from potr_cl.raster.resident import ResidentScene, ResidentSubset
 from potr_cl.raster.scene_buffers import Drawable
-from potr_cl.stages.learnt import Learnt
 from potr_cl.views.shares import ViewShares
 from potr_cl.views.visibility import Visibility
 from potr_cl.workers.pool import Pool, Shared
@@ -37,23 +36,57 @@ from potr_cl.workers.pool import Pool, Shared
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+    from potr_cl.codec.encoder import Coded
+    from potr_cl.codec.quantize import HyperParameters
+    from potr_cl.stages.fitting.fitted import Fitted, LeftOut
+    from potr_cl.stages.held_out import PhotographChoice
+    from potr_cl.stages.pruning.schedule import Pruned
+    from potr_cl.stages.refitting.refit_options import Refitted
+    from potr_cl.stages.unseen import Unresolved, Unseen
+    from potr_cl.stages.views_between import Added
+    from potr_cl.views.shares import ViewShares
+
 
 T = TypeVar("T")
 
 
-class Importances(Protocol):
-    """How much each splat shows in each view, as far as that has been measured."""
+@dataclass(frozen=True)
+class Results:
+    """What stages have found out; None where nobody has.
 
-    def view_importances(self) -> Iterator[tuple[int, NDArray[np.int64], NDArray[np.float64]]]:
-        """The importances, view by view.
+    Attributes:
+        unresolved: splats that no view shows from near enough, which all stages leave alone.
+        between: the views that were added.
+        shown: which part of the views shows a splat, on the average, where that is known.
+        unseen: splats that no view sees, or that stay though none resolves them.
+        price: ΔMSE below which a splat has gone.
+        shares: who of the workers elsewhere does which views, with what these see.
+        pruned: the order in which splats went.
+        fitted: the fit, or why there is none.
+        chosen: the parameters that a fit chose coefficients with.
+        compacted: whether colours are sparse already.
+        refitted: the re-fit of the colours.
+        photographs: the choice between re-fits to photographs.
+        coded: the file.
+    """
 
-        Yields:
-            The number of the view, the numbers of the splats that it sees, ascending, and the mean of T α of each over
-            the view's pixels.
-        """
-        ...
+    unresolved: Unresolved | None = None
+    between: Added | None = None
+    shown: float = 1.0
+    unseen: Unseen | Unresolved | None = None
+    price: float | None = None
+    shares: ViewShares | None = None
+    pruned: Pruned | None = None
+    fitted: Fitted | LeftOut | None = None
+    chosen: HyperParameters | None = None
+    compacted: bool = False
+    refitted: Refitted | None = None
+    photographs: PhotographChoice | None = None
+    coded: Coded | None = None
 
 
+#: The number of a view, the numbers of the splats that it sees, ascending, and the mean of T α of each over its pixels.
+Importances: TypeAlias = Iterator[tuple[int, NDArray[np.int64], NDArray[np.float64]]]
 #: Called with the name of what is being done and the part of it that is done, 0 to 1.
 Progress = Callable[[str, float], None]
 
@@ -69,12 +102,12 @@ class State:
         views: the training views; empty if there are no cameras.
         added: how many of them, the last ones, a stage has put between those that were given.
         truth: what a stage has fitted to photographs, where it did; it may have fewer splats than ``source``.
-        sights: what each view may draw of ``source``, where a stage has found that this is little.
+        visibility: what each view may draw of ``source``, where a stage has found that this is little.
         cut: a scene that is these survivors of ``source`` as they are there; None: none is known to be.
         geometry: of ``scene`` as the file's readers will see it, once a stage has had it rounded. A stage that then
             changes anything but colours makes it None again.
         importances: of the splats in each view, for stages that work while splats are being removed; else None.
-        learnt: what stages have found out.
+        results: what stages have found out.
     """
 
     source: Scene
@@ -83,11 +116,11 @@ class State:
     views: tuple[Camera, ...]
     geometry: Rounded | None = None
     importances: Importances | None = None
-    learnt: Learnt = field(default_factory=Learnt)
+    results: Results = field(default_factory=Results)
     added: int = 0
     cut: Scene | None = None
     truth: Scene | None = None
-    sights: Visibility | None = None
+    visibility: Visibility | None = None
 
     @property
     def goal(self) -> Scene:
@@ -114,9 +147,9 @@ class State:
         """Whether ``scene`` is known to be some splats of ``source`` as they are there."""
         return self.scene is self.source or self.scene is self.cut
 
-    def having_learnt(self, **found: Any) -> State:
-        """This state with what a stage has found out, by the fields of :class:`Learnt`."""
-        return dataclasses.replace(self, learnt=dataclasses.replace(self.learnt, **found))
+    def with_results(self, **found: Any) -> State:
+        """This state with what a stage has found out, by the fields of :class:`Results`."""
+        return dataclasses.replace(self, results=dataclasses.replace(self.results, **found))
 
 
 @dataclass(frozen=True)
@@ -149,7 +182,7 @@ class Workbench:
     progress: Progress = lambda what, done: None
     tell: Callable[[str], None] = lambda line: None
     output: Output = field(default_factory=Potr)
-    kept: KeptScene | None = None
+    kept: ResidentScene | None = None
     photographs: Path | None = None
     pool: Pool | None = None
 
@@ -157,8 +190,8 @@ class Workbench:
         """What to give to a rasterizer for a scene: it may lie on the device already."""
         return scene if self.kept is None else self.kept.drawable(self.opened, scene)
 
-    def placed(self, state: State, some: NDArray[np.int64] | None = None) -> Scene | KeptScene | PartOfKept:
-        """A state's scene, or where devices have it, for :func:`potr_cl.raster.kept_scene.lying_on`.
+    def scene_of(self, state: State, some: NDArray[np.int64] | None = None) -> Scene | ResidentScene | ResidentSubset:
+        """A state's scene, or where devices have it, for :func:`potr_cl.raster.resident.scene_on`.
 
         Args:
             state: whose scene.
@@ -168,8 +201,8 @@ class Workbench:
         if kept is None or not state.is_cut or kept.drawable(self.opened, state.source) is state.source:
             return state.scene if some is None else state.scene.subset(some)
         if state.scene is state.source:
-            return kept if some is None else PartOfKept(kept, some)
-        return PartOfKept(kept, state.survivors if some is None else state.survivors[some])
+            return kept if some is None else ResidentSubset(kept, some)
+        return ResidentSubset(kept, state.survivors if some is None else state.survivors[some])
 
     @contextmanager
     def shared(self, pool: Pool, state: State, some: NDArray[np.int64] | None = None) -> Iterator[Shared]:
@@ -179,7 +212,7 @@ class Workbench:
         stages need too, and numbers.
         """
         if pool.in_process:
-            with pool.shared(self.placed(state, some)) as placed:
+            with pool.shared(self.scene_of(state, some)) as placed:
                 yield placed
             return
         numbers = some
@@ -188,10 +221,10 @@ class Workbench:
         with pool.shared(state.source if state.is_cut else state.scene) as whole:
             yield whole if numbers is None else Shared(whole.handle, numbers.astype(np.uint32))
 
-    def shared_source(self, state: State) -> Scene | KeptScene | ViewShares:
+    def shared_source(self, state: State) -> Scene | ResidentScene | ViewShares:
         """A state's source for the pool's workers; where they have what their views see already, that."""
         in_process = self.pool is not None and self.pool.in_process
-        dealt = state.learnt.shares
+        dealt = state.results.shares
         if dealt is not None and dealt.views is state.views and not in_process:
             return dealt
         return self.kept if self.kept is not None and in_process and self.kept.is_of(state.source) else state.source

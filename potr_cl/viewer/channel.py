@@ -5,8 +5,10 @@ A connection is a tab's second one. It names the tab by a key that viser's page 
 
 - from the page: ``{"divider": 0.4}``, ``{"swap": true}``, ``{"fly": 3}``, ``{"rung": 2, "asked": 5}`` (the fifth time),
   ``{"mode": "heat map"}``, ``{"cameras": true}`` to show or hide them, and ``{"file": {"name", "size", "as"}}``, after
-  which the file follows as binary messages;
-- to the page: ``{"state": {…}}`` and ``{"upload": {…}}``.
+  which the file follows as binary messages; ``{"scene": 7}`` asks for a scene to draw, and ``{"draws": true}`` says
+  that the page draws what is to be seen, and needs no pictures;
+- to the page: ``{"state": {…}}``, ``{"upload": {…}}``, and ``{"scene": {"number", "bytes"}}``, after which the file
+  follows as binary messages.
 """
 
 from __future__ import annotations
@@ -27,6 +29,8 @@ from potr_cl.viewer.uploads import Upload
 
 #: Bytes after which the page is told how much has come.
 _TOLD_EVERY = 4 << 20
+#: Bytes of a scene that are sent at a time.
+_PART = 1 << 20
 #: Seconds without a part of a file after which it is given up: others wait for its place.
 _SILENCE = 60.0
 #: Files that may be on their way at a time, of all tabs.
@@ -44,6 +48,12 @@ class Tab(Protocol):
 
     def fly(self, view: int) -> None:
         """A view of the list was clicked."""
+
+    def draw(self, draws: bool) -> None:
+        """The page draws the scenes by itself, or no longer."""
+
+    def file(self, number: int) -> bytes:
+        """A scene for the page to draw, a .potr file. Raises PotrError, OSError or MemoryError: there is none."""
 
     def climb(self, rung: int) -> None:
         """A rung of the ladder was clicked."""
@@ -96,11 +106,13 @@ class Channel:
             while True:
                 await connection.send(json.dumps(await mail.take()))
 
-        delivering, inbox = asyncio.ensure_future(deliver()), Inbox(connection, said_by_page)
+        tasks, inbox = [asyncio.ensure_future(deliver())], Inbox(connection, said_by_page)
         try:
             tab.connected(send)
             while True:
                 content = await inbox.next()
+                if "scene" in content and (len(tasks) < 2 or tasks[-1].done()):  # the page asks for one at a time
+                    tasks[1:] = [asyncio.ensure_future(_give(connection, tab, content["scene"]))]
                 if "file" in content:
                     await self._receive(inbox, tab, content["file"], mail.put)
                 else:
@@ -109,7 +121,8 @@ class Channel:
             if type(error).__module__.split(".")[0] != "websockets":  # it has been closed: nothing is wrong
                 raise
         finally:
-            delivering.cancel()
+            for task in tasks:
+                task.cancel()
 
     async def _receive(
         self, inbox: Inbox, tab: Tab, announced: dict[str, Any], put: Callable[[dict[str, Any]], None]
@@ -150,6 +163,19 @@ class Channel:
             self._uploads -= 1
 
 
+async def _give(connection: Any, tab: Tab, number: int) -> None:
+    """Send a scene for the page to draw."""
+    try:
+        data = await asyncio.to_thread(tab.file, number)
+    except (PotrError, OSError, MemoryError) as error:
+        said = plain(error) if isinstance(error, PotrError) else "its file cannot be read again"
+        await connection.send(json.dumps({"scene": {"number": number, "error": said}}))
+        return
+    await connection.send(json.dumps({"scene": {"number": number, "bytes": len(data)}}))
+    for at in range(0, len(data), _PART):
+        await connection.send(data[at : at + _PART])
+
+
 class _Mail:
     """What the page has not been told yet; what is out of date by then it is never told."""
 
@@ -176,6 +202,7 @@ def _obey(tab: Tab, content: dict[str, Any]) -> None:
         ("swap", tab.swap),
         ("mode", tab.choose_mode),
         ("fly", tab.fly),
+        ("draws", tab.draw),
         ("rung", tab.climb),
         ("asked", tab.acknowledge),
     )

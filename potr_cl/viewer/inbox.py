@@ -121,6 +121,8 @@ _SAID: dict[str, Callable[[Any], bool]] = {
     "rung": _is_place,
     "asked": _is_place,
     "cameras": lambda value: value is True,
+    "draws": lambda value: isinstance(value, bool),
+    "scene": _is_place,
     "file": lambda value: isinstance(value, dict),
     "cancel": lambda value: True,
 }

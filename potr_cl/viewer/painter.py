@@ -168,9 +168,11 @@ class Painter:
         gaze, moving = visitor.gaze, began - visitor.moved < PAUSE
         assert gaze is not None
         try:
-            if visitor.stale_look or not visitor.is_still:
+            bare = visitor.look is not None and visitor.look.a is None and visitor.look.b is None
+            if visitor.stale_look or not visitor.is_still or (bare and visitor.is_pictured):
                 visitor.stale_look = visitor.stale_picture = False
-                draft = not moving and visitor.drafted is not gaze and self._pace(visitor).is_slow
+                pace = self._pace(visitor)
+                draft = visitor.is_pictured and not moving and visitor.drafted is not gaze and pace.is_slow
                 if draft:
                     visitor.drafted = gaze
                 self._render(visitor, moving, draft)
@@ -186,7 +188,7 @@ class Painter:
         except Exception as error:
             self._give_up(visitor, f"unforeseen {type(error).__name__}: {error}")
         visitor.painted = time.monotonic()
-        if moving and visitor.look is not None:
+        if moving and visitor.look is not None and visitor.is_pictured:
             self._pace(visitor).took(visitor.painted - began)
 
     def _render(self, visitor: Visitor, moving: bool, draft: bool) -> None:
@@ -200,12 +202,15 @@ class Painter:
             width, height = pace.size(width, height)
         elif draft:
             width, height = (width + 1) // 2, (height + 1) // 2
-        figures = is_pair and not draft and (not moving or pace.is_full)
+        figures = is_pair and not draft and (not moving or (pace.is_full and visitor.is_pictured))
         scenes = ("A", "B") if figures else visitor.needs(is_pair)
         visitor.look = self._session.look(camera_of(gaze, width, height), scenes, figures)
 
     def _compose(self, visitor: Visitor) -> None:
         look = visitor.look
+        if look is not None and not visitor.is_pictured:
+            visitor.show(Shown(None, visitor.is_still, look, 1))
+            return
         if look is None or (look.a is None and look.b is None):
             return
         a, b = (look.b, look.a) if visitor.swapped else (look.a, look.b)

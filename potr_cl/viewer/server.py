@@ -43,6 +43,8 @@ if TYPE_CHECKING:
 LOCALHOST = "127.0.0.1"
 #: Bytes of decoded rungs that are kept.
 _KEPT = 1 << 30
+#: Splats that a page draws at most, of all its scenes: some 500 MB of its memory.
+MOST_DRAWN = 3_000_000
 #: Seconds between two lists of views while losses are being found.
 _LIST_EVERY = 1.0
 
@@ -90,6 +92,7 @@ class Viewer:
         self.losses = Losses(views, photographs)
         self.painter = Painter(self.session, self.losses, self._list_views)
         self._cameras = list(cameras)
+        self._background = "rgb({})".format(",".join(f"{round(255 * part)}" for part in background))
         self._ladder = ladder
         self._antialiased = antialiased
         self._rung = _middle(ladder) if ladder is not None else 0
@@ -118,7 +121,9 @@ class Viewer:
 
         check_address(host, port)
         channel = Channel(self._tab_of, self._readers, self._antialiased)
-        door = Door(host, page.assets(), page.head(), {page.CHANNEL: channel.serve})
+        assets = page.assets()
+        self._has_script = page.DRAWING in assets
+        door = Door(host, assets, page.head(), {page.CHANNEL: channel.serve})
         with door.guarding(), _silent():
             server = viser.ViserServer(host=host, port=port, label="potr_cl", verbose=False)
         # It warns of whatever a tab that has just been closed is told.
@@ -203,6 +208,18 @@ class Viewer:
 
         self.painter.do(job)
 
+    def file(self, number: int) -> bytes:
+        """A scene for a page to draw, a .potr file.
+
+        Raises:
+            PotrError, OSError, MemoryError: it is shown no longer, or there can be none.
+        """
+        for which in ("A", "B"):
+            exhibit = self.session.exhibit("A" if which == "A" else "B")
+            if exhibit is not None and exhibit.number == number:
+                return exhibit.potr
+        raise UsageError("this scene is shown no longer")
+
     def _slid(self, event: Any) -> None:
         if self._ladder is not None and event.client is not None:  # the user, not the program
             rungs, wanted = self._ladder.rungs, float(self._slider.value)
@@ -226,7 +243,7 @@ class Viewer:
                 path = ladder.file(ladder.rungs[rung])
                 scene = load_scene(path, antialiased=self._antialiased)
                 name = plain(path.name, LONGEST_VALUE)
-                self._kept[rung] = Exhibit(scene, name, path.stat().st_size)
+                self._kept[rung] = Exhibit(scene, name, path.stat().st_size, path)
             self._kept.move_to_end(rung)
             while len(self._kept) > 1 and sum(each.scene.nbytes for each in self._kept.values()) > _KEPT:
                 self._kept.popitem(last=False)
@@ -250,6 +267,12 @@ class Viewer:
                 note = "A and B are equally large"
             else:
                 note = f"B is {ratio:.1f} times smaller" if ratio > 1 else f"B is {1 / ratio:.1f} times larger"
+        shown = [exhibit for exhibit in there.values() if exhibit is not None]
+        drawable = (
+            self._has_script
+            and sum(len(exhibit.scene) for exhibit in shown) <= MOST_DRAWN
+            and not any(exhibit.scene.antialiased for exhibit in shown)
+        )
         ladder = None
         if self._ladder is not None:
             ladder = {
@@ -271,6 +294,8 @@ class Viewer:
                 if exhibit is not None
             ],
             "note": note,
+            "drawable": {which: exhibit.number for which, exhibit in there.items() if exhibit} if drawable else None,
+            "background": self._background,
             "ladder": ladder,
             **(self._views_state or self._views()),
         }

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
 from typing import Literal
 
 from potr_cl.errors import DeviceError, DeviceMemoryError
 from potr_cl.formats.images import Colour
+from potr_cl.formats.scenes.page import potr_of
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
@@ -17,6 +21,8 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import RasterRules
 
 Which = Literal["A", "B"]
+#: How finely a scene is rounded that the page draws.
+_FINE = {"q": 1.0, "sf_dc": 512.0, "sf_sh": 256.0, "sf_opacity": 32.0, "sf_rotation": 64.0, "sf_scale": 64.0}
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,11 +33,24 @@ class Exhibit:
         scene: it.
         name: what people call it; chosen by whoever named the file.
         nbytes: of its file, or of its arrays where it comes from none.
+        source: its file, if that may be read again.
+        number: that no other has.
     """
 
     scene: Scene
     name: str
     nbytes: int
+    source: Path | None = None
+    number: int = field(default_factory=itertools.count(1).__next__)
+
+    @cached_property
+    def potr(self) -> bytes:
+        """The scene as a .potr file for the page to draw: its own, or one rounded more finely than screens show.
+
+        Raises:
+            DataError, UsageError, OSError: it cannot be made or read.
+        """
+        return potr_of(self.scene, self.source, **_FINE)
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,6 +39,9 @@ class House(Protocol):
     def put(self, which: Which, exhibit: Exhibit) -> None:
         """Show a scene to all tabs."""
 
+    def file(self, number: int) -> bytes:
+        """A scene for the page to draw."""
+
     def climb(self, rung: int) -> None:
         """Show a rung of the ladder to all tabs."""
 
@@ -96,6 +99,7 @@ class TabHandle:
         self._mode.on_update(lambda _: self.choose_mode(self._mode.value))
         self._factor = gui.add_dropdown("amplify", FACTORS, initial_value="auto", order=4)
         self._factor.on_update(lambda _: self._amplify())
+        gui.add_html(_box("drawn"), order=2.5)
         gui.add_html(_box("figures"), order=5)
         self._photograph = gui.add_slider(
             "photograph", 0.0, 1.0, 0.01, 0.0, order=6, hint="how much of the photograph shows over the picture"
@@ -140,6 +144,13 @@ class TabHandle:
             self._mode.value = chosen
         self._house.painter.wake(self.visitor, look=True)
         self.restate(everything=False)
+
+    def draw(self, draws: bool) -> None:
+        self.visitor.draws, self.visitor.is_still = draws, False
+        self._house.painter.wake(self.visitor, look=True)
+
+    def file(self, number: int) -> bytes:
+        return self._house.file(number)
 
     def climb(self, rung: int) -> None:
         self._house.climb(rung)
@@ -222,7 +233,9 @@ class TabHandle:
         self._client.flush()  # else viser gathers messages for a sixtieth of a second
         if shown.still:
             self._arrange()
-        look, height, width = shown.look, *shown.picture.shape[:2]
+        look, height, width = shown.look, shown.look.camera.height, shown.look.camera.width
+        if shown.picture is not None:
+            height, width = shown.picture.shape[:2]
         values = []
         if look.psnr is not None and look.ssim is not None:
             values = [["PSNR", decibels(look.psnr)], ["SSIM", f"{look.ssim:.4f}"]]

@@ -22,13 +22,13 @@ class Shown:
     """What a visitor is shown.
 
     Attributes:
-        picture: (H, W, 3) uint8.
+        picture: (H, W, 3) uint8; None where the browser draws.
         still: whether it is as good as it gets.
         look: what it was made of.
         factor: by which differences in it are amplified.
     """
 
-    picture: U8
+    picture: U8 | None
     still: bool
     look: Look
     factor: int
@@ -51,6 +51,7 @@ class Visitor:
         swapped: whether A is shown in B's place and B in A's: the flicker key is held.
         fade: how much of the photograph shows.
         view: number of the view that the camera is at, if it is at one.
+        draws: whether the browser draws what is to be seen by itself.
     """
 
     number: int
@@ -66,6 +67,7 @@ class Visitor:
     swapped: bool = False
     fade: float = 0.0
     view: int | None = None
+    draws: bool = False
     #: The painter's own: what was rendered last, of which camera, and whether more is to be done.
     look: Look | None = None
     is_still: bool = False
@@ -81,8 +83,15 @@ class Visitor:
         part = min(1.0, MOST_PIXELS / max(self.width, self.height, 1))
         return max(round(self.width * part), 1), max(round(self.height * part), 1)
 
+    @property
+    def is_pictured(self) -> bool:
+        """Whether it needs pictures: no browser draws photographs over a scene."""
+        return not self.draws or self.fade > 0
+
     def needs(self, is_pair: bool) -> tuple[Which, ...]:
         """The scenes that its picture is made of."""
+        if not self.is_pictured:
+            return ()
         if not is_pair:
             return ("A", "B")
         if self.mode in ("A", "B"):

@@ -4,7 +4,7 @@ Follow it in this order:
 
 1. visibility.py: what views may draw of a scene, and whether that pays. Pure NumPy. reached.py: what a sweep fetches
    of that, as a device finds it.
-2. groups.py and plan.py: views that are looked at with the same splats, and the ways to group all views. A plan
+2. plan.py: views that are looked at with the same splats, and the ways to group all views. A plan
    is data: to look at views in another way, write another function there.
 3. budget.py: how much memory there is, and which groups of a plan stay on the device. *Who decides what is resident?*
 4. subsets.py: where a group's splats come from: all, named by numbers, or copied.

@@ -2,8 +2,8 @@
 
 A :class:`Budget` is asked for each group, in the plan's order, how many bytes it may take (:meth:`Budget.room`), and is
 told what it has taken (:meth:`Budget.took`). A group with less room than it takes is streamed: made again whenever it
-is looked at. Views of which only a part fits (:class:`Shared`) keep their lists first, see
-:mod:`potr_cl.raster.view_cache`.
+is looked at. Views of which only a part fits (:class:`Shared`) keep their lists first, in a
+:class:`ViewCache`.
 """
 
 from __future__ import annotations
@@ -12,15 +12,107 @@ import math
 from collections.abc import Sequence
 from typing import Protocol
 
+import pyopencl as cl
+
+from potr_cl.errors import DeviceError
 from potr_cl.model.camera import Camera
 from potr_cl.opencl.device import Device
-from potr_cl.raster.view_cache import ViewCache
-from potr_cl.raster.view_set import tile_grid
-from potr_cl.views.groups import ViewGroup, work
+from potr_cl.opencl.memory import Memory, Owner
+from potr_cl.raster.view_set import ViewSet, tile_grid
+from potr_cl.views.visibility import ViewGroup, work
+
+#: A launch's views should take at most a sixteenth of the budget: it is filled launch by launch, and what is left over
+#: at the end is not used.
+LEAST_SETS = 16
+#: Bytes of a projected splat of a view: shape and colour.
+_SHAPE, _COLOUR = 32, 16
+GEOMETRY = _SHAPE + _COLOUR
+
+
+class ViewCache(Owner):
+    """Prepared views that are kept for more than one sweep, within a budget of device memory.
+
+    Tile lists and depth orders take longer to make again than projections. So the lists of as many views as possible
+    are kept first, and then the projections of as many of these as there is room for. The other views share room for
+    one projection, which is made again whenever it is needed.
+
+    Args:
+        device: that they are prepared on.
+        budget: bytes that they may take.
+        others: bytes of the budget for which others have more use than views have for geometry of their own.
+
+    Attributes:
+        room: bytes of the budget that are left.
+        largest: projected splats of the largest set of views that will be kept, where later ones are larger than the
+            first ones.
+        shared: shapes and colours for views that have none of their own, one set of views at a time; None: all views
+            have their own.
+    """
+
+    def __init__(self, device: Device, budget: float, others: float = 0) -> None:
+        self._memory = Memory(device)
+        self._whole: list[ViewSet] = []  # those that keep their geometry
+        self.room, self._others = budget, others
+        self.largest = 0
+        self.shared: tuple[cl.Buffer, cl.Buffer] | None = None
+
+    def most_views(self, most: int, nbytes: int) -> int:
+        """Views to do in one launch: ``most``, or as many as surely are a small part of the budget.
+
+        Args:
+            nbytes: that a view takes, at least.
+        """
+        return int(min(max(self.room // (LEAST_SETS * nbytes), 1), most))
+
+    def keep(self, views: ViewSet, own: int = 0) -> bool:
+        """Keep prepared views if the budget allows it.
+
+        Args:
+            views: may lose their geometry now, or later, when other views need the room.
+            own: bytes that the caller keeps along with them.
+
+        Returns:
+            Whether they are kept. If not, the caller closes them.
+        """
+        to_spare = [*self._whole, views]
+        shared = 0 if self.shared else max(GEOMETRY * self.largest, *map(self._geometry, to_spare))
+        needed = views.nbytes_cached + own
+        if needed + shared > self.room + sum(map(self._geometry, self._whole)):
+            return False
+        left = self.room - needed - self._geometry(views)
+        if self.shared is None and left < max(self._others, 0):
+            self._share(shared // GEOMETRY)
+            left -= shared
+        self.room = left
+        while self.room < 0 or (self.room < self._others and to_spare):
+            other = to_spare.pop()
+            self.room += self._geometry(other)
+            other.free_geometry()
+        self._whole = to_spare
+        return True
+
+    def _geometry(self, views: ViewSet) -> int:
+        return GEOMETRY * views.stride * len(views.views)
+
+    def _share(self, splats: int) -> None:
+        try:
+            self.shared = (
+                self._memory.allocate(_SHAPE * splats, "the projected splats"),
+                self._memory.allocate(_COLOUR * splats, "the projected splats' colours"),
+            )
+        except DeviceError:
+            self._memory.close()
+            raise
+
+    def close(self) -> None:
+        """Give back the memory that views share; the views themselves are closed by their owners."""
+        self._memory.close()
+        self.shared, self._whole = None, []
+
 
 #: Part of the device's memory that the views may take unless the caller sets a budget. A CPU's is that of the host: the
 #: scene, its new colours and all other programs live there too.
-_SHARE, _SHARE_OF_HOST = 0.5, 0.3
+_SHARE_OF_ALL, _SHARE_OF_HOST = 0.5, 0.3
 #: The same of what is free, of views that share the device with other large things: a re-fit's vectors.
 _SHARE_OF_FREE, _SHARE_OF_FREE_HOST = 0.4, 0.25
 #: Bytes that a view whose splats are named by their numbers is expected to take, for each splat: shape, colour, number,
@@ -42,7 +134,7 @@ _IN_HAND, _MOST_IN_HAND = 120, 1 / 4
 
 def default_memory(device: Device) -> int:
     """Bytes that the views may take: half of a GPU's memory, 0.3 of a CPU's, which is the host's memory."""
-    return int(device.info.memory * (_SHARE_OF_HOST if device.info.shares_host_memory else _SHARE))
+    return int(device.info.memory * (_SHARE_OF_HOST if device.info.shares_host_memory else _SHARE_OF_ALL))
 
 
 def free_memory(device: Device) -> float:

@@ -25,12 +25,11 @@ from potr_cl.errors import DeviceMemoryError
 from potr_cl.model.camera import Camera
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import MARGIN, Memory, Owner, Reused
-from potr_cl.raster.view_cache import GEOMETRY, ViewCache
 from potr_cl.raster.view_set import ViewSet
-from potr_cl.views.budget import target_bytes
-from potr_cl.views.groups import ViewGroup
+from potr_cl.views.budget import GEOMETRY, ViewCache, target_bytes
 from potr_cl.views.plan import ViewPlan
 from potr_cl.views.subsets import Left, SplatSource, Subset
+from potr_cl.views.visibility import ViewGroup
 
 
 class Work(Protocol):
@@ -115,9 +114,6 @@ class ViewEngine(Owner, Generic[W]):
         idle: numbers of views that draw nothing.
         passing: bytes that a set of streamed views takes while it is there, at most, where they take turns in the same
             memory. Others may have what that leaves.
-
-    Raises:
-        DeviceError: a view does not fit the device.
     """
 
     def __init__(
@@ -287,11 +283,7 @@ class ViewEngine(Owner, Generic[W]):
 
     @contextmanager
     def ready(self, launch: Launch[W]) -> Iterator[Ready[W]]:
-        """Views with their geometry, inside the block; the numbers of streamed ones' splats stay until the next ones'.
-
-        Raises:
-            DeviceError: they do not fit the device.
-        """
+        """Views with their geometry, inside the block; streamed ones' splats' numbers stay until the next ones'."""
         if launch.resident is not None:
             self.project(launch.resident)
             yield launch.resident

@@ -16,10 +16,10 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.model.splat_groups import SplatGroups
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner, Reused
-from potr_cl.raster.kept_scene import fits_whole, whole_on_device
 from potr_cl.raster.picked_splats import NO_SPLAT, IndexSubset, IndexSubsets, Picker
 from potr_cl.raster.preparing_memory import PreparingMemory
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.resident import fits_whole, whole_on_device
 from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.raster.scene_buffers import SPLAT_GROUP, Drawable, SceneBuffers, gathered
 from potr_cl.views import visibility
@@ -49,9 +49,6 @@ class SeenRasterizer(Owner):
 
     Attributes:
         device, rules, background: as given.
-
-    Raises:
-        DeviceError: the device has no room for the numbers of the splats' groups.
     """
 
     def __init__(
@@ -96,9 +93,6 @@ class SeenRasterizer(Owner):
             numbers: of the views among them.
             cameras: the views.
             target, start: as of :meth:`render_into`.
-
-        Raises:
-            DeviceError: a view does not fit the device, or the device failed.
         """
         first = 0
         while first < len(numbers):
@@ -172,9 +166,6 @@ class SeenRasterizer(Owner):
             cameras: of the views.
             target: takes (pixels, 3) float32.
             start: byte where they begin.
-
-        Raises:
-            DeviceError: a view does not fit the device, or the device failed.
         """
         seen = self._groups.visible_by(cameras, self.rules.near)
         with Memory(self.device) as memory:
@@ -211,10 +202,6 @@ class SeenRasterizer(Owner):
                 memory = stack.enter_context(Memory(self.device))
                 yield stack.enter_context(self._picked(self.picks(memory, seen[None]), 0))
 
-    def close(self) -> None:
-        """Give all device memory back."""
-        self._owned.close()
-
 
 def rasterizer_for(
     device: Device,
@@ -240,9 +227,6 @@ def rasterizer_of(
     Args:
         device, scene, rules, background: as of :class:`~potr_cl.raster.rasterizer.Rasterizer`.
         groups: of the scene's splats, where views see little of it (:func:`groups_worth_it`).
-
-    Raises:
-        DeviceError: the scene does not fit the device.
     """
     if groups is None:
         return Rasterizer(device, scene, rules, background)

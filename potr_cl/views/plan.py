@@ -20,11 +20,21 @@ from numpy.typing import NDArray
 from potr_cl.model.camera import Camera
 from potr_cl.raster.preparing_memory import PreparingMemory
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.view_cache import GEOMETRY, LEAST_SETS, ViewCache
-from potr_cl.views.budget import COPIED_SPLAT, Budget, Foretold, Named, Shared, Together, drawn_bytes, target_bytes
-from potr_cl.views.groups import ViewGroup
+from potr_cl.views.budget import (
+    COPIED_SPLAT,
+    GEOMETRY,
+    LEAST_SETS,
+    Budget,
+    Foretold,
+    Named,
+    Shared,
+    Together,
+    ViewCache,
+    drawn_bytes,
+    target_bytes,
+)
 from potr_cl.views.subsets import CopiedSplats
-from potr_cl.views.visibility import Visibility
+from potr_cl.views.visibility import ViewGroup, Visibility
 
 #: Streamed views may lose so many times as much as a tile may, on the average, before they are looked at again: some
 #: tiles lose far more than the average. With ten million splats and 300 views, all of them streamed, 2 and 0.5 cost 1.4
@@ -185,9 +195,6 @@ def as_drawn(
         clusters: of those that are meant.
         memory: bytes of the device's that they may take.
         progress: called with the views whose splats are found, and their number.
-
-    Raises:
-        DeviceError: a piece of the scene does not fit the device.
     """
     found: list[ViewGroup] = []
     for cluster in clusters:

@@ -1,4 +1,5 @@
-"""Which splats each view reaches: :func:`reached_splats`.
+"""Which splats each view reaches, as a device finds it: :func:`reached_splats`; and which are surely seen at all:
+:func:`surely_seen`, the quick part of :func:`potr_cl.model.splat_groups.unseen_splats`.
 
 A view reaches a splat if a sweep fetches it, for any of its tiles. Most others lie beside the view; or behind what ends
 all pixels of their tiles, as most of a city does. What a sweep computes is the same to the last bit if the others are
@@ -9,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -17,9 +19,12 @@ from numpy.typing import NDArray
 
 from potr_cl.errors import DeviceMemoryError
 from potr_cl.model.camera import Camera
+from potr_cl.model.splat_groups import NEAR, REACH, bounds, views_in_turn
 from potr_cl.opencl.memory import Memory, Reused
+from potr_cl.opencl.structs import struct_dtype
 from potr_cl.raster.picked_splats import Picker
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.scene_buffers import SPLAT_GROUP, SceneBuffers
 from potr_cl.raster.view_set import camera_struct
 
 #: Fewer splats are looked at together as fast.
@@ -79,9 +84,6 @@ def reached_splats(
 
     Returns:
         None where views had better share all splats: there are few, or views reach many of them.
-
-    Raises:
-        DeviceError: a view with all splats does not fit the device.
     """
     if rasterizer.splats < LEAST_SPLATS or not numbers:
         return None
@@ -180,3 +182,49 @@ def _reached(
     finally:
         passing.close()
     return found
+
+
+_SOURCE = "raster/surely_seen.cl"
+
+
+class Seen(IntEnum):
+    """What is known of a splat, ``enum`` of the kernel."""
+
+    NO, YES, UNDECIDED = range(3)
+
+
+def surely_seen(scene: SceneBuffers, cameras: Sequence[Camera]) -> NDArray[np.uint8]:
+    """Whether splats reach into a view's picture.
+
+    Args:
+        scene: the splats on a device.
+        cameras: the views.
+
+    Returns:
+        (N,) :class:`Seen` of each splat; undecided where rounding could decide it.
+    """
+    device = scene.device
+    seers = np.zeros(len(cameras), struct_dtype(_SOURCE, "Seer"))
+    for seer, number in zip(seers, views_in_turn(len(cameras)), strict=True):
+        camera = cameras[number]
+        seer["rotation"], seer["translation"] = camera.rotation.ravel(), camera.translation
+        for axis, (low, high) in enumerate(bounds(camera)):
+            seer["low"][axis], seer["high"][axis] = low, high
+            seer["low_length"][axis], seer["high_length"][axis] = np.hypot(1, low), np.hypot(1, high)
+    kernel = device.shared_kernel(_SOURCE, "surely_seen")
+    with Memory(device) as memory:
+        found = memory.allocate(scene.stride, "the splats that are seen")
+        kernel.bind(
+            splats=scene.splats,
+            stride=scene.stride,
+            means=scene.means,
+            scales=scene.scales,
+            seers=memory.upload(seers, "the views"),
+            views=len(cameras),
+            near=NEAR,
+            reach_of_one=REACH,
+            seen=found,
+        )
+        kernel.launch((scene.stride,), (SPLAT_GROUP,))
+        seen: NDArray[np.uint8] = device.download(found, (scene.splats,), np.uint8)
+    return seen

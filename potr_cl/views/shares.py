@@ -8,12 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.model.splat_groups import Indices
-from potr_cl.raster.carried import Excerpt
+from potr_cl.raster.resident import SceneSubset
 from potr_cl.views.visibility import Visibility
+from potr_cl.workers.pool import Pool, Shares
+
+if TYPE_CHECKING:
+    from potr_cl.raster.resident import ResidentScene
+    from potr_cl.views.targets import PicturesAhead
 
 
 @dataclass(frozen=True)
@@ -23,14 +29,14 @@ class ViewShare:
     Attributes:
         numbers: of its views, ascending.
         splats: (n,) int64, the numbers of the splats that these may draw, ascending, in the scene that is worked on.
-        excerpt: these splats, whose places are their numbers from now on.
-        sights: what all views may draw of them.
+        subset: these splats, whose places are their numbers from now on.
+        visibility: what all views may draw of them.
     """
 
     numbers: list[int]
     splats: Indices
-    excerpt: Excerpt
-    sights: Visibility
+    subset: SceneSubset
+    visibility: Visibility
 
 
 @dataclass(frozen=True)
@@ -47,10 +53,15 @@ class ViewShares:
     shares: tuple[ViewShare, ...]
     names: tuple[str, ...] = ()
 
+    @property
+    def dealt(self) -> Shares:
+        """Who does which: the master none."""
+        return Shares([], [share.numbers for share in self.shares], self.names)
+
     @staticmethod
     def of(
         views: Sequence[Camera],
-        sights: Visibility,
+        visibility: Visibility,
         speeds: Sequence[float],
         source: Scene,
         numbers: Indices,
@@ -60,7 +71,7 @@ class ViewShares:
 
         Args:
             views: at least one.
-            sights: what they see of the scene that is worked on.
+            visibility: what they see of the scene that is worked on.
             speeds: of those that are to do them.
             source: a scene that has that one's splats as they are.
             numbers: (N,) of these there, ascending.
@@ -68,9 +79,23 @@ class ViewShares:
         """
         shares: list[ViewShare] = []
         busy: list[str] = []
-        for place, own in enumerate(sights.dealt(speeds)):
+        for place, own in enumerate(visibility.dealt(speeds)):
             if own:
                 busy += names[place : place + 1]
-                splats, of_these = sights.of_views(own)
-                shares.append(ViewShare(own, splats, Excerpt(source, numbers[splats]), of_these))
+                splats, of_these = visibility.of_views(own)
+                shares.append(ViewShare(own, splats, SceneSubset(source, numbers[splats]), of_these))
         return ViewShares(views, tuple(shares), tuple(busy))
+
+
+@dataclass(frozen=True)
+class HelpFrom:
+    """Workers that do some of the views.
+
+    Attributes:
+        pool: the workers.
+        source: the scene whose pictures are the targets, perhaps kept on devices, or with pictures of it there; or who
+            does which views, and has what these see of it.
+    """
+
+    pool: Pool
+    source: Scene | ResidentScene | PicturesAhead | ViewShares

@@ -7,7 +7,7 @@ the others keep their order.
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -18,6 +18,7 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.model.splat_groups import Indices
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner, Reused
 from potr_cl.raster.picked_splats import NO_SPLAT, IndexSubset, IndexSubsets, Picker
@@ -26,8 +27,8 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.raster.scene_buffers import SPLAT_GROUP, Drawable, SceneBuffers, stride_of
 from potr_cl.raster.view_set import ViewSet
-from potr_cl.views.groups import Indices, ViewGroup
 from potr_cl.views.reached import Reach
+from potr_cl.views.visibility import ViewGroup
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class Subset:
     scene: SceneBuffers | None = None
 
 
-class SplatSource(Owner):
+class SplatSource(Owner, ABC):
     """Gives groups their splats, in the colours that they have by now.
 
     Attributes:
@@ -98,9 +99,6 @@ class SplatSource(Owner):
             stack, memory: own what is taken.
             group: the group.
             left: take only these; None: all.
-
-        Raises:
-            DeviceError: the device has no room.
         """
 
     @abstractmethod

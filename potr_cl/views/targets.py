@@ -30,12 +30,11 @@ from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.ferry import Cargo, Ferry
 from potr_cl.opencl.memory import Memory, Owner, Scratch
-from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.picked_splats import IndexSubsets
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.resident import ResidentScene
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
-from potr_cl.raster.view_cache import ViewCache
-from potr_cl.views.budget import target_bytes
+from potr_cl.views.budget import ViewCache, target_bytes
 from potr_cl.views.pictures import SeenRasterizer
 from potr_cl.views.visibility import Visibility
 
@@ -57,9 +56,6 @@ class Targets(Protocol):
             numbers: of the views.
             buffer: takes (H, W, 3) float32 of each, one behind the other.
             start: byte where they begin.
-
-        Raises:
-            DeviceError: the device failed, or a view does not fit it.
         """
         ...
 
@@ -95,17 +91,13 @@ def targets_of(
     scene: Drawable,
     cameras: Sequence[Camera],
     background: tuple[float, float, float],
-    sights: Visibility | None = None,
+    visibility: Visibility | None = None,
 ) -> Iterator[RenderedTargets]:
-    """A scene's pictures, with what each view may draw where that is known and the scene lies on a GPU: the same bits.
-
-    Raises:
-        DeviceError: the scene, or the numbers of its splats' groups, do not fit the device.
-    """
+    """A scene's pictures; by what views may draw, where that is known and the scene lies on a GPU: the same bits."""
     with ExitStack() as stack:
-        if sights is not None and isinstance(scene, SceneBuffers) and device.family == "gpu":
-            seen = stack.enter_context(SeenRasterizer(device, scene, sights.groups, background=background))
-            yield RenderedTargets(seen, cameras, seen.picks(stack.enter_context(Memory(device)), sights.seen))
+        if visibility is not None and isinstance(scene, SceneBuffers) and device.family == "gpu":
+            seen = stack.enter_context(SeenRasterizer(device, scene, visibility.groups, background=background))
+            yield RenderedTargets(seen, cameras, seen.picks(stack.enter_context(Memory(device)), visibility.seen))
         else:
             whole = stack.enter_context(Rasterizer(device, scene, background=background))
             yield RenderedTargets(whole, cameras)
@@ -208,7 +200,7 @@ class PicturesAhead(Owner):
         background: R, G, B behind it.
         cameras: all views.
         numbers: of the views whose pictures each device will be asked for.
-        sights: what each view may draw, where no view sees much of the scene.
+        visibility: what each view may draw, where no view sees much of the scene.
 
     Attributes:
         source: as given.
@@ -216,15 +208,15 @@ class PicturesAhead(Owner):
 
     def __init__(
         self,
-        source: KeptScene,
+        source: ResidentScene,
         background: tuple[float, float, float],
         cameras: Sequence[Camera],
         numbers: Mapping[Device, Sequence[int]],
-        sights: Visibility | None = None,
+        visibility: Visibility | None = None,
     ) -> None:
         self.source = source
         self._begun: dict[Device, Future[_Rendered | None]] = {
-            device: in_background(_rendered, device, source, background, cameras, some, sights)
+            device: in_background(_rendered, device, source, background, cameras, some, visibility)
             for device, some in numbers.items()
             if device.family == "gpu" and some
         }
@@ -290,21 +282,21 @@ class _Rendered(Owner):
 
 def _rendered(
     device: Device,
-    source: KeptScene,
+    source: ResidentScene,
     background: tuple[float, float, float],
     cameras: Sequence[Camera],
     numbers: Sequence[int],
-    sights: Visibility | None,
+    visibility: Visibility | None,
 ) -> _Rendered | None:
     """Some views' pictures on a device; None: it has not much room, or the scene does not lie there."""
     if sum(target_bytes(cameras[number]) for number in numbers) > AHEAD * device.info.memory:
         return None
-    scene = source.on(device)
+    scene = source.found_on(device)
     if not isinstance(scene, SceneBuffers):
         return None
     with suppress(DeviceMemoryError), device.all_or_nothing():
         rendered = _Rendered(device, cameras, numbers)
-        with targets_of(device, scene, cameras, background, sights) as targets:
+        with targets_of(device, scene, cameras, background, visibility) as targets:
             targets.into(numbers, rendered.buffer)
         return rendered
     return None
@@ -327,9 +319,6 @@ class TargetPictures(Owner):
         targets: give them, until others are named (:meth:`fill`, :meth:`of`).
         sets: of views that will be asked for, always together: there is room for the largest in any case. None: views
             are asked for in any order, and kept one by one.
-
-    Raises:
-        DeviceMemoryError: the device has no room for these.
     """
 
     def __init__(

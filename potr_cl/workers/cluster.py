@@ -1,7 +1,7 @@
 """A Dask cluster: :class:`ClusterPool`. Every worker of it is a worker here, with a device of its own.
 
 Dask brings the network, placing things on workers, and who is alive. A worker's parts, and what they share, live in an
-actor there (:class:`potr_cl.workers.seat.Seat`). Dask's own way to share things (``scatter``) keeps only one copy of
+actor there (:mod:`potr_cl.workers.actor`). Dask's own way to share things (``scatter``) keeps only one copy of
 them in the long run, and that goes with its worker. The master only adds up what the workers find.
 """
 
@@ -13,23 +13,21 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from concurrent.futures import TimeoutError as NotInTime
 from contextlib import ExitStack, contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 from potr_cl.errors import DeviceError, PotrError, UsageError
 from potr_cl.opencl.device import Device
-from potr_cl.workers.client import client_of, first_line
+from potr_cl.workers.actor import ClusterWorker, WorkerFailed, host_of
+from potr_cl.workers.client import Pulse, client_of, first_line
 from potr_cl.workers.host import DeviceThread
-from potr_cl.workers.pool import Held, Part, Pool, Shared, Traffic, Worker, WorkerLost, tell_of_kinds
-from potr_cl.workers.pulse import Pulse
-from potr_cl.workers.seat import Known, Seat
+from potr_cl.workers.pool import Pool, Shared, Traffic, Worker, WorkerLost, tell_of_kinds
 
 if TYPE_CHECKING:
     from dask.distributed import Client
 
-#: Seconds to wait for the first worker to come, and for a worker to say which device it has.
-_COME, _HELLO = 60.0, 120.0
+#: Seconds to wait for the first worker to come.
+_COME = 60.0
 #: Seconds between two looks at whether a worker that has not answered yet is alive, and at whether to go on waiting.
 _ALIVE, _POLL = 3.0, 0.1
 #: The second of them grows by this factor from look to look, up to so much: each look wakes the client's event loop.
@@ -66,7 +64,7 @@ class ClusterPool(Pool):
         self.first, self.traffic, self.patience = first, Traffic(), patience
         self._closing = threading.Event()
         self._waiting = ThreadPoolExecutor(_MOST_WAITING, thread_name_prefix="potr_cl cluster")
-        self._workers: list[_ClusterWorker] = []
+        self._workers: list[ClusterWorker] = []
         self._here: DeviceThread | None = None
         self._is_gone = False  # the scheduler
         self._refused: set[str] = set()
@@ -187,7 +185,7 @@ class ClusterPool(Pool):
         except Exception as error:
             if self._closing.is_set() or address not in self._alive() or _is_of_transport(error):
                 raise WorkerLost(f"{address} is gone ({first_line(error)})") from None
-            raise _Failed(address, first_line(error)) from error
+            raise WorkerFailed(address, first_line(error)) from error
 
     def _answered(self, answer: Any, seconds: float) -> bool:
         """Whether an answer is there, after waiting a little for it."""
@@ -242,7 +240,7 @@ class ClusterPool(Pool):
             _log.warning("%s; ignoring this worker", lost)
         self._take_in([worker for worker in workers if self._rounds_as_others(worker)])
 
-    def _rounds_as_others(self, worker: _ClusterWorker) -> bool:
+    def _rounds_as_others(self, worker: ClusterWorker) -> bool:
         """Whether a worker that has been met computes to the same digits; if not it is left, and the user told."""
         if worker.digits == self._digits:
             return True
@@ -265,7 +263,7 @@ class ClusterPool(Pool):
                 return
             with suppress(WorkerLost):
                 come = self._alive() - {worker.name for worker in self._workers} - self._refused
-                for worker in self._invited({address for address in come if _host(address) not in lost}):
+                for worker in self._invited({address for address in come if host_of(address) not in lost}):
                     try:
                         worker.meet()
                     except (UsageError, WorkerLost) as error:
@@ -280,16 +278,18 @@ class ClusterPool(Pool):
                         _log.warning("worker %s joined; it gets views from the next stage on", worker.name)
                         self._take_in([worker])
 
-    def _invited(self, addresses: set[str]) -> list[_ClusterWorker]:
+    def _invited(self, addresses: set[str]) -> list[ClusterWorker]:
         """Workers that have begun to say which device they take: those of one computer take its devices in turn."""
-        alive, invited = self._alive(), list[_ClusterWorker]()
+        alive, invited = self._alive(), list[ClusterWorker]()
         for address in sorted(addresses):
-            there = [each for each in [*self._workers, *invited] if each.host == _host(address) and each.name in alive]
+            there = [
+                each for each in [*self._workers, *invited] if each.host == host_of(address) and each.name in alive
+            ]
             place = min(set(range(len(there) + 1)) - {each.place for each in there})
-            invited.append(_ClusterWorker(self, address, place))
+            invited.append(ClusterWorker(self, address, place))
         return invited
 
-    def _take_in(self, workers: Sequence[_ClusterWorker]) -> None:
+    def _take_in(self, workers: Sequence[ClusterWorker]) -> None:
         with self._meeting:
             self._workers = [*self._workers, *workers]
             if self._closing.is_set():
@@ -300,169 +300,5 @@ class ClusterPool(Pool):
             tell_of_kinds(str(self.first.info), (worker.device for worker in self._workers))
 
 
-def _host(address: str) -> str:
-    return address.rsplit(":", 1)[0]
-
-
-class _ClusterWorker(Worker):
-    """One of Dask's workers, with a seat for this pool.
-
-    Args:
-        pool: that it is of.
-        name: its address.
-        place: its number among the workers of its computer.
-
-    Attributes:
-        host: the computer.
-        device, digits: the name of its device and how it rounds, once it has been met.
-    """
-
-    device = digits = ""
-
-    def __init__(self, pool: ClusterPool, name: str, place: int) -> None:
-        self.name, self.host, self.place = name, _host(name), place
-        self._pool = pool
-        self._known: list[tuple[int, Any]] = []  # what the seat has been sent
-        self._next = 0
-        self._sending = threading.Lock()
-        options = {"actor": True, "workers": [name], "allow_other_workers": False, "pure": False}
-        with _as_worker_lost(name):
-            self._future = pool.client.submit(Seat, place, **options)
-        self._seat: Any = None
-
-    def meet(self) -> None:
-        """Wait until it says which device it has.
-
-        Raises:
-            UsageError: it cannot do the work.
-            WorkerLost: it has gone.
-        """
-        try:
-            self._seat = self._pool.wait_for(self._future, self.name, _HELLO)
-            version, name, family, self.digits = self.ask("hello")
-        except WorkerLost:
-            # As those do that have no potr_cl.
-            raise WorkerLost(
-                f"worker {self.name} of the cluster has gone as it was asked for its device: see what it says itself, "
-                "and install potr_cl there as it is here"
-            ) from None
-        except DeviceError as error:
-            if "deserialization of the task graph" in str(error):  # which the scheduler does
-                raise UsageError(
-                    "the scheduler of the cluster does not know potr_cl: install it there as it is here"
-                ) from None
-            if not isinstance(error, _Failed):
-                raise UsageError(f"worker {self.name} of the cluster cannot do the work: {error}") from None
-            raise UsageError(
-                f"worker {self.name} of the cluster cannot do the work ({error.said}): install potr_cl there as it is "
-                "here"
-            ) from None
-        _check(self.name, version, name, family, self._pool.first)
-        # Hosts of two generations can call other processors by the same name.
-        others = name == str(self._pool.first.info) and self.digits != self._pool.first.digits()
-        self.device = f"{name} with other instructions" if others else name
-
-    def ask(self, method: str, *args: Any) -> Any:
-        """What a method of the seat returns."""
-        with _as_worker_lost(self.name), self._pool.client.as_current():  # actors look for the client
-            answer = getattr(self._seat, method)(*args)
-        return self._pool.wait_for(answer, self.name)
-
-    def make(self, kind: type[Part], memory: int | None, given: Sequence[Any]) -> Future[Held]:
-        def made() -> Held:
-            with self._sending:
-                things = [
-                    Shared(Known(self._sent(each.handle)), each.part) if isinstance(each, Shared) else each
-                    for each in given
-                ]
-                self._next += 1
-                number = self._next
-                # Until it is made nothing else is sent, for which the seat would forget what this is made of.
-                self.ask("make", number, kind, memory, things)
-            return _HeldThere(self._pool, self, number)
-
-        return self._pool.begin(made)
-
-    def has(self, thing: Any) -> bool:
-        """Whether the seat has been sent a thing, and keeps it."""
-        return any(known is thing for _, known in self._known)
-
-    def _sent(self, thing: Any) -> int:
-        """The number by which the seat knows a thing, after sending it if need be."""
-        number = next((number for number, known in self._known if known is thing), None)
-        if number is None:
-            self._next += 1
-            number = self._next
-            # Two: the uncompressed scene, and what is worked on now.
-            kept = self._known[-1:]
-            self.ask("keep", number, thing, [each for each, _ in kept])
-            self._pool.traffic.add(sent=getattr(thing, "nbytes", 0), what=type(thing).__name__)
-        else:
-            kept = [each for each in self._known if each[1] is not thing]
-        self._known = [*kept, (number, thing)]
-        return number
-
-    def leave(self) -> None:
-        """Have Dask forget the seat, and with it all that it holds, as soon as it is idle."""
-        with suppress(Exception):
-            self._future.release()
-
-
-class _Failed(DeviceError):
-    """Something else than this package failed on a worker.
-
-    Attributes:
-        said: what it says.
-    """
-
-    def __init__(self, address: str, said: str) -> None:
-        super().__init__(f"worker {address} failed ({said})")
-        self.said = said
-
-
-class _HeldThere(Held):
-    """A part on one of Dask's workers."""
-
-    def __init__(self, pool: ClusterPool, worker: _ClusterWorker, number: int) -> None:
-        self._pool, self._worker, self._number = pool, worker, number
-
-    def begin(self, command: str, args: Sequence[Any]) -> Future[Any]:
-        return self._pool.begin(lambda: self._worker.ask("run", self._number, command, tuple(args)))
-
-    def abandon(self) -> None:
-        # Without waiting: the worker may be gone, or stand still.
-        with suppress(PotrError):
-            self._pool.begin(lambda: self._worker.ask("drop", self._number))
-
-    def close(self) -> None:
-        # One that stands still, though Dask knows it, is not waited for ever: it forgets the part when it goes on.
-        with suppress(PotrError, NotInTime):
-            self._pool.begin(lambda: self._worker.ask("drop", self._number)).result(self._pool.patience)
-
-
-def _check(address: str, version: str, name: str, family: str, first: Device) -> None:
-    from potr_cl import __version__
-
-    if version != __version__:
-        raise UsageError(
-            f"worker {address} of the cluster has potr_cl {version}, this computer {__version__}: install the same"
-        )
-    if family != first.family:
-        raise UsageError(
-            f"worker {address} of the cluster computes on {name}, this computer on {first.info}, which round "
-            "differently: choose a device of the same kind with --device"
-        )
-
-
 def _is_of_transport(error: Exception) -> bool:
     return isinstance(error, (OSError, EOFError)) or "lost" in str(error).lower() or "cancel" in repr(error).lower()
-
-
-@contextmanager
-def _as_worker_lost(who: str) -> Iterator[None]:
-    try:
-        yield
-    except PotrError:
-        raise
-    except Exception as error:
-        raise WorkerLost(f"{who} does not answer ({first_line(error)})") from None

@@ -50,7 +50,7 @@ class Parts(Owner):
         names: Sequence[str] = (),
     ) -> None:
         self._longest = 0.0  # seconds that anything has taken
-        self._pool, self._kind, self._memory = pool, kind, memory
+        self._pool, self._kind, self._budget = pool, kind, memory
         self._given = [tuple(each) for each in given]
         self._log: list[tuple[str, tuple[Any, ...]]] = []
         self._unfit: set[str] = set()  # workers on which a part of this work has failed
@@ -74,7 +74,7 @@ class Parts(Owner):
             DeviceError: no worker can make them.
         """
         making, self._making = self._making, {}
-        self._collect(making, self._take_made, None)
+        self._collect(making, self._held.__setitem__, None)
 
     def __len__(self) -> int:
         return len(self._given)
@@ -174,9 +174,6 @@ class Parts(Owner):
         self._pool.traffic.add(sent=nbytes(args), what=command)
         return held.begin(command, args)
 
-    def _take_made(self, place: int, held: Held) -> None:
-        self._held[place] = held
-
     def _able(self) -> list[Worker]:
         """Workers that have neither been lost nor failed with a part of this work; without any, the reserve."""
         for workers in (self._pool.workers, self._pool.reserve):
@@ -252,7 +249,7 @@ class Parts(Owner):
         """Make a part on the worker that has it now, and have it do all that it has been told."""
         worker = self._by[place]
         assert worker is not None
-        held: Held = self._answer(worker.make(self._kind, self._memory, self._given[place]))
+        held: Held = self._answer(worker.make(self._kind, self._budget, self._given[place]))
         self._held[place] = held
         for command, args in self._log:
             self._answer(self._begin(place, command, args))
@@ -269,9 +266,6 @@ class Parts(Owner):
             return future.result(None if patience is None else max(patience, _SLOWER * self._longest))
         except NotInTime:
             raise WorkerLost("it does not answer") from None
-
-    def _note(self, command: str, args: tuple[Any, ...]) -> None:
-        self._log.append((command, args))
 
 
 #: A method of the parts, and what it is given.
@@ -341,7 +335,7 @@ class Pending:
             parts._pending = None  # it is over
             raise
         if self._logged:
-            parts._note(self._command, self._args)
+            parts._log.append((self._command, self._args))
         self._found = [found[place] for place in range(len(found))]
         return self._found
 

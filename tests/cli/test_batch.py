@@ -12,7 +12,7 @@ import pytest
 from potr_cl import cli
 from potr_cl.formats import load_scene
 from potr_cl.formats.scenes import ply
-from potr_cl.workers.opening import Workers, open_workers
+from potr_cl.workers.host import Workers, open_workers
 from tests.reference.scenes import random_scene
 
 KEEP = ["--no-prune", "--no-compact", "--refit", "off"]

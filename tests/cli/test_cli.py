@@ -18,7 +18,7 @@ from tests.cli.calls import KEEP, fails
 
 def test_what_looks_at_no_views_opens_no_device(tmp_path, scene_path, monkeypatch):
     opened = []
-    monkeypatch.setattr("potr_cl.workers.opening.Device", opened.append)
+    monkeypatch.setattr("potr_cl.workers.host.Device", opened.append)
     assert cli.main(["encode", str(scene_path), "-o", str(tmp_path / "scene.potr"), *KEEP]) == 0
     assert not opened
 

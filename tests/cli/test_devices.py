@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import getpass
 import json
+import platform
+from pathlib import Path
 
 import pytest
 
@@ -57,6 +60,37 @@ def test_devices_check_fails_if_the_one_to_be_taken_does(capsys, monkeypatch, ch
     assert said in captured.err
     marks = [line[:2].strip() for line in captured.out.splitlines() if line[2:3].isdigit()]
     assert marks == [("*" if i == 0 else "") + ("" if check == "passed" else "!") for i, check in enumerate(checks)]
+
+
+def test_a_report_to_be_posted(capsys, monkeypatch, tmp_path):
+    """Holds what was found on each device, and no names or paths of the user."""
+    names = getpass.getuser(), platform.node(), Path.home().name
+    said = [
+        f"{Path.home()}/a.cl:3: warning by {names[0]} on {names[1]}",
+        r"C:\Users\me\a.cl(3): unused",
+        "either/or",
+    ]
+    times = {"removal": {"launches": 3, "seconds": 0.5}}
+    monkeypatch.setattr(verdict, "measured", lambda info: (None, {"compiler": said, "seconds": 1.5, "times": times}))
+    run(capsys, "devices", "--report", tmp_path / "devices.json")
+    text = (tmp_path / "devices.json").read_text("utf-8")
+    report = json.loads(text)
+    assert [entry["name"] for entry in report["devices"]] == [info.name for info in list_devices()]
+    entry = next(entry for entry in report["devices"] if entry["check"] == "passed")
+    assert entry["times"] == times
+    assert entry["driver"]
+    assert isinstance(entry["extensions"], list)
+    assert entry["compiler"] == ["…:3: warning by … on …", "…(3): unused", "either/or"]
+    assert str(Path.home()) not in text
+    assert "Users" not in text
+
+
+def test_a_report_of_a_device_that_fails(capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr(verdict, "measured", lambda info: ("atomics are wrong in /tmp/x/kernel.cl", {}))
+    fails(capsys, ["devices", "--report", str(tmp_path / "devices.json")], 1, "none works")
+    entry = json.loads((tmp_path / "devices.json").read_text("utf-8"))["devices"][0]
+    assert entry["check"] == "atomics are wrong in …"
+    assert "times" not in entry
 
 
 def test_no_device(capsys, monkeypatch):

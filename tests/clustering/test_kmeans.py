@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from potr_cl.clustering.comparison import Lists, Points
+from potr_cl.clustering.comparison import Lists, Points, centres_of_sums, errors_at_zero, rows_of_points
 from potr_cl.clustering.kmeans import Rate, assigned, cluster
-from potr_cl.clustering.rows import centres_of_sums, errors_at_zero, rows_of_points
 from tests.devices import KERNELS, open_device
 
 

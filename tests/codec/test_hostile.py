@@ -21,6 +21,7 @@ from potr_cl.errors import DataError, UsageError
 from potr_cl.host.inputs import FREE_SPLATS
 from potr_cl.model.box import Box
 from potr_cl.model.scene import Scene
+from tests.cases.memory import takes_at_most
 from tests.cases.own_warnings import no_warnings
 from tests.oracles.decoder import decode as decode_independently
 from tests.reference.file_parts import File
@@ -53,13 +54,8 @@ def one_leaf(splats, depth=0) -> list:
 
 def refused_without_memory(data, message, trust=False):
     """That a file is refused before anything of it is unpacked: its header alone tells."""
-    tracemalloc.start()
-    try:
-        with pytest.raises(DataError, match=message):
-            open_file(data, trust)
-        assert tracemalloc.get_traced_memory()[1] < 1 << 20
-    finally:
-        tracemalloc.stop()
+    with takes_at_most(1 << 20), pytest.raises(DataError, match=message):
+        open_file(data, trust)
 
 
 # Bombs ---------------------------------------------------------------------------------------------------------------

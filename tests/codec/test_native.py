@@ -15,7 +15,9 @@ from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import decode, open_file
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.native import library
-from potr_cl.codec.native.library import LIBRARY_VARIABLE, VARIABLE, Functions, native
+from potr_cl.codec.native import octree as native_octree
+from potr_cl.codec.native.declarations import CFunctions
+from potr_cl.codec.native.library import LIBRARY_VARIABLE, VARIABLE, native
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.codec.sections import Property
 from potr_cl.errors import DataError, UsageError
@@ -300,7 +302,7 @@ def test_a_library_that_is_none(monkeypatch, tmp_path):
 
 
 @pytest.fixture
-def functions(choose) -> Functions:
+def functions(choose) -> CFunctions:
     choose("native")
     found = native()
     assert found is not None
@@ -309,13 +311,13 @@ def functions(choose) -> Functions:
 
 def test_trees_and_tails_of_other_sizes_are_refused(functions):
     nothing = np.zeros(0, np.uint8)
-    tree = functions.octree.tree(nothing, nothing, 3, False)
+    tree = native_octree.tree(functions, nothing, nothing, 3, False)
     assert tree is not None
     with pytest.raises(TypeError, match="another number of splats"):
-        functions.octree.walk(tree, np.zeros(1, np.uint8), np.zeros(0, np.uint64), 2, 1)
+        native_octree.Walk(functions, tree, np.zeros(1, np.uint8), np.zeros(0, np.uint64), 2, 1)
     with pytest.raises(TypeError, match="takes 1 of uint8"):
-        functions.octree.walk(tree, np.zeros(2, np.uint8), np.zeros(0, np.uint64), 1, 1)
-    walk = functions.octree.walk(tree, np.full(1, 3, np.uint8), np.zeros(0, np.uint64), 1, 1)
+        native_octree.Walk(functions, tree, np.zeros(2, np.uint8), np.zeros(0, np.uint64), 1, 1)
+    walk = native_octree.Walk(functions, tree, np.full(1, 3, np.uint8), np.zeros(0, np.uint64), 1, 1)
     with pytest.raises(TypeError, match="before their tails"):
         walk.centres(0, np.zeros(4), np.zeros(3))
     with pytest.raises(TypeError, match="tails of another size"):

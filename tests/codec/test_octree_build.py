@@ -30,13 +30,11 @@ def test_levels_at_a_turn_are_numpys(monkeypatch):
         monkeypatch.setenv(VARIABLE, value)
         levels.append(octree.build(means, tolerance, absolute=True)[0].leaf_levels)
     assert np.array_equal(*levels)
-    functions = native().octree_build
-    assert set(functions.wanted(turn, half, 20)) == {-1}
-    assert -1 not in functions.wanted(turn * (1 + 1e-9), half, 20)
+    assert set(native_octree.wanted(native(), turn, half, 20)) == {-1}
+    assert -1 not in native_octree.wanted(native(), turn * (1 + 1e-9), half, 20)
 
 
 def test_what_does_not_fit_is_refused_before_c_sees_it():
-    building = native().octree_build
     words, numbers, wanted = np.zeros((1, 4), np.uint64), np.arange(4), np.zeros(4, np.int8)
     for arguments in (
         (words, 22, numbers, wanted),
@@ -47,9 +45,9 @@ def test_what_does_not_fit_is_refused_before_c_sees_it():
         (words.astype(np.int64), 3, numbers, wanted),
     ):
         with pytest.raises(TypeError):
-            building.streams(*arguments)
+            native_octree.streams(native(), *arguments)
     with pytest.raises(TypeError):
-        building.bounds(np.zeros((3, 3), np.float32), np.ones(2))
+        native_octree.bounds(native(), np.zeros((3, 3), np.float32), np.ones(2))
 
 
 @pytest.mark.parametrize("tolerance", [1e-1, 1e-3, 1e-7], ids=["some share leaves", "one word", "two words"])

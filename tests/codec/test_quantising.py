@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from potr_cl.codec import quantize
+from potr_cl.codec.native import quantising
 from potr_cl.codec.native.library import VARIABLE, native
 from potr_cl.codec.quantisers import median
 from potr_cl.codec.quantize import HyperParameters
@@ -26,7 +27,7 @@ def test_unit_quaternions_are_those_of_the_rasterizer(number):
     rng = np.random.default_rng(number)
     quaternions = rng.normal(0, 1, (number, 4)).astype(np.float32) * rng.lognormal(0, 9, (number, 1)).astype(np.float32)
     quaternions[::7] = 0
-    ours, wanted = functions.quantising.unit_quaternions(quaternions), unit_quaternions(quaternions).astype(np.float32)
+    ours, wanted = quantising.unit_quaternions(functions, quaternions), unit_quaternions(quaternions).astype(np.float32)
     assert (ours.dtype, ours.tobytes()) == (wanted.dtype, wanted.tobytes())
 
 
@@ -84,19 +85,18 @@ def test_what_does_not_fit_is_refused_before_c_sees_it():
     functions = native()
     if functions is None:
         pytest.skip("the compiled library is not there: python -m tools.make.native, or pip install -e .")
-    quantising = functions.quantising
     ones, sh = np.ones((4, 3), np.float32), np.ones((4, 1, 3), np.float32)
     with pytest.raises(TypeError):
-        quantising.nearest(ones, np.ones((2, 3)), np.empty(5))
+        quantising.nearest(functions, ones, np.ones((2, 3)), np.empty(5))
     doubles, logits, numbers = np.ones((4, 3)), np.ones(4, np.float32), np.arange(4)
     for order, start, columns in ((numbers + 1, 0, 7), (numbers, 1, 7), (numbers, -1, 7), (numbers, 0, 6)):
         with pytest.raises(TypeError):
-            quantising.splat_levels(
+            quantising.splat_levels(functions,
                 np.ones((4, 4), np.float32), doubles, logits, order, *quantize.AXIS_ROTATIONS, (1.0, 1.0, 1.0),
                 (0.0, 1.0), start, np.empty((columns, 4), np.int32),
             )  # fmt: skip
     with pytest.raises(TypeError):
-        quantising.nearest(ones.astype(np.float64), np.ones((2, 3)), np.empty(4))  # type: ignore[arg-type]
+        quantising.nearest(functions, ones.astype(np.float64), np.ones((2, 3)), np.empty(4))  # type: ignore[arg-type]
     order, factors, levels = np.arange(4), np.ones(4), np.empty((1, 3, 4), np.int16)
     for arguments in (
         (sh.astype(np.float64), False, order, factors, factors, 0, levels),
@@ -111,10 +111,10 @@ def test_what_does_not_fit_is_refused_before_c_sees_it():
         (sh, False, order, factors, factors, 0, levels.astype(np.int32)),
     ):
         with pytest.raises(TypeError):
-            quantising.colour_levels(*arguments)
+            quantising.colour_levels(functions, *arguments)
     for number in (-1, 4):
         with pytest.raises(TypeError, match="not there"):
-            quantising.canonical(
+            quantising.canonical(functions,
                 np.ones((4, 4), np.float32), ones, np.array([number]), np.ones((4, 24)), np.zeros((24, 3), np.uint8),
                 np.empty((1, 3)), np.empty((1, 3), np.float32),
             )  # fmt: skip

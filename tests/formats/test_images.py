@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import os
-import tracemalloc
 
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ from PIL import Image
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.images import image_size, parse_colour, read_ground_truth, to_8_bits, write_png
 from tests.cases.images import png_of
+from tests.cases.memory import takes_at_most
 from tests.cases.own_warnings import no_warnings
 
 
@@ -86,13 +86,10 @@ def test_webp_is_read(tmp_path):
 def test_too_many_pixels_are_refused_before_they_are_unpacked(tmp_path, width, height):
     path = tmp_path / "a.png"
     path.write_bytes(png_of(width, height))
-    tracemalloc.start()
-    with no_warnings():
+    with takes_at_most(4 << 20), no_warnings():
         for read in (image_size, read_ground_truth):
             with pytest.raises(DataError, match="pixels"):
                 read(path)
-    assert tracemalloc.get_traced_memory()[1] < 4 << 20
-    tracemalloc.stop()
 
 
 def test_large_photographs_give_no_warning(tmp_path):
@@ -138,15 +135,8 @@ def test_no_such_file(tmp_path):
 
 
 def test_8_bits_are_clamped_and_rounded():
-    assert to_8_bits(np.array([-1, 0, 0.4999 / 255, 0.5001 / 255, 254.6 / 255, 1, 9])).tolist() == [
-        0,
-        0,
-        0,
-        1,
-        255,
-        255,
-        255,
-    ]
+    values = np.array([-1, 0, 0.4999 / 255, 0.5001 / 255, 254.6 / 255, 1, 9])
+    assert to_8_bits(values).tolist() == [0, 0, 0, 1, 255, 255, 255]
 
 
 def test_png_keeps_pixels_and_text():
@@ -180,10 +170,7 @@ def test_no_colours(text):
 def test_rounding_to_8_bits_takes_little_memory() -> None:
     """One view of 16384 x 16384 pixels took three times its 3 GB."""
     image = np.random.default_rng(0).normal(0.5, 1, (2000, 900, 3)).astype(np.float32)
-    tracemalloc.start()
-    found = to_8_bits(image)
-    most = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert most < found.nbytes + (1 << 24)
+    with takes_at_most(image.size + (1 << 24)):
+        found = to_8_bits(image)
     assert np.array_equal(found, np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8))
     assert to_8_bits(image[:0]).shape == (0, 900, 3)

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from potr_cl import DataError, Scene, UsageError, cli, info
 from potr_cl.formats import cameras, load_cameras, load_scene, registry, save_scene, scene_writer, scenes
-from potr_cl.formats.declaration import SceneFormat
+from potr_cl.formats.declaration import CameraFormat, SceneFormat
 from potr_cl.formats.ladder import Ladder, Rung
 from potr_cl.formats.registry import CAMERA_FORMATS, SCENE_FORMATS, listed
 from potr_cl.formats.scenes import page
@@ -45,7 +45,10 @@ def test_every_declared_format_is_in_its_table(package: Any, table: tuple[Any, .
     modules = [
         importlib.import_module(f"{package.__name__}.{each.name}") for each in pkgutil.iter_modules(package.__path__)
     ]
-    declared = [module.FORMAT for module in modules if hasattr(module, "FORMAT")]
+    kinds = (SceneFormat, CameraFormat)
+    declared = {
+        id(each): each for module in modules for each in vars(module).values() if isinstance(each, kinds)
+    }.values()
     assert sorted(map(name, declared)) == sorted(map(name, table))
     assert all(entry in table for entry in declared)
 
@@ -98,7 +101,7 @@ def test_every_format_reads_what_it_writes(
     for suffix in entry.suffixes:
         path = tmp_path / f"scene{suffix}"
         save_scene(path, scene)
-        assert registry.reader_of(path) is entry.load
+        assert registry.format_of(path) is entry
         back = in_order_of(scene, load_scene(path))
         assert back.sh.shape == scene.sh.shape
         # The coarsest steps of all formats, and some; a format's own test knows its steps.
@@ -113,7 +116,7 @@ def test_every_format_reads_what_it_writes(
 @pytest.mark.parametrize("suffix", [suffix for entry in WRITTEN for suffix in entry.suffixes])
 def test_suffixes_in_capitals_and_after_points(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"v1.2{suffix.upper()}"
-    assert registry.writer_of(path) == next(entry.save for entry in WRITTEN if suffix in entry.suffixes)
+    assert registry.written_format(path) == next(entry for entry in WRITTEN if suffix in entry.suffixes)
 
 
 def test_content_decides_between_formats_of_one_extension(data: Path, tmp_path: Path) -> None:
@@ -122,10 +125,10 @@ def test_content_decides_between_formats_of_one_extension(data: Path, tmp_path: 
     )
     for name in ("a.ply", "a.compressed.ply"):
         shutil.copy(data / "plush_excerpt.ply", tmp_path / name)
-        assert registry.reader_of(tmp_path / name) is plain.load
+        assert registry.format_of(tmp_path / name) is plain
         shutil.copy(data / "foreign" / "degree_0.compressed.ply", tmp_path / name)
-        assert registry.reader_of(tmp_path / name) is compressed.load
-    assert registry.reader_of(tmp_path / "missing.compressed.ply") is plain.load
+        assert registry.format_of(tmp_path / name) is compressed
+    assert registry.format_of(tmp_path / "missing.compressed.ply") is plain
 
 
 def test_unknown_suffixes(tmp_path: Path) -> None:

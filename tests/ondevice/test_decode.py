@@ -23,9 +23,8 @@ from potr_cl.codec.native.values import BundleShare
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import DataError, DeviceError, DeviceMemoryError, UsageError
 from potr_cl.model.sightings import looked_at
-from potr_cl.ondevice import dequantiser
-from potr_cl.ondevice.decode import decode_to_device
-from potr_cl.ondevice.staged_bundles import StagedBundles
+from potr_cl.ondevice import decode
+from potr_cl.ondevice.decode import StagedBundles, decode_to_device
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers, uploaded
@@ -227,7 +226,7 @@ def test_memory_that_bundles_take_turns_in(beside, threads, pinned, device, monk
     """Less of it than there are bundles: those that come late wait until others are on the device."""
     monkeypatch.setattr(block_values, "_ROOMS_BESIDE", beside)
     if pinned:
-        monkeypatch.setattr(dequantiser, "_WORTH_PINNING", 1)
+        monkeypatch.setattr(decode, "_WORTH_PINNING", 1)
     for splats in (9 * 8192 + 77, 3 * 8192):
         file = open_file(of_bundles(splats, 2))
         with uploaded(device, file.scene()) as wanted, decode_to_device(file, device, threads=threads) as got:

@@ -29,10 +29,16 @@ def no_builds(monkeypatch) -> None:
     monkeypatch.setattr(cl, "Program", refused)
 
 
-def test_what_was_needed_once_is_there_the_next_time(monkeypatch):
-    first = Device()
-    first.prepare_for("a test").result()
-    first.program("raster/columns.cl")
+@pytest.fixture
+def needed() -> Device:
+    """A device that has needed a program; what it was is noted."""
+    device = Device()
+    device.prepare_for("a test").result()
+    device.program("raster/columns.cl")
+    return device
+
+
+def test_what_was_needed_once_is_there_the_next_time(needed, monkeypatch):
     second, other = Device(), Device()
     second.prepare_for("a test").result()
     other.prepare_for("another test").result()
@@ -42,43 +48,25 @@ def test_what_was_needed_once_is_there_the_next_time(monkeypatch):
         other.program("raster/columns.cl")
 
 
-def test_warnings_that_become_errors_while_programs_are_loaded_stop_nobody(monkeypatch):
-    """As where the main thread runs in a block of its own: filters are the whole process's."""
-    first = Device()
-    first.prepare_for("a test").result()
-    first.program("raster/columns.cl")
-    second = Device()
-    build, warned = cl.Program.build, []
+@pytest.mark.parametrize("always", [False, True])
+def test_warnings_that_become_errors_while_programs_are_loaded_stop_nobody(needed, monkeypatch, always):
+    """As where the main thread runs in a block of its own: filters are the whole process's. What is always interrupted
+    is loaded by who needs it: what is loaded ahead raises nothing."""
+    second, build, warned = Device(), cl.Program.build, []
 
     def chatting(program, *arguments, **choices):
-        if not warned:
+        if always or not warned:
             warned.append(1)
             warnings.simplefilter("error")
         warnings.warn("a compiler's words", cl.CompilerWarning, stacklevel=1)
         return build(program, *arguments, **choices)
 
-    monkeypatch.setattr(cl.Program, "build", chatting)
-    with warnings.catch_warnings():
-        second.prepare_for("a test").result()
-        assert warned
-        no_builds(monkeypatch)
-        assert second.kernel("raster/columns.cl", "columns").name == "columns"
-
-
-def test_a_device_that_is_always_interrupted_is_loaded_by_who_needs_it(monkeypatch):
-    """What is loaded ahead raises nothing."""
-    first = Device()
-    first.prepare_for("a test").result()
-    first.program("raster/columns.cl")
-    second = Device()
-
-    def chatting(program, *arguments, **choices):
-        warnings.simplefilter("error")
-        warnings.warn("a compiler's words", cl.CompilerWarning, stacklevel=1)
-
     with warnings.catch_warnings(), monkeypatch.context() as patch:
         patch.setattr(cl.Program, "build", chatting)
         second.prepare_for("a test").result()
+        assert warned
+    if not always:
+        no_builds(monkeypatch)
     assert second.kernel("raster/columns.cl", "columns").name == "columns"
 
 
@@ -89,10 +77,7 @@ def test_experiments_are_not_noted(cache):
     assert not list(cache.rglob("needed-*.json"))
 
 
-def test_what_cannot_be_built_any_more_stops_nobody(cache):
-    device = Device()
-    device.prepare_for("a test").result()
-    device.program("raster/columns.cl")
+def test_what_cannot_be_built_any_more_stops_nobody(needed, cache):
     (note,) = cache.rglob("needed-*.json")
     note.write_text(json.dumps([["raster/gone.cl", []], ["opencl/probe.cl", [["LANES", "no number"]]], *[PROGRAM]]))
     again = Device()

@@ -69,7 +69,7 @@ class Clock:
 
 def test_pieces_are_as_long_as_they_may_be(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock()
-    monkeypatch.setattr("potr_cl.opencl.pieces.time.perf_counter", lambda: clock.now)
+    monkeypatch.setattr("potr_cl.opencl.pieces.perf_counter", lambda: clock.now)
     pieces = Pieces(seconds=100, compute_units=1)
     pieces.launch(clock.enqueue, clock, ("raster/reached.cl", "mark_reached", ()), (300,), (1,))  # type: ignore[arg-type]
     assert clock.pieces == [2, 8, 32, *[40] * 6, 18]

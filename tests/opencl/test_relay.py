@@ -28,9 +28,10 @@ def between(request, devices):
 
 
 def test_all_arrives(between, monkeypatch):
+    """And a part of it."""
+    lender, borrower = between
+    monkeypatch.setattr(relay, "_SLICE", 4096)  # many slices, and a last one that is shorter
     for count in [1, 1000, 4096, 4097, 100_003]:
-        monkeypatch.setattr(relay, "_SLICE", 4096)  # many slices, and a last one that is shorter
-        lender, borrower = between
         values = np.random.default_rng(count).integers(0, 2**32, count, np.uint32)
         with Memory(lender) as there, Memory(borrower) as here, Relay(borrower) as relayed:
             lent = Lent(lender, there.upload(values, "a test"), values.nbytes)
@@ -40,19 +41,10 @@ def test_all_arrives(between, monkeypatch):
                 found = borrower.download(target, (count + 1,), np.uint32)
                 assert np.array_equal(found[:-1], values)
                 assert found[-1] == 0
-
-
-def test_a_part_of_it(between, monkeypatch):
-    monkeypatch.setattr(relay, "_SLICE", 4096)
-    lender, borrower = between
-    values = np.arange(10_000, dtype=np.uint32)
-    with Memory(lender) as there, Memory(borrower) as here, Relay(borrower) as relayed:
-        lent = Lent(lender, there.upload(values, "a test"), values.nbytes)
-        target = here.upload(np.zeros(10_000, np.uint32), "a test")
-        relayed.fetch(target, lent, 4 * 1000, 4 * 3000)
-        found = borrower.download(target, (10_000,), np.uint32)
-    assert np.array_equal(found[:3000], values[1000:4000])
-    assert not found[3000:].any()
+            if count > 10_000:
+                relayed.fetch(target, lent, 4 * 1000, 4 * 3000)
+                found = borrower.download(target, (count + 1,), np.uint32)
+                assert np.array_equal(found[:-1], np.concatenate([values[1000:4000], values[3000:]]))
 
 
 def test_it_is_lent_as_it_is_after_what_was_enqueued(between):

@@ -82,6 +82,26 @@ def test_how_a_trial_ends(child, source, decided, said):
     assert verdict.kept(info) == (decided, said)
 
 
+def test_what_a_trial_measures_is_told(child):
+    child.write_text('import sys; print(\'{"seconds": 2, "asked": "\' + sys.argv[2] + \'"}\')')
+    info = choose_device()
+    assert verdict.measured(info) == (None, {"seconds": 2, "asked": "--measure"})
+    child.write_text("import sys; sys.exit('atomics are wrong')")
+    assert verdict.measured(info) == ("atomics are wrong", {})
+    assert verdict.kept(info) == (True, "atomics are wrong")
+
+
+@pytest.mark.slow
+def test_kernels_are_timed_and_the_compiler_is_heard(monkeypatch):
+    monkeypatch.setattr(trial, "_MANY_SPLATS", 400)
+    monkeypatch.setattr(trial, "_LARGE_SIDE", 48)
+    found = trial.measured(choose_device())
+    assert found["times"].keys() >= {"removal", "refit_sweep", "derivatives", "compact"}
+    assert all(each["launches"] > 0 and each["seconds"] > 0 for each in found["times"].values())
+    assert found["seconds"] > 0
+    assert all("warning" in line.lower() or "error" in line.lower() for line in found["compiler"])
+
+
 @pytest.mark.slow
 def test_the_trial_builds_every_kernel_of_encodes_and_this_machines_device_passes(plush_excerpt, plush_excerpt_cameras):
     tried, used = Device(), Device()

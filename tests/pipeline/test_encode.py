@@ -14,8 +14,7 @@ from potr_cl.errors import UsageError
 from potr_cl.model.camera import train_views
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.pipeline.run import Run
-from potr_cl.pipeline.stopwatch import Stopwatch
+from potr_cl.pipeline.run import Run, Stopwatch
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.code import Code
 from potr_cl.stages.compact import Compact
@@ -50,7 +49,7 @@ def reduced(scene, cameras, options, device):
     """The scene after pruning and compaction, and what pruning did."""
     run = Run(options, Stopwatch(), device)
     state = run.stages(State.of(scene, train_views(cameras)), [Prune, Compact])
-    return state.scene, state.learnt.pruned
+    return state.scene, state.results.pruned
 
 
 def same(a, b):
@@ -171,7 +170,7 @@ def test_progress_of_the_refit_is_of_its_time(device, plush_excerpt, views):
 def test_a_stage_within_another_counts_for_itself(monkeypatch):
     now = iter([0.0, 1.0, 2.0, 5.0, 9.0, 10.0, 20.0, 21.0])
     # Not the clock of the whole process: other threads look at that.
-    monkeypatch.setattr("potr_cl.pipeline.stopwatch.time", SimpleNamespace(perf_counter=lambda: next(now)))
+    monkeypatch.setattr("potr_cl.pipeline.run.time", SimpleNamespace(perf_counter=lambda: next(now)))
     watch = Stopwatch()
     for stage, done in (("a", 0.0), ("a", 0.5), ("b", 0.0), ("b", 1.0), ("a", 0.7), ("a", 1.0), ("c", 1.0)):
         watch(stage, done)

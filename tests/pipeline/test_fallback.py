@@ -12,7 +12,7 @@ import pytest
 from potr_cl.errors import DeviceError, DeviceMemoryError
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
-from potr_cl.pipeline.fallback import on_device
+from potr_cl.pipeline.fallback import with_fallback
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.views.budget import default_memory
 from tests.devices import skip_without_cpu
@@ -108,7 +108,7 @@ def test_other_failures_are_not_tried_again():
         raise DeviceError("vanished")
 
     with pytest.raises(DeviceError, match="vanished"):
-        on_device(Device(), None, work)
+        with_fallback(Device(), None, work)
     assert len(calls) == 1
 
 
@@ -134,5 +134,5 @@ def test_memory_errors_of_the_driver_count_too(caplog, error):
 
     device = Device()
     with caplog.at_level(logging.WARNING, "potr_cl"):
-        assert on_device(device, None, work) == (np.pi, device)
+        assert with_fallback(device, None, work) == (np.pi, device)
     assert budgets == [None, default_memory(device) // 8, 0]

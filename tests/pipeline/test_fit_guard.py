@@ -11,11 +11,11 @@ from potr_cl.errors import DeviceMemoryError
 from potr_cl.model.camera import test_views as views_to_judge
 from potr_cl.model.camera import train_views
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline import fit_trial
+from potr_cl.pipeline import run
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
-from potr_cl.stages.fit import LeftOut
+from potr_cl.stages.fitting.fitted import LeftOut
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,7 @@ def test_without_room_to_compare_files_the_fit_judges_itself(judged, plush_excer
     def no_room(*anything):
         raise DeviceMemoryError("two scenes at a time do not fit")
 
-    monkeypatch.setattr(fit_trial, "held_out_error", no_room)
+    monkeypatch.setattr(run, "held_out_error", no_room)
     options = EncodeOptions(q=0.5).changed(prune={"delta_mse_max": 1e-8}, fit={"steps": "auto"})
     made, _ = judged(train_views(plush_excerpt_cameras), options)
     assert not isinstance(made.fitted, LeftOut)

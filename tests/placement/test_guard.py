@@ -13,13 +13,12 @@ from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.pipeline.run import Run
-from potr_cl.pipeline.stopwatch import Stopwatch
-from potr_cl.placement.guard import unresolved
+from potr_cl.pipeline.run import Run, Stopwatch
+from potr_cl.placement.rays import unresolved
 from potr_cl.placement.virtual import place_cameras
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.code import Code
-from potr_cl.stages.pruning.on_device import prune_scene
+from potr_cl.stages.pruning.controller import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions
 from potr_cl.stages.stage import State
@@ -94,7 +93,7 @@ def test_no_stage_touches_what_no_view_resolved(device, preset):
     for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
         assert np.array_equal(getattr(state.scene, name)[rows], getattr(scene, name)[found]), name
     assert len(state.survivors) < len(scene), "others go"
-    assert state.learnt.unresolved.splats == state.learnt.unseen.splats == np.count_nonzero(found)
+    assert state.results.unresolved.splats == state.results.unseen.splats == np.count_nonzero(found)
 
 
 @pytest.mark.slow
@@ -102,7 +101,7 @@ def test_without_the_guard_they_are_lost(device):
     dropped = kept(device, "drop")
     assert np.count_nonzero(dropped.survivors >= _EACH) < 50
     plain = kept(device, "keep")
-    assert plain.learnt.unresolved is None, "given cameras say where people look"
+    assert plain.results.unresolved is None, "given cameras say where people look"
     assert np.count_nonzero(plain.survivors >= _EACH) < _EACH / 2
 
 

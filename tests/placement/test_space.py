@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.spherical_harmonics import energy, unit_coefficients
-from potr_cl.placement.memory import Memory
+from potr_cl.placement.candidates import Memory
 from potr_cl.placement.rays import resolved_by, shown_from
 from potr_cl.placement.space import Space, _distances
 from tests.cases.surfaces import box, flat_splats, sphere

@@ -129,12 +129,12 @@ def test_lpips_orders_pictures():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["lego", "plush"])
 def test_recorded_figures_of_another_renderer_and_other_metrics(name, request):
-    """Every test view against its photograph: the scene's makers measured with gsplat and PyTorch."""
+    """Test views against their photographs: the scene's makers measured with gsplat and PyTorch."""
     folder = request.getfixturevalue(name)
     recorded = json.loads((folder / "reference" / "metrics.json").read_text())["per_view"]
     cameras = {camera.name: camera for camera in load_cameras(folder / "cameras.json")}
     rasterizer = Rasterizer(Device(), load_scene(folder / "point_cloud.ply"), GSPLAT)
-    for view in recorded:
+    for view in recorded[:: max(len(recorded) // 12, 1)]:
         camera = cameras[view["img_name"]]
         image, _ = rasterizer.render(camera)
         photograph = read_ground_truth(camera.image_path)

@@ -89,8 +89,8 @@ def test_lists_are_made_of_what_is_left_of_an_opacity(device: Device) -> None:
     scene, view = antialiased(random_splats(400, 0, seed=3), smaller=2), tilted_camera(3, 83, 61)
     counts = []
     for each in (scene, scene.rendered(False)):
-        with Rasterizer(device, each, GSPLAT) as rasterizer, rasterizer.prepare(view) as prepared:
-            counts.append(prepared.intersection_count)
+        with Rasterizer(device, each, GSPLAT) as rasterizer, rasterizer.prepare_set([view]) as prepared:
+            counts.append(prepared.capacity)
     assert counts[0] < 0.9 * counts[1]
 
 

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from potr_cl.raster import launch_gpu, long_lists
+from potr_cl.raster import launcher, preparing_memory
 from potr_cl.raster.rasterizer import Rasterizer
 from tests.devices import KERNELS, open_device
 from tests.reference.scenes import ring_of_cameras, visible_scene
@@ -36,18 +36,18 @@ def test_the_same_order(device, monkeypatch, count, longest):
     assert lengths.max() > longest
     sorted_apart = []
 
-    class Noting(long_lists.LongLists):
+    class Noting(preparing_memory.LongLists):
         def enqueue(self, *args: object) -> None:
             sorted_apart.append(self)
             super().enqueue(*args)  # type: ignore[arg-type]
 
     monkeypatch.setattr("potr_cl.raster.preparing_memory.LongLists", Noting)
-    monkeypatch.setattr(long_lists, "LONGEST", longest)
-    monkeypatch.setattr(launch_gpu, "LONGEST", longest)
+    monkeypatch.setattr(preparing_memory, "LONGEST", longest)
+    monkeypatch.setattr(launcher, "LONGEST", longest)
     got, _ = lists_of(device, scene, cameras)
     assert sorted_apart
     assert np.array_equal(got, wanted)
-    monkeypatch.setattr(long_lists, "PIECE", 64)
+    monkeypatch.setattr(preparing_memory, "PIECE", 64)
     got, _ = lists_of(device, scene, cameras)
     assert np.array_equal(got, wanted)
 
@@ -57,7 +57,7 @@ def test_without_room_the_same_order(device, monkeypatch):
     scene, cameras = visible_scene(2500, 0), ring_of_cameras(3, size=40)
     wanted, _ = lists_of(device, scene, cameras)
 
-    class WithoutRoom(long_lists.LongLists):
+    class WithoutRoom(preparing_memory.LongLists):
         def find(self, views: object) -> bool:
             with monkeypatch.context() as full:
                 full.setattr(device, "info", dataclasses.replace(device.info, memory=device.allocated))
@@ -67,8 +67,8 @@ def test_without_room_the_same_order(device, monkeypatch):
 
     asked: list[bool] = []
     monkeypatch.setattr("potr_cl.raster.preparing_memory.LongLists", WithoutRoom)
-    monkeypatch.setattr(long_lists, "LONGEST", 16)
-    monkeypatch.setattr(launch_gpu, "LONGEST", 16)
+    monkeypatch.setattr(preparing_memory, "LONGEST", 16)
+    monkeypatch.setattr(launcher, "LONGEST", 16)
     got, _ = lists_of(device, scene, cameras)
     assert asked == [False]
     assert np.array_equal(got, wanted)
@@ -76,5 +76,5 @@ def test_without_room_the_same_order(device, monkeypatch):
 
 def test_lists_as_others(device, monkeypatch):
     """None is long: nothing is sorted apart."""
-    monkeypatch.setattr(long_lists.LongLists, "enqueue", lambda *args: pytest.fail("there is no long list"))
+    monkeypatch.setattr(preparing_memory.LongLists, "enqueue", lambda *args: pytest.fail("there is no long list"))
     lists_of(device, visible_scene(500, 0), ring_of_cameras(2, size=40))

@@ -25,14 +25,14 @@ def test_prepared_views_composite_as_rendered(device: Device) -> None:
     scene = random_splats(2000, 2, seed=4)
     rasterizer = Rasterizer(device, scene)
     cameras = [tilted_camera(1, 64, 64), tilted_camera(2, 120, 33), tilted_camera(3, 17, 15)]
-    views = [rasterizer.prepare(c) for c in cameras]
+    views = [rasterizer.prepare_set([c]) for c in cameras]
     for view in views * 2:
         image, transmittance = rasterizer.composite(view)
-        rendered = rasterizer.render(view.camera)
+        rendered = rasterizer.render(view.views[0].camera)
         assert image.tobytes() == rendered[0].tobytes()
         assert transmittance.tobytes() == rendered[1].tobytes()
     for view in views:
-        assert view.capacity == view.intersection_count > 0
+        assert view.capacity == view.views[0].intersection_count > 0
         view.close()
     rasterizer.close()
 
@@ -44,13 +44,13 @@ def test_a_prepared_view_takes_another_camera_in_its_memory(device: Device) -> N
     with Rasterizer(device, scene) as rasterizer, rasterizer.prepare_set([cameras[2]]) as views:
         for camera in [cameras[0], cameras[1], cameras[2], cameras[0]]:
             assert rasterizer.prepare_again(views, [camera])
-            image, transmittance = rasterizer.composite(views.views[0])
+            image, transmittance = rasterizer.composite(views)
             rendered = rasterizer.render(camera)
             assert image.tobytes() == rendered[0].tobytes()
             assert transmittance.tobytes() == rendered[1].tobytes()
-        before = rasterizer.composite(views.views[0])[0]
+        before = rasterizer.composite(views)[0]
         assert not rasterizer.prepare_again(views, [tilted_camera(1, 64, 65)])
-        assert np.array_equal(rasterizer.composite(views.views[0])[0], before)
+        assert np.array_equal(rasterizer.composite(views)[0], before)
 
 
 def test_a_set_takes_other_cameras_in_its_memory(device: Device) -> None:
@@ -66,7 +66,7 @@ def test_a_set_takes_other_cameras_in_its_memory(device: Device) -> None:
             for view, offsets, start, camera in zip(
                 views.views, views.read_offsets(), views.intersection_starts, cameras, strict=False
             ):
-                with rasterizer.prepare(camera) as alone:
+                with rasterizer.prepare_set([camera]) as alone:
                     own_offsets, own_intersections = read_lists(device, alone)
                 assert np.array_equal(offsets, own_offsets)
                 assert np.array_equal(intersections[start : start + view.intersection_count], own_intersections)
@@ -84,15 +84,15 @@ def test_views_of_a_set_are_those_prepared_alone(device: Device) -> None:
     intersections = device.download(views.intersections, (views.capacity,), np.uint32)
     subtiles = device.download(views.subtiles, (views.capacity,), np.uint16)
     for i, view in enumerate(cameras):
-        alone = rasterizer.prepare(view)
+        alone = rasterizer.prepare_set([view])
         part = slice(views.intersection_starts[i], views.intersection_starts[i + 1])
         own_offsets, own_intersections = read_lists(device, alone)
         assert np.array_equal(offsets[i], own_offsets)
         assert np.array_equal(intersections[part], own_intersections)
-        own_subtiles = device.download(alone.owner.subtiles, (alone.intersection_count,), np.uint16)
+        own_subtiles = device.download(alone.subtiles, (alone.capacity,), np.uint16)
         assert np.array_equal(subtiles[part], own_subtiles)
-        assert views.views[i].intersection_count == alone.intersection_count
-        assert (alone.intersection_count == 0) == (i == 1)
+        assert views.views[i].intersection_count == alone.capacity
+        assert (alone.capacity == 0) == (i == 1)
         alone.close()
     views.close()
     rasterizer.close()
@@ -148,8 +148,8 @@ def test_lists_that_do_not_fit_are_made_again(device: Device) -> None:
     rng = np.random.default_rng(6)
     depths = np.stack([0 * rng.random(300), 0 * rng.random(300), rng.uniform(1, 5, 300)], axis=1)
     scene, view = splats(depths, sigma=5, logit=-4, colour=rng.uniform(0, 1, (300, 3))), camera(256, 256)
-    with Rasterizer(device, scene) as rasterizer, rasterizer.prepare(view) as prepared:
-        assert prepared.intersection_count > 1 << 16
+    with Rasterizer(device, scene) as rasterizer, rasterizer.prepare_set([view]) as prepared:
+        assert prepared.capacity > 1 << 16
         expected = rasterizer.composite(prepared)
         for _ in range(2):  # the second frame has room
             image, transmittance = rasterizer.render(view)

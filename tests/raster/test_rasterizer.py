@@ -15,7 +15,7 @@ from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer, render
 from potr_cl.raster.rules import GSPLAT, INRIA, RasterRules
-from potr_cl.raster.view_set import TILE, View
+from potr_cl.raster.view_set import TILE, ViewSet
 from tests.reference import raster as reference
 from tests.reference.scenes import plain_splats as splats
 from tests.reference.scenes import random_splats, tilted_camera
@@ -45,9 +45,9 @@ def check(
     return wanted
 
 
-def read_lists(device: Device, view: View) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
+def read_lists(device: Device, view: ViewSet) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
     offsets = device.download(view.offsets, (view.tiles + 1,), np.uint32)
-    return offsets, device.download(view.intersections, (view.intersection_count,), np.uint32)
+    return offsets, device.download(view.intersections, (view.capacity,), np.uint32)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -124,7 +124,7 @@ def test_tile_lists_are_tight_and_sorted(device: Device, rules: RasterRules) -> 
     """Every splat that reaches alpha 1/255 in a tile's pixel is in its list, few others are, nearest first."""
     scene, view = random_splats(300, 0, seed=8), tilted_camera(8, 91, 77)
     rasterizer = Rasterizer(device, scene, rules)
-    prepared = rasterizer.prepare(view)
+    prepared = rasterizer.prepare_set([view])
     offsets, intersections = read_lists(device, prepared)
     prepared.close()
     rasterizer.close()
@@ -142,7 +142,7 @@ def test_tile_lists_are_tight_and_sorted(device: Device, rules: RasterRules) -> 
         log_alpha = np.where(inside, np.log(projected.opacity[k]) - q / 2, -np.inf)
         for found, threshold in ((touched, 1e-5), (nearly, -0.1)):
             rows, columns = np.nonzero(log_alpha >= np.log(1 / 255) + threshold)
-            found |= {(tile, int(splat)) for tile in set(rows // TILE * prepared.columns + columns // TILE)}
+            found |= {(tile, int(splat)) for tile in set(rows // TILE * prepared.views[0].columns + columns // TILE)}
     listed = set()
     for tile in range(prepared.tiles):
         run = intersections[offsets[tile] : offsets[tile + 1]]
@@ -152,7 +152,7 @@ def test_tile_lists_are_tight_and_sorted(device: Device, rules: RasterRules) -> 
     # The ellipse is tested, not the pixels in it: where it touches a tile between pixel centres it is listed too.
     assert len(listed - nearly) <= 0.02 * len(listed)
     assert offsets[0] == 0
-    assert offsets[-1] == len(intersections) == prepared.intersection_count
+    assert offsets[-1] == len(intersections) == prepared.capacity
 
 
 def test_one_tile_of_any_length_is_sorted(device: Device) -> None:
@@ -161,7 +161,7 @@ def test_one_tile_of_any_length_is_sorted(device: Device) -> None:
         depth = rng.integers(1, max(n // 3, 2), size=n) / 8 + 1  # many ties
         scene = splats(np.stack([0 * depth, 0 * depth, depth], axis=1), sigma=1e-4, logit=0)
         rasterizer = Rasterizer(device, scene)
-        prepared = rasterizer.prepare(camera(16, 16))
+        prepared = rasterizer.prepare_set([camera(16, 16)])
         offsets, intersections = read_lists(device, prepared)
         prepared.close()
         rasterizer.close()
@@ -245,7 +245,7 @@ def test_a_tile_with_a_hundred_thousand_intersections(device: Device) -> None:
     means = np.concatenate([rng.uniform(-0.05, 0.05, (n, 2)), rng.uniform(1, 2, (n, 1))], axis=1)
     scene = splats(means, sigma=1e-3, logit=-2, colour=rng.uniform(0, 1, (n, 3)))
     rasterizer = Rasterizer(device, scene)
-    view = rasterizer.prepare(camera(16, 16))
+    view = rasterizer.prepare_set([camera(16, 16)])
     _, intersections = read_lists(device, view)
     image, _ = rasterizer.composite(view)
     view.close()
@@ -332,7 +332,7 @@ def test_lists_larger_than_the_device_give_an_error(device: Device) -> None:
 def make_and_prepare(device: Device, scene: Scene, view: Camera) -> None:
     rasterizer = Rasterizer(device, scene)
     try:
-        rasterizer.prepare(view)
+        rasterizer.prepare_set([view])
     finally:
         rasterizer.close()
 
@@ -344,7 +344,7 @@ def test_what_does_not_fit_leaves_nothing_behind(device: Device) -> None:
     before = device.allocated
     rasterizer = Rasterizer(device, scene)
     with_scene = device.allocated
-    rasterizer.prepare(view).close()
+    rasterizer.prepare_set([view]).close()
     most = device.allocated
     rasterizer.close()
     assert device.allocated == before

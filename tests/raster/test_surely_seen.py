@@ -9,9 +9,9 @@ import pytest
 
 from potr_cl.model.splat_groups import unseen_splats
 from potr_cl.raster.scene_buffers import uploaded
-from potr_cl.raster.surely_seen import Seen, surely_seen
-from potr_cl.stages.pruning.unseen import find_unseen
 from potr_cl.stages.stage import State
+from potr_cl.stages.unseen import find_unseen
+from potr_cl.views.reached import Seen, surely_seen
 from tests.reference.scenes import random_scene
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from potr_cl.errors import DeviceMemoryError
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.view_cache import ViewCache
+from potr_cl.views.budget import ViewCache
 from tests.devices import FAMILIES, open_device
 
 

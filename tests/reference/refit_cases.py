@@ -16,9 +16,9 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.coefficients import Coefficients, Vector
 from potr_cl.stages.refitting.colour_refit import ColourRefit
-from potr_cl.stages.refitting.layout import Ridge
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
+from potr_cl.stages.refitting.sliced_arrays import Ridge
 from potr_cl.views.targets import RenderedTargets, Targets
 from tests.reference.refit import Array, Reference
 

@@ -7,8 +7,8 @@ import pytest
 
 from potr_cl.opencl.memory import Memory
 from potr_cl.opencl.relay import Relay
-from potr_cl.stages.pruning.survivors import SplatState
-from potr_cl.stages.pruning.travelling_totals import AlivePacking
+from potr_cl.stages.pruning.buffers import SplatState
+from potr_cl.stages.pruning.exchange import AlivePacking
 from tests.devices import KERNELS, open_device
 
 

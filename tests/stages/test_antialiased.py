@@ -14,7 +14,7 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS, ViewWeights
 from potr_cl.stages.pruning.removal import RemovalSweep
-from potr_cl.stages.pruning.staleness import SweepOptions
+from potr_cl.stages.pruning.sweep import SweepOptions
 from tests.cases.scenes import antialiased
 from tests.devices import KERNELS, open_device
 from tests.reference import raster as reference

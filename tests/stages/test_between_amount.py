@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from potr_cl.stages.between.amount import most_needed, needed, views_where_few
+from potr_cl.stages.views_between import most_needed, needed, views_where_few
 
 
 @pytest.mark.parametrize("slow", [False, True])

@@ -9,11 +9,11 @@ from potr_cl.codec.quantize import HyperParameters
 from potr_cl.model import splat_groups
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
-from potr_cl.raster.kept_scene import KeptScene
-from potr_cl.stages.between.room import room_for
+from potr_cl.raster.resident import ResidentScene
 from potr_cl.stages.pruning.removal import planned_sweep
-from potr_cl.stages.pruning.staleness import SweepOptions
+from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.stages.stage import State, Workbench
+from potr_cl.stages.views_between import room_for
 from potr_cl.views import visibility
 from potr_cl.views.visibility import Visibility
 from tests.cases.streets import street
@@ -41,7 +41,7 @@ def rooms(device, memories, kept: bool = False) -> list[int]:
     state = State.of(scene, own)
     found = []
     for memory in memories:
-        with KeptScene(device, scene) as on_device:
+        with ResidentScene(device, scene) as on_device:
             bench = Workbench(
                 HyperParameters.from_quality(0.5), device=device, memory=memory, kept=on_device if kept else None
             )

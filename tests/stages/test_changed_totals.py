@@ -10,8 +10,8 @@ import pytest
 
 from potr_cl.errors import DeviceMemoryError
 from potr_cl.opencl.memory import Memory
-from potr_cl.stages.pruning.survivors import SplatState
-from potr_cl.stages.pruning.travelling_totals import AddedChanges, ChangedTotals
+from potr_cl.stages.pruning.buffers import SplatState
+from potr_cl.stages.pruning.exchange import AddedChanges, ChangedTotals
 from tests.devices import KERNELS, open_device
 
 

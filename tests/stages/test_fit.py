@@ -12,12 +12,12 @@ from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import resized
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.fit import Fit, LeftOut
-from potr_cl.stages.fitting.fit import FitOptions, Fitted, fit_scene, held_out_error
-from potr_cl.stages.fitting.views import batches, share_out
-from potr_cl.stages.learnt import Learnt
+from potr_cl.stages.fit import Fit
+from potr_cl.stages.fitting.fit import FitOptions, batches, fit_scene, held_out_error
+from potr_cl.stages.fitting.fitted import Fitted, LeftOut
+from potr_cl.stages.held_out import share_out
 from potr_cl.stages.prune import Prune
-from potr_cl.stages.stage import State, Workbench
+from potr_cl.stages.stage import Results, State, Workbench
 from potr_cl.views.targets import RenderedTargets
 from tests.devices import FAMILIES, KERNELS, open_device
 from tests.reference.refit_cases import Pictures
@@ -133,7 +133,7 @@ def test_the_same_bits_every_time_and_others_from_another_seed(family_device):
     source = visible_scene(60, 1, seed=3)
     cameras = ring_of_cameras(8, size=40)
     results = [
-        fitted_to(family_device, source, shaken(source), cameras, dataclasses.replace(STEPS, steps=100, seed=seed))
+        fitted_to(family_device, source, shaken(source), cameras, dataclasses.replace(STEPS, steps=40, seed=seed))
         for seed in (0, 0, 1)
     ]
     for name in PARAMETERS:
@@ -142,6 +142,7 @@ def test_the_same_bits_every_time_and_others_from_another_seed(family_device):
         assert not np.array_equal(first, third)
 
 
+@pytest.mark.one_family
 def test_what_does_not_help_is_not_kept(family_device):
     """A scene that is perfect in the views held out, and targets elsewhere that lead away from it."""
     source = visible_scene(60, 1, seed=3)
@@ -254,7 +255,7 @@ def test_the_stage_mends_what_pruning_has_left(family_device):
     after = Fit(steps=200, choosing=0, rounding=0).run(before, bench_of(family_device))
     assert np.array_equal(after.survivors, left)
     assert after.geometry is None
-    assert isinstance(after.learnt.fitted, Fitted)
+    assert isinstance(after.results.fitted, Fitted)
     errors = [mean_error(family_device, source, state.scene, cameras) for state in (before, after)]
     assert errors[1] < 0.6 * errors[0]
 
@@ -264,18 +265,19 @@ def test_one_view_cannot_be_held_out(family_device):
     before = State.of(source, ring_of_cameras(1))
     after = Fit(steps=10).run(before, bench_of(family_device))
     assert after.scene is before.scene
-    assert isinstance(after.learnt.fitted, LeftOut)
-    assert "two training views" in str(after.learnt.fitted)
+    assert isinstance(after.results.fitted, LeftOut)
+    assert "two training views" in str(after.results.fitted)
     with pytest.raises(UsageError, match="two training views"):
         fitted_to(family_device, source, source, ring_of_cameras(1))
 
 
+@pytest.mark.one_family
 def test_sparse_colours_stay_sparse(family_device):
     source = visible_scene(60, 2, seed=3)
     start = shaken(source)
     start.sh[:, 4:] = 0
     before = dataclasses.replace(
-        State.of(source, ring_of_cameras(8, size=40)), scene=start, learnt=Learnt(compacted=True)
+        State.of(source, ring_of_cameras(8, size=40)), scene=start, results=Results(compacted=True)
     )
     after = Fit(steps=30).run(before, bench_of(family_device)).scene
     assert np.array_equal(after.sh[:, 1:], start.sh[:, 1:])
@@ -292,7 +294,7 @@ def test_it_is_off_unless_asked_for():
 
 def priced(source, cameras, price):
     """As pruning has left it that removed nothing."""
-    return State.of(source, cameras).having_learnt(price=price)
+    return State.of(source, cameras).with_results(price=price)
 
 
 def cost(device, source, scene, cameras, price):
@@ -313,7 +315,7 @@ def small_views(plush_excerpt_cameras):
 def test_splats_are_removed_for_the_fit_to_make_up_for(family_device, plush_excerpt, small_views):
     before = priced(plush_excerpt, small_views, PRICE)
     after = priced_fit(2).run(before, bench_of(family_device))
-    told = after.learnt.fitted
+    told = after.results.fitted
     assert isinstance(told, Fitted)
     assert told.spared == len(before.scene) - len(after.scene) > 300
     assert len(after.survivors) == len(after.scene)
@@ -322,7 +324,7 @@ def test_splats_are_removed_for_the_fit_to_make_up_for(family_device, plush_exce
     assert told.without + 1.25 * PRICE * len(before.scene) == pytest.approx(costs[0], rel=1e-3)
     assert told.error + 1.25 * PRICE * len(after.scene) == pytest.approx(costs[1], rel=1e-3)
     assert f"{told.spared:,} splats more" in str(told)
-    assert after.learnt.price == PRICE
+    assert after.results.price == PRICE
 
 
 def priced_fit(further, **options):
@@ -338,9 +340,10 @@ def test_of_a_given_number_of_splats_none_are_removed(family_device, plush_excer
     before = dataclasses.replace(State.of(plush_excerpt, small_views), scene=shaken(plush_excerpt, only=("sh",)))
     after = Fit(steps=30).run(before, bench_of(family_device))
     assert len(after.scene) == len(plush_excerpt)
-    assert after.learnt.fitted.spared == 0
+    assert after.results.fitted.spared == 0
 
 
+@pytest.mark.one_family
 def test_little_is_left_to_the_refit(family_device, plush_excerpt, small_views):
     """Splats that moved have fewer coefficients that are 0: a fit that gains little makes a larger file."""
     start = shaken(plush_excerpt, only=("sh",))
@@ -351,8 +354,8 @@ def test_little_is_left_to_the_refit(family_device, plush_excerpt, small_views):
             family_device, start, small_views, RenderedTargets(rasterizer, small_views), FitOptions(steps=2)
         )
     assert 0.7 * alone.errors[0] < alone.error < alone.errors[0], "the fit gains, but little"
-    assert isinstance(after.learnt.fitted, LeftOut)
-    assert "gained little" in str(after.learnt.fitted)
+    assert isinstance(after.results.fitted, LeftOut)
+    assert "gained little" in str(after.results.fitted)
     assert after.scene is before.scene
 
 
@@ -387,13 +390,14 @@ def test_views_between_are_its_own(family_device, plush_excerpt, small_views):
     assert not np.array_equal(states[0].scene.means, states[1].scene.means)
 
 
+@pytest.mark.one_family
 @pytest.mark.parametrize(("steps", "further", "price"), [(2, 1e6, 1e-9), (2, 1e4, 1e-7)])
 def test_what_does_not_pay_is_left_out(family_device, steps, further, price):
     source, cameras = visible_scene(60, 1, seed=3), ring_of_cameras(8, size=40)
     before = priced(source, cameras, price)
     after = Fit(steps=steps, further=further).run(before, bench_of(family_device))
-    assert isinstance(after.learnt.fitted, LeftOut)
-    assert "did not make up" in str(after.learnt.fitted)
+    assert isinstance(after.results.fitted, LeftOut)
+    assert "did not make up" in str(after.results.fitted)
     assert after.scene is before.scene
     assert after.survivors is before.survivors
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from potr_cl.stages.fitting.files import File, TwoFiles
+from potr_cl.stages.fitting.fitted import File, TwoFiles
 
 
 def two(nbytes: float, decibels: float) -> TwoFiles:

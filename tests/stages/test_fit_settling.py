@@ -13,10 +13,10 @@ from potr_cl.model.camera import resized, train_views
 from potr_cl.outputs.ply import Ply
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fit import Fit
+from potr_cl.stages.fitting.adam import Factors, in_form_of_files
 from potr_cl.stages.fitting.fit import FitOptions, fit_scene
-from potr_cl.stages.fitting.parameters import Factors, in_form_of_files
 from potr_cl.stages.fitting.settling import Looking, Settling, settle
-from potr_cl.stages.fitting.views import share_out
+from potr_cl.stages.held_out import share_out
 from potr_cl.stages.refit import Refit
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.views.targets import RenderedTargets
@@ -92,6 +92,7 @@ def test_a_fit_can_look_at_what_a_file_will_hold(device, plush_excerpt, views):
 
 
 @pytest.mark.slow
+@pytest.mark.one_family
 def test_coefficients_are_chosen_and_the_rest_moves(device, plush_excerpt, views):
     _, then, errors, _ = settled(device, plush_excerpt, views, Settling(0.5, 0, 0.1))
     assert then.geometry is None
@@ -132,12 +133,12 @@ def test_other_kinds_of_files_round_at_once(device, plush_excerpt, views):
 @pytest.mark.one_family
 def test_the_stage_hands_its_geometry_on(device, plush_excerpt, views):
     bench = Workbench(HyperParameters.from_quality(0.5, "best"), device=device)
-    start = State.of(plush_excerpt, views).having_learnt(price=3e-8)  # about half of the splats are worth it
+    start = State.of(plush_excerpt, views).with_results(price=3e-8)  # about half of the splats are worth it
     usual = Fit(steps=50, further=0.26, choosing=0, between=0)
     with_it, without = (dataclasses.replace(usual, rounding=part).run(start, bench) for part in (0.3, 0))
     assert isinstance(with_it.geometry, Geometry)
     assert without.geometry is None
-    told = with_it.learnt.fitted
+    told = with_it.results.fitted
     assert told.spared > 100
     assert len(told.settled) == 2
     assert told.facts["settled"] == list(told.settled)
@@ -150,6 +151,6 @@ def test_where_no_splats_were_spared_nothing_is_rounded_yet(device, plush_excerp
     smaller = plush_excerpt.subset(np.arange(0, len(plush_excerpt), 2))
     start = dataclasses.replace(State.of(plush_excerpt, views), scene=smaller, survivors=np.arange(0, 1500, 2))
     after = Fit(steps=60, between=0).run(start, Workbench(PARAMETERS, device=device))
-    assert after.learnt.fitted.spared == 0
-    assert after.learnt.fitted.settled == ()
+    assert after.results.fitted.spared == 0
+    assert after.results.fitted.settled == ()
     assert after.geometry is None

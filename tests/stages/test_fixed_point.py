@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from potr_cl.model.camera import Camera
 from potr_cl.raster.view_set import TILE
-from potr_cl.stages.pruning.fixed_point import FixedPoint
+from potr_cl.stages.pruning.sweep import FixedPoint
 
 EYE = Camera("view", 16, 16, 10.0, 10.0, 8.0, 8.0, np.eye(3), np.zeros(3))
 

@@ -52,4 +52,4 @@ def test_the_compaction_keeps_what_a_stage_before_has_done_to_the_colours(state)
     assert compacted.scene.sh_degree == 1
     dc = compacted.scene.sh[:, 0]
     assert np.allclose(dc, dc[:, :1], atol=1e-4)  # still grey
-    assert compacted.learnt.compacted
+    assert compacted.results.compacted

@@ -16,16 +16,16 @@ from potr_cl.codec.quantize import HyperParameters
 from potr_cl.model import splat_groups
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.raster import kept_scene
+from potr_cl.raster import resident
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers, gathered, uploaded
 from potr_cl.stages import prune
 from potr_cl.stages.pruning import removal
-from potr_cl.stages.pruning.measured import measurement
-from potr_cl.stages.pruning.on_device import prune_scene
+from potr_cl.stages.pruning.controller import prune_scene
+from potr_cl.stages.pruning.helpers import measurement
 from potr_cl.stages.pruning.removal import RemovalSweep, planned_sweep
 from potr_cl.stages.pruning.schedule import PruningOptions
-from potr_cl.stages.pruning.staleness import SweepOptions
+from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.views import budget, visibility
 from potr_cl.views.shares import ViewShares
@@ -62,20 +62,20 @@ def skip_unless(grouping, kernels):
 @contextmanager
 def sweep(devices, grouping, options, scene, cameras, elsewhere=False, spared=None):
     """A measurement of the street as a plan says, and that it gave all memory back."""
-    sights = None if grouping == "whole" else Visibility.of(scene, cameras)
+    visibility = None if grouping == "whole" else Visibility.of(scene, cameras)
     with ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
         if grouping == "by view":  # as a GPU with memory of its own does
-            patch.setattr(kept_scene, "fits_whole", lambda device, scene: True)
+            patch.setattr(resident, "fits_whole", lambda device, scene: True)
         pool = None
         if len(devices) > 1:
             pool = stack.enter_context((ElsewherePool if elsewhere else HostPool)(devices))
         dealt = None
-        if elsewhere and sights is not None:
+        if elsewhere and visibility is not None:
             names = [worker.name for worker in pool.workers()]
-            dealt = ViewShares.of(cameras, sights, [1.0] * len(names), scene, np.arange(len(scene)), names)
+            dealt = ViewShares.of(cameras, visibility, [1.0] * len(names), scene, np.arange(len(scene)), names)
         bench = Workbench(HyperParameters.from_quality(0.5), device=devices[0], memory=options.memory, pool=pool)
         state = State.of(scene, cameras)
-        yield stack.enter_context(measurement(state, bench, options, sights, spared, dealt))
+        yield stack.enter_context(measurement(state, bench, options, visibility, spared, dealt))
     assert [device.allocated for device in devices] == [0] * len(devices), "not all memory was given back"
 
 
@@ -236,9 +236,9 @@ def test_from_a_scene_on_the_device(kernels):
     """Copies are gathered there."""
     device = open_device(kernels)
     scene, cameras = street()
-    sights = Visibility.of(scene, cameras)
+    visibility = Visibility.of(scene, cameras)
     with uploaded(device, scene) as whole:
-        given = (device, whole, cameras, SweepOptions(0.0, turns=2), (0.0, 0.0, 0.0), sights, None, None, scene)
+        given = (device, whole, cameras, SweepOptions(0.0, turns=2), (0.0, 0.0, 0.0), visibility, None, None, scene)
         with planned_sweep(*given) as got:
             found = got.measure()
     with Rasterizer(device, scene) as rasterizer, RemovalSweep(rasterizer, cameras, SweepOptions(0.0)) as wanted:

@@ -9,10 +9,10 @@ import pytest
 
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.pruning.on_device import prune_scene
+from potr_cl.stages.pruning.controller import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions, Smoothed, choose, prune
-from potr_cl.stages.pruning.staleness import SweepOptions
+from potr_cl.stages.pruning.sweep import SweepOptions
 from tests.devices import KERNELS, open_device
 from tests.reference.scenes import ring_of_cameras, visible_scene
 

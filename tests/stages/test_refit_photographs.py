@@ -9,7 +9,7 @@ from potr_cl.model.camera import train_views
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.stages.refitting.photographs import PhotographChoice, hold_out
+from potr_cl.stages.held_out import PhotographChoice, hold_out
 from tests.cases.photographs import photographed_scene, photographs
 from tests.reference.scenes import ring_of_cameras
 

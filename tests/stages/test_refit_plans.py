@@ -16,12 +16,13 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.picked_splats import IndexSubset
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages import refit as refit_stage
-from potr_cl.stages.refitting import own_views, placement
-from potr_cl.stages.refitting.colour_refit import ColourRefit, HelpFrom
+from potr_cl.stages.refitting import coefficients, own_views
+from potr_cl.stages.refitting.colour_refit import ColourRefit
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.views import reached
 from potr_cl.views.reached import reached_splats
+from potr_cl.views.shares import HelpFrom
 from potr_cl.views.subsets import ListedSplats
 from potr_cl.workers.host import HostPool
 from tests.cases.elsewhere import ElsewherePool
@@ -169,7 +170,7 @@ def plain(device):
 )  # fmt: skip
 def test_the_same_solution(device, plain, picked, plan, way, monkeypatch):
     monkeypatch.setattr(own_views, "ENOUGH", 4)
-    monkeypatch.setattr(placement, "_FEWEST", plan.resident)
+    monkeypatch.setattr(coefficients, "_FEWEST", plan.resident)
     made = picked(plan.picked)
     found = fitted(device, plan, way)
     assert bool(made) == plan.picked
@@ -218,7 +219,7 @@ def test_what_is_known_of_coefficients(device):
 @pytest.mark.parametrize("own", [False, True], ids=["the host's memory", "memory of its own"])
 def test_little_memory_is_enough(device, own, monkeypatch):
     """Vectors that are too large for the memory that is given do not come to the device: most of them are not there."""
-    monkeypatch.setattr(placement, "_ANYWAY", 0)
+    monkeypatch.setattr(coefficients, "_ANYWAY", 0)
     kind = {"kind": "gpu", "integrated": False} if own else {"kind": "cpu"}
     device = Device(dataclasses.replace(device.info, **kind), family=device.family)
     count = 20_000
@@ -244,7 +245,7 @@ def test_slices_of_nothing():
 @pytest.mark.one_runtime
 def test_memory_is_that_of_vectors_and_views_together(device, monkeypatch):
     """Also where the vectors lie on the device."""
-    monkeypatch.setattr(placement, "_ANYWAY", 0)
+    monkeypatch.setattr(coefficients, "_ANYWAY", 0)
     count = 3000
     one_piece = 3400 * count
     with case_of(device, 3, count) as case:
@@ -272,13 +273,13 @@ def test_which_splats_are_reached(device, monkeypatch):
         for camera, numbers in zip(cameras, found, strict=True):
             with rasterizer.prepare_set([camera]) as views:
                 listed = device.download(views.intersections, (views.capacity,), np.uint32)
-                wanted, _ = rasterizer.composite(views.views[0])
+                wanted, _ = rasterizer.composite(views)
             drawn.append(np.unique(listed))
             assert np.all(np.diff(numbers.astype(np.int64)) > 0)
             assert np.isin(numbers, drawn[-1]).all()
             subset = scene.subset(numbers.astype(np.int64))
             with Rasterizer(device, subset) as alone, alone.prepare_set([camera]) as views:
-                got, _ = alone.composite(views.views[0])
+                got, _ = alone.composite(views)
             assert np.array_equal(got, wanted)
         assert sum(map(len, found)) < 0.9 * sum(map(len, drawn)) < 0.5 * len(scene) * len(cameras)
 
@@ -418,8 +419,8 @@ def test_more_views_stay(device, picked):
 @pytest.mark.parametrize("part", [0.3, 0.6])
 def test_little_memory_is_enough_for_views_with_splats_of_their_own(device, picked, part, monkeypatch):
     """What lies on the device keeps to what is given, as soon as that is more than the least."""
-    monkeypatch.setattr(placement, "_ANYWAY", 0)
-    monkeypatch.setattr(placement, "_LEAST_SLICE", 512)
+    monkeypatch.setattr(coefficients, "_ANYWAY", 0)
+    monkeypatch.setattr(coefficients, "_LEAST_SLICE", 512)
     device = Device(dataclasses.replace(device.info, kind="gpu", integrated=False), family=device.family)
     scene, cameras = crowded(5000, degree=3)
     one_piece = 3400 * len(scene)
@@ -447,7 +448,7 @@ def test_the_same_file(device, plush_excerpt, plush_excerpt_cameras, monkeypatch
     remembered = encode(plush_excerpt, small, options.changed(memory=1 << 30), device=device)
     assert remembered.data == whole.data
     for name in ("_ANYWAY", "_OF_FREE", "_OF_GIVEN"):
-        monkeypatch.setattr(placement, name, 0)
+        monkeypatch.setattr(coefficients, name, 0)
     sliced = encode(plush_excerpt, small, options, device=device)
     assert sliced.data == whole.data
     assert sliced.refitted.errors == whole.refitted.errors

@@ -15,7 +15,7 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions, prune
-from potr_cl.stages.pruning.staleness import SweepOptions
+from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.views.budget import default_memory
 from tests.devices import KERNELS, open_device
 from tests.reference import raster as reference

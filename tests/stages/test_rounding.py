@@ -9,11 +9,10 @@ import pyopencl as cl
 import pytest
 
 from potr_cl.outputs.output import ColourGrid
-from potr_cl.stages.refitting.blocks import SplatBlocks
+from potr_cl.stages.refitting.blocks import TURNS, Round, Rounding, SplatBlocks, Steps
 from potr_cl.stages.refitting.colour_refit import ColourRefit
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
-from potr_cl.stages.refitting.rounding import TURNS, Round, Rounding, Steps
 from tests.devices import KERNELS, open_device
 from tests.reference.refit import LENGTHS, to_rgb, to_ycocg
 from tests.reference.refit_cases import Case, as_rows, unpacked

@@ -11,7 +11,7 @@ import pytest
 from potr_cl.raster.scene_buffers import stride_of
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.exchange import Exchange, SparseVector
-from potr_cl.stages.refitting.layout import Layout
+from potr_cl.stages.refitting.sliced_arrays import Layout
 from tests.devices import KERNELS, open_device
 
 

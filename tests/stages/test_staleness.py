@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from potr_cl.stages.pruning.staleness import SweepOptions, TileSchedule, by_set
+from potr_cl.stages.pruning.resident import TileSchedule, by_set
+from potr_cl.stages.pruning.sweep import SweepOptions
 
 #: Two views of 3 and 2 tiles among others that are not cached.
 VIEWS = [(1, 3), (4, 2)]

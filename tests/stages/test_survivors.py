@@ -12,8 +12,8 @@ import pytest
 from potr_cl.errors import DeviceError
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.source import kernel_source
+from potr_cl.stages.pruning.buffers import SplatState, Survivors
 from potr_cl.stages.pruning.resident import Queues
-from potr_cl.stages.pruning.survivors import SplatState, Survivors
 
 REMOVED, ALIVE, JUST_REMOVED = SplatState
 

@@ -100,11 +100,11 @@ def test_a_splat_that_only_an_added_view_sees_is_kept(device, half_seen, plush_e
     there = dataclasses.replace(given[0], translation=given[0].translation - given[0].rotation @ np.full(3, 30.0))
     state = dataclasses.replace(State.of(half_seen, [*given, there]), added=1)
     left = Prune(iterations=3).run(state, Workbench(HyperParameters.from_quality(0.2), device=device))
-    assert left.learnt.unseen.splats == 300
+    assert left.results.unseen.splats == 300
     assert set(range(1500, 1800)) <= set(left.survivors)
     # Had somebody given it, some of them would have gone.
     asked = Prune(iterations=3).run(
         dataclasses.replace(state, added=0), Workbench(HyperParameters.from_quality(0.2), device=device)
     )
-    assert asked.learnt.unseen.splats < 300
+    assert asked.results.unseen.splats < 300
     assert not set(range(1500, 1800)) <= set(asked.survivors)

@@ -23,7 +23,7 @@ from potr_cl.placement.virtual import place_cameras
 from potr_cl.quality.metrics import psnr
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.removal import RemovalSweep
-from potr_cl.stages.pruning.staleness import SweepOptions
+from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.stages.views_between import Between
 
@@ -85,7 +85,7 @@ def test_a_scene_of_which_parts_are_seen_by_few_views_gets_more(device, plush_ex
     assert state.views[: len(given)] == tuple(given)
     assert len(state.views) == len(given) + count
     assert all(is_between(camera) for camera in state.views[len(given) :])
-    assert (state.learnt.between.given, state.learnt.between.added) == (len(given), count)
+    assert (state.results.between.given, state.results.between.added) == (len(given), count)
 
 
 def test_dense_views_get_none(device, plush_excerpt, plush_excerpt_cameras):
@@ -157,7 +157,7 @@ def test_virtual_cameras_get_some_if_they_are_asked_for(device, plush_excerpt):
     bench = Workbench(HyperParameters.from_quality(0.5, "best"), device=device)
     alone = Between().run(state, bench)
     assert not alone.added
-    assert 0 < alone.learnt.shown <= 1
+    assert 0 < alone.results.shown <= 1
     asked = Between(views=1.0).run(state, bench)
     assert 2 < asked.added <= 8
     assert is_virtual(asked.views)

@@ -41,15 +41,15 @@ def test_the_same_pictures(device):
     away = dataclasses.replace(cameras[0], rotation=np.diag([1.0, -1.0, -1.0]) @ cameras[0].rotation)
     away = dataclasses.replace(away, translation=-away.rotation @ (cameras[0].centre + 1000), width=50)
     cameras = [*cameras, away, cameras[1]]
-    sights = Visibility.of(scene, cameras, INRIA.near)
-    assert sights.totals[-2] == 0
-    assert sights.totals.sum() < 0.5 * len(scene) * len(cameras)
+    visibility = Visibility.of(scene, cameras, INRIA.near)
+    assert visibility.totals[-2] == 0
+    assert visibility.totals.sum() < 0.5 * len(scene) * len(cameras)
     pixels = [3 * camera.width * camera.height for camera in cameras]
     background = (0.1, 0.2, 0.3)
     with (
         uploaded(device, scene) as whole,
         Rasterizer(device, whole, background=background) as rasterizer,
-        targets_of(device, whole, cameras, background, sights) as visible,
+        targets_of(device, whole, cameras, background, visibility) as visible,
         Memory(device) as memory,
     ):
         buffers = [memory.allocate(4 * sum(pixels), "pictures") for _ in range(2)]
@@ -66,7 +66,7 @@ def test_the_same_pictures(device):
 
 def test_fewer_together_where_the_device_has_no_room(device, monkeypatch):
     scene, cameras = street()
-    sights = Visibility.of(scene, cameras, INRIA.near)
+    visibility = Visibility.of(scene, cameras, INRIA.near)
     pixels = sum(3 * camera.width * camera.height for camera in cameras)
     together = []
     prepare = Rasterizer.prepare_set
@@ -83,7 +83,7 @@ def test_fewer_together_where_the_device_has_no_room(device, monkeypatch):
         for full in (False, True):
             if full:
                 monkeypatch.setattr(Rasterizer, "prepare_set", failing)
-            with targets_of(device, whole, cameras, (0.0, 0.0, 0.0), sights) as visible:
+            with targets_of(device, whole, cameras, (0.0, 0.0, 0.0), visibility) as visible:
                 visible.into(range(len(cameras)), buffer)
             found.append(device.download(buffer, (pixels,), np.float32))
     assert max(together) > 2 == together[-1]

@@ -279,6 +279,94 @@ def test_a_click_on_a_frustum_flies_there(viewer, page):
     raise AssertionError("no click flew anywhere")
 
 
+#: Hides the panel and viser's notes.
+HIDE = """document.head.append(Object.assign(document.createElement("style"),
+  { textContent: ".mantine-Paper-root, .mantine-Notifications-root { visibility: hidden }" }))"""
+
+
+def test_the_browser_draws_what_render_does(viewer, browser):
+    """Where WebGL is computed on the CPU only if it is asked to."""
+    context = browser.new_context(viewport={"width": WIDTH, "height": HEIGHT})
+    tab = context.new_page()
+    try:
+        tab.goto(viewer.url)
+        until(lambda: tab.locator(".potr-figures b").count() > 0)
+        tab.locator("[data-potr=drawn] [aria-pressed=true]", has_text="exact").wait_for()
+        assert tab.evaluate("globalThis.potr") is None, "what is not needed is loaded"
+        visitor = viewer.painter.visitors[-1]
+        slide(tab, 0)
+        until(lambda: viewer.session.exhibit("B").name.endswith("_q0.potr"))
+        tab.locator("[data-view='4']").click()
+        until(lambda: visitor.view == 4)
+        tab.keyboard.press("x")
+        until(lambda: visitor.draws)
+        tab.evaluate(HIDE)
+
+        def picture(columns: slice = slice(None)) -> Any:
+            tab.wait_for_timeout(200)
+            shot = np.asarray(Image.open(io.BytesIO(tab.screenshot())).convert("RGB"))
+            return shot[60:, columns].astype(np.float64) / 255
+
+        def exact(which: str, columns: slice = slice(None), width: int = WIDTH) -> Any:
+            camera = camera_of(visitor.gaze, width, HEIGHT)
+            pixels = potr_cl.render(viewer.session.exhibit(which).scene, camera).pixels
+            return pixels[60:, columns].astype(np.float64) / 255
+
+        def is_drawn(which: str, columns: slice = slice(None), width: int = WIDTH, of: slice | None = None) -> bool:
+            """Whether the part of the page is that scene, and not the other one, however good that is."""
+            drawn, other = picture(columns), "B" if which == "A" else "A"
+            like = psnr(drawn, exact(which, of or columns, width))
+            return bool(28 < like < 60 and like > psnr(drawn, exact(other, of or columns, width)) + 1)
+
+        left, right = slice(0, WIDTH // 2 - 25), slice(WIDTH // 2 + 25, None)
+        until(lambda: is_drawn("A", left) and is_drawn("B", right))
+        press(viewer, tab, "4")
+        until(lambda: is_drawn("B"))
+        tab.keyboard.down("f")
+        until(lambda: is_drawn("A"))
+        tab.keyboard.up("f")
+        press(viewer, tab, "2")
+        half = WIDTH // 2
+        until(lambda: is_drawn("A", left, half, left) and is_drawn("B", right, half, slice(25, None)))
+        press(viewer, tab, "3")
+        figures = still(viewer, tab).look
+        assert figures.psnr is not None, "figures are found without pictures"
+        # Another scene, of another camera.
+        viewer.climb(2)
+        press(viewer, tab, "4")
+        tab.mouse.move(300, 300)
+        tab.mouse.wheel(0, 100)
+        until(lambda: visitor.view is None)
+        until(lambda: 28 < psnr(picture(), exact("B")) < 60)
+        # Both: left of the line as drawn here, right of it the server's own.
+        here = picture()
+        tab.keyboard.press("x")
+        until(lambda: not visitor.draws and visitor.is_still)
+        until(lambda: psnr(picture(), exact("B")) > 34 and not np.array_equal(picture(), here))
+        tab.wait_for_timeout(700)
+        pictured = picture()
+        tab.locator("[data-potr=drawn] button", has_text="both").dispatch_event("click")
+        until(lambda: tab.evaluate("document.body.dataset.drawn") == "both")
+        until(lambda: psnr(picture(left), here[:, left]) > 60 and psnr(picture(right), pictured[:, right]) > 60)
+        assert psnr(here[:, left], pictured[:, left]) < 50
+        labels = tab.locator(".potr-label").all_inner_texts()
+        assert labels == ["B, your GPU", "B, exact"]
+        # What it cannot draw.
+        press(viewer, tab, "6")
+        until(lambda: tab.evaluate("document.body.dataset.drawn") == "")
+    finally:
+        context.close()
+        until(lambda: len(viewer.painter.visitors) < 2)
+
+
+def test_a_scene_that_is_too_large_is_pictured(viewer, page, monkeypatch):
+    page.locator("[data-potr=drawn] button").first.wait_for()
+    with monkeypatch.context() as patch:
+        patch.setattr("potr_cl.viewer.server.MOST_DRAWN", 100)
+        viewer.climb(0)
+        page.locator("[data-potr=drawn] button").first.wait_for(state="detached")
+
+
 def test_a_second_tab_and_the_end_of_the_work(viewer, browser, page):
     first = still(viewer, page)
     second = opened(browser, viewer)

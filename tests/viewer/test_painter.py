@@ -140,6 +140,25 @@ def test_beside_each_other_each_has_half_the_width(painter, gazes):
     assert shown.look.a.shape == shown.look.b.shape == (HEIGHT, WIDTH // 2, 3)
 
 
+def test_a_browser_that_draws_gets_figures_and_no_pictures(painter, gazes, scenes, device, monkeypatch):
+    browser, looks, look = Browser(), [], Session.look
+    monkeypatch.setattr(Session, "look", lambda *args, **choices: looks.append(args) or look(*args, **choices))
+    browser.visitor.draws = True
+    painter.enter(browser.visitor)
+    browser.look(painter, gazes[0])
+    until(lambda: browser.shown)
+    assert [scenes for _, _, scenes, _ in looks[:1]] == [()], "nothing is rendered while the camera moves"
+    shown = browser.still()
+    camera = camera_of(gazes[0], WIDTH, HEIGHT)
+    compared = potr_cl.compare(*(each.scene for each in scenes), [camera], device=device)
+    assert shown.look.psnr == pytest.approx(compared.psnr, abs=1e-4)
+    assert {each.picture is None for each in browser.shown} == {True}
+    browser.visitor.draws = False
+    painter.wake(browser.visitor)
+    until(lambda: browser.shown[-1].picture is not None)
+    assert browser.shown[-1].picture.shape == (HEIGHT, WIDTH, 3)
+
+
 def test_losses_are_those_of_compare(painter, gazes, scenes, plush_excerpt_cameras, device):
     browser = Browser()
     painter.enter(browser.visitor)
@@ -298,5 +317,12 @@ def test_the_photograph_of_a_view_fades_over_it(device, scenes, plush_excerpt_ca
             painter.ask(lambda: None)
             expected = bare * (1 - part) + 200 * part
             until(lambda expected=expected: abs(browser.shown[-1].picture - expected).max() <= 1)
+        # A browser that draws has no photographs.
+        browser.visitor.draws = True
+        browser.look(painter, browser.visitor.gaze)
+        until(lambda: browser.visitor.is_still and browser.shown[-1].picture is None)
+        browser.visitor.fade = 1.0
+        painter.wake(browser.visitor)
+        until(lambda: browser.shown[-1].picture is not None and abs(browser.shown[-1].picture - 200.0).max() <= 1)
     finally:
         painter.stop(patience=300)

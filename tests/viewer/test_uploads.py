@@ -48,8 +48,8 @@ class Connection:
         self.sent: list[dict[str, Any]] = []
         self.closed: int | None = None
 
-    async def send(self, message: str) -> None:
-        self.sent.append(json.loads(message))
+    async def send(self, message: str | bytes) -> None:
+        self.sent.append({"part": message} if isinstance(message, bytes) else json.loads(message))
 
     async def close(self, code: int, _reason: str) -> None:
         self.closed = code
@@ -89,13 +89,32 @@ def test_what_the_page_says_is_obeyed() -> None:
     [
         {"divider": "x"}, {"divider": True}, {"divider": float("nan")}, {"swap": 1}, {"fly": True}, {"fly": 1.5}, [], 7,
         None, {"mode": 3}, {"mode": []}, {"divider": 10**400}, {"fly": -(10**400)}, {"divider": 1e999},
-        {"rung": "1"}, b"bytes that nobody waits for", {"unknown": {}}, {"file": "name"},
+        {"rung": "1"}, {"draws": 1}, {"scene": "/etc/passwd"}, {"scene": 1.5}, {"unknown": {}}, {"file": "name"},
+        b"bytes that nobody waits for",
     ],
 )  # fmt: skip
 def test_nonsense_is_passed_over(nonsense) -> None:
     tab, connection = spoken([nonsense, {"fly": 1}])
     assert tab.heard == [("fly", 1)]
     assert connection.closed is None
+
+
+@pytest.mark.parametrize("file", [b"x" * 3_000_000, potr_cl.UsageError("shown no longer"), OSError("/its/path")])
+def test_a_scene_is_given_to_a_page_that_draws(file, monkeypatch) -> None:
+    def give(_self: Tab, number: int) -> bytes:
+        assert number == 7
+        if isinstance(file, Exception):
+            raise file
+        return file
+
+    monkeypatch.setattr(Tab, "file", give, raising=False)
+    tab, connection = spoken([{"scene": 7}, *[{"draws": k % 2 == 0} for k in range(9)]])
+    scenes, parts = ([sent[kind] for sent in connection.sent if kind in sent] for kind in ("scene", "part"))
+    assert b"".join(parts) == (file if isinstance(file, bytes) else b"")
+    told = {"bytes": len(file)} if isinstance(file, bytes) else {"error": scenes[0]["error"]}
+    assert scenes == [{"number": 7, **told}]
+    assert "/its/path" not in str(scenes)
+    assert tab.heard[-1] == ("draw", True)
 
 
 def test_json_that_is_none_is_passed_over() -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from potr_cl.views.budget import Foretold, Named, Shared, target_bytes
-from potr_cl.views.groups import ViewGroup
 from potr_cl.views.plan import neighbours
+from potr_cl.views.visibility import ViewGroup
 from tests.reference.scenes import ring_of_cameras
 
 CAMERAS = ring_of_cameras(12, size=32)

@@ -379,8 +379,8 @@ def test_a_scheduler_that_stands_still_is_told(device, monkeypatch, caplog):
     assert "gave up" not in caplog.text
 
 
-def seats(dask_worker):
-    """On a worker: how many seats there are."""
+def actors(dask_worker):
+    """On a worker: how many actors there are."""
     return len(dask_worker.state.actors)
 
 
@@ -403,7 +403,7 @@ def test_ctrl_c_leaves_no_worker_busy(tmp_path, data, scene, cameras, device, ex
         ]  # fmt: skip
         running = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
         try:
-            eventually(lambda: sum(client.run(seats).values()) == 2)
+            eventually(lambda: sum(client.run(actors).values()) == 2)
             time.sleep(1)
             running.send_signal(signal.SIGINT)
             _, said = running.communicate(timeout=300)
@@ -413,7 +413,7 @@ def test_ctrl_c_leaves_no_worker_busy(tmp_path, data, scene, cameras, device, ex
         assert "interrupted" in said
         assert "Traceback" not in said
         assert not list(tmp_path.iterdir())
-        eventually(lambda: sum(client.run(seats).values()) == 0)
+        eventually(lambda: sum(client.run(actors).values()) == 0)
         # Nothing that was taken for it stays taken, and the workers are free for others.
         eventually(lambda: set(client.run(taken).values()) == {0})
         assert potr_cl.encode(scene, cameras, OPTIONS, device=device, cluster=client).data == expected
@@ -421,9 +421,9 @@ def test_ctrl_c_leaves_no_worker_busy(tmp_path, data, scene, cameras, device, ex
 
 def taken():
     """On a worker: bytes of its devices that somebody has."""
-    from potr_cl.workers import seat
+    from potr_cl.workers import actor
 
-    return sum(device.allocated for device in seat.opened.values())
+    return sum(device.allocated for device in actor.opened.values())
 
 
 @pytest.mark.parametrize(
@@ -474,7 +474,7 @@ def test_nobody_of_a_computer_is_asked_again_where_one_was_lost_as_it_was_met(de
         raise WorkerLost(f"{worker.name} has gone")
 
     with local_cluster(1) as cluster, ClusterPool(cluster.scheduler_address, device) as pool:
-        monkeypatch.setattr("potr_cl.workers.cluster._ClusterWorker.meet", lost)
+        monkeypatch.setattr("potr_cl.workers.actor.ClusterWorker.meet", lost)
         cluster.scale(2)
         eventually(lambda: asked)
         cluster.scale(3)

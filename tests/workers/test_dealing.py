@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from potr_cl.workers.dealing import deal, shares
 from potr_cl.workers.host import HostPool
+from potr_cl.workers.pool import deal, shares
 from tests.devices import open_device
 
 

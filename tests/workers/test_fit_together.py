@@ -12,7 +12,8 @@ from potr_cl.errors import DeviceError
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting import together
 from potr_cl.stages.fitting.fit import FitOptions, fit_scene
-from potr_cl.stages.fitting.together import FitPart, Helpers
+from potr_cl.stages.fitting.together import FitPart
+from potr_cl.views.shares import HelpFrom
 from potr_cl.views.targets import RenderedTargets
 from potr_cl.workers.host import HostPool
 from tests.cases.elsewhere import ElsewherePool
@@ -33,8 +34,8 @@ def family(request):
 
 def fitted(device, pool=None, options=OPTIONS):
     with Rasterizer(device, SOURCE) as rasterizer:
-        helpers = None if pool is None else Helpers(pool, SOURCE)
-        return fit_scene(device, START, VIEWS, RenderedTargets(rasterizer, VIEWS), options, helpers=helpers)
+        help_from = None if pool is None else HelpFrom(pool, SOURCE)
+        return fit_scene(device, START, VIEWS, RenderedTargets(rasterizer, VIEWS), options, help_from=help_from)
 
 
 @pytest.fixture(scope="module")

@@ -19,12 +19,11 @@ from potr_cl.opencl.memory import Memory
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.stages.pruning import removal
-from potr_cl.stages.pruning.shared_removal import RemovalPart
-from potr_cl.stages.refitting.shared_map import ColourPart
+from potr_cl.stages.pruning.helpers import RemovalPart
+from potr_cl.stages.refitting.helpers import ColourPart
 from potr_cl.views import targets, visibility
 from potr_cl.views.targets import RenderedTargets
-from potr_cl.workers.host import HostPool
-from potr_cl.workers.opening import open_workers
+from potr_cl.workers.host import HostPool, open_workers
 from potr_cl.workers.parts import Parts
 from potr_cl.workers.pool import Part
 from tests.cases.cameras import small
@@ -270,16 +269,6 @@ def test_python_takes_several_devices(plush_excerpt, plush_excerpt_cameras):
         potr_cl.encode(plush_excerpt, cameras, OPTIONS, device=[device.info, device.info])
     with pytest.raises(UsageError, match="list of devices is empty"):
         potr_cl.encode(plush_excerpt, cameras, OPTIONS, device=[])
-
-
-def test_a_search_shares_views_out_too(plush_excerpt, plush_excerpt_cameras):
-    cameras = few(plush_excerpt_cameras)
-    options = EncodeOptions.for_preset("best", prune={"iterations": 4}, refit={"steps": 2})
-    device = Device()
-    alone = potr_cl.encode(plush_excerpt, cameras, options, device=device, max_size=16_000)
-    together = potr_cl.encode(plush_excerpt, cameras, options, device=[device, Device()], max_size=16_000)
-    assert together.data == alone.data
-    assert together.shared is not None
 
 
 @pytest.mark.slow

@@ -20,9 +20,9 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator, judge_by_photographs
 from potr_cl.quality.judging import JudgingPart
 from potr_cl.quality.photographs import GroundTruth
-from potr_cl.raster import kept_scene
-from potr_cl.raster.kept_scene import KeptScene
+from potr_cl.raster import resident
 from potr_cl.raster.rasterizer import Rasterizer, render
+from potr_cl.raster.resident import ResidentScene
 from potr_cl.raster.scene_buffers import SceneBuffers, uploaded
 from potr_cl.views import pictures, visibility
 from potr_cl.views.pictures import SeenRasterizer, rasterizer_of
@@ -99,9 +99,9 @@ def test_a_scene_that_is_kept_is_not_sent_again(plush_excerpt, cameras, coded, f
     views = EvaluationViews.of(cameras)
     expected = judged(open_device(family), plush_excerpt, coded, views)
     devices = [open_device(family) for _ in range(2)]
-    with HostPool(devices) as pool, KeptScene(devices[0], plush_excerpt) as kept:
+    with HostPool(devices) as pool, ResidentScene(devices[0], plush_excerpt) as kept:
         for device in devices:
-            assert isinstance(kept.on(device), SceneBuffers)
+            assert isinstance(kept.found_on(device), SceneBuffers)
         monkeypatch.setattr("potr_cl.raster.rasterizer.uploaded", None)
         assert judged(devices[0], kept, coded, views, pool) == expected
     assert [device.allocated for device in devices] == [0] * 2
@@ -193,6 +193,7 @@ def test_a_search_for_a_psnr_judges_together(plush_excerpt, cameras, monkeypatch
     devices = [device, open_device("cpu")]
     together = potr_cl.encode(plush_excerpt, cameras, options, device=devices, min_psnr=32)
     assert together.data == alone.data
+    assert together.shared is not None
     assert set(judged_by) == set(devices)
     assert [device.allocated for device in devices] == [0] * 2
 
@@ -255,7 +256,7 @@ def test_views_of_a_large_scene_are_judged_by_what_they_see(family, monkeypatch)
     assert np.mean(sorted(projected)[:-1]) < 0.4 * len(scene)
     with HostPool(devices) as pool:
         assert judged(devices[0], scene, coded, views, pool) == expected
-        with KeptScene(devices[0], scene, memory=0) as kept:
+        with ResidentScene(devices[0], scene, memory=0) as kept:
             kept.groups = SplatGroups.of(scene)
             monkeypatch.setattr(visibility, "LEAST_SPLATS", 1 << 30)
             assert judged(devices[0], kept, coded, views, pool) == expected
@@ -284,7 +285,7 @@ def test_with_little_memory_a_decoded_file_is_judged_by_what_views_see_too(famil
 
     monkeypatch.setattr(Rasterizer, "__init__", noted)
     with (
-        KeptScene(device, scene, memory=scene.nbytes) as kept,
+        ResidentScene(device, scene, memory=scene.nbytes) as kept,
         Potr().seen(coded.data, device, memory=scene.nbytes) as candidate,
         Evaluator(device, kept, views, BACKGROUND) as evaluator,
     ):
@@ -304,7 +305,7 @@ def test_an_encode_leaves_the_groups_that_it_has_found(family, monkeypatch):
     monkeypatch.setattr("potr_cl.views.visibility.LEAST_SPLATS", 1)
     scene, cameras = street(5, 500, across=True)
     device = open_device(family)
-    with KeptScene(device, scene) as kept:
+    with ResidentScene(device, scene) as kept:
         encode(scene, cameras, dataclasses.replace(OPTIONS, cameras_anyway=True), device=device, kept=kept)
         assert kept.groups is not None
         assert len(kept.groups.group_of) == len(scene)
@@ -376,9 +377,9 @@ def test_a_ladder_keeps_the_scene_on_the_devices(plush_excerpt, cameras, tmp_pat
     expected = potr_cl.encode_ladder(plush_excerpt, tmp_path / "alone", "0.2,0.4", cameras, options)
     sent = []
     for how in ("uploaded", "copied"):  # to the first device, and from there to the other one
-        bring = getattr(kept_scene, how)
+        bring = getattr(resident, how)
         monkeypatch.setattr(
-            kept_scene, how, lambda device, scene, bring=bring: sent.append(device) or bring(device, scene)
+            resident, how, lambda device, scene, bring=bring: sent.append(device) or bring(device, scene)
         )
     devices = [open_device("cpu") for _ in range(2)]
     found = potr_cl.encode_ladder(plush_excerpt, tmp_path / "together", "0.2,0.4", cameras, options, device=devices)

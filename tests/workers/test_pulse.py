@@ -10,8 +10,8 @@ from typing import Any, cast
 
 import pytest
 
-from potr_cl.workers import pulse
-from potr_cl.workers.pulse import Pulse
+from potr_cl.workers import client as clients
+from potr_cl.workers.client import Pulse
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def loop():
 
 
 def test_an_answer_that_was_lost_long_ago_says_nothing(loop, monkeypatch):
-    monkeypatch.setattr(pulse, "_STILL", 0.3)
+    monkeypatch.setattr(clients, "_STILL", 0.3)
     asked = []
 
     async def broadcast(msg: Any, workers: list[str]) -> dict[str, Any]:
@@ -46,7 +46,7 @@ def test_an_answer_that_was_lost_long_ago_says_nothing(loop, monkeypatch):
 
 
 def test_who_never_answers_stands_still(loop, monkeypatch):
-    monkeypatch.setattr(pulse, "_STILL", 0.3)
+    monkeypatch.setattr(clients, "_STILL", 0.3)
 
     async def broadcast(msg: Any, workers: list[str]) -> dict[str, Any]:
         raise OSError("no answer")

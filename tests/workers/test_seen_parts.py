@@ -14,11 +14,11 @@ from potr_cl.errors import DeviceMemoryError
 from potr_cl.model import splat_groups
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.raster.carried import Excerpt
+from potr_cl.raster.resident import SceneSubset
 from potr_cl.raster.rules import INRIA
-from potr_cl.stages.pruning import shared_removal
+from potr_cl.stages.pruning import helpers
 from potr_cl.stages.refitting.exchange import DrawnRows
-from potr_cl.stages.refitting.shared_map import ColourPart
+from potr_cl.stages.refitting.helpers import ColourPart
 from potr_cl.views import visibility
 from potr_cl.views.shares import ViewShares
 from potr_cl.views.visibility import Visibility
@@ -78,7 +78,7 @@ def test_the_same_bytes(family, options, monkeypatch):
     expected = encode(scene, cameras, options, device=open_device(family)).data
     made = []
 
-    class Noting(shared_removal.RemovalPart):
+    class Noting(helpers.RemovalPart):
         def __init__(self, device, memory, given, *more):
             made.append(len(given))
             super().__init__(device, memory, given, *more)
@@ -88,8 +88,8 @@ def test_the_same_bytes(family, options, monkeypatch):
             made.append(len(source))
             super().__init__(device, memory, constant, sh_count, rules, background, source, *more)
 
-    monkeypatch.setattr("potr_cl.stages.pruning.measured.RemovalPart", Noting)
-    monkeypatch.setattr("potr_cl.stages.refitting.shared_map.ColourPart", NotingColours)
+    monkeypatch.setattr("potr_cl.stages.pruning.helpers.RemovalPart", Noting)
+    monkeypatch.setattr("potr_cl.stages.refitting.helpers.ColourPart", NotingColours)
     devices = [open_device(family) for _ in range(4)]
     with ElsewherePool(devices) as pool:
         assert encode(scene, cameras, options, device=devices[0], pool=pool).data == expected
@@ -132,7 +132,7 @@ def test_who_is_told_again_is_told_the_colours_of_then(lost_at, monkeypatch, plu
     cameras = [small(camera) for camera in plush_excerpt_cameras[:5]]
     devices = [open_device("cpu") for _ in range(3)]
     expected = encode(plush_excerpt, cameras, options, device=devices[0]).data
-    measure, asked = shared_removal.RemovalPart.changes, []
+    measure, asked = helpers.RemovalPart.changes, []
 
     def losing(removal):
         if not asked or asked[0] is removal:
@@ -141,7 +141,7 @@ def test_who_is_told_again_is_told_the_colours_of_then(lost_at, monkeypatch, plu
                 raise DeviceMemoryError("no room")
         return measure(removal)
 
-    monkeypatch.setattr(shared_removal.RemovalPart, "changes", losing)
+    monkeypatch.setattr(helpers.RemovalPart, "changes", losing)
     with ElsewherePool(devices) as pool:
         assert encode(plush_excerpt, cameras, options, device=devices[0], pool=pool).data == expected
     assert asked.count(asked[0]) == lost_at
@@ -162,7 +162,7 @@ def test_a_re_fit_without_room_for_that_sends_all(monkeypatch):
             refused.append(self)
             raise DeviceMemoryError("no room")
 
-    monkeypatch.setattr("potr_cl.stages.refitting.shared_map.DrawnRows", WithoutRoom)
+    monkeypatch.setattr("potr_cl.stages.refitting.helpers.DrawnRows", WithoutRoom)
     with ElsewherePool(devices) as pool:
         assert encode(scene, cameras, options, device=devices[0], pool=pool).data == expected
     assert refused
@@ -196,7 +196,7 @@ def test_workers_with_gpus_look_at_each_view_with_what_it_may_draw(keep, monkeyp
     scene = with_a_house_that_nobody_sees(scene)
     options = OPTIONS.changed(prune={"keep": keep})
     expected = encode(scene, cameras, options, device=open_device(family)).data
-    monkeypatch.setattr("potr_cl.raster.kept_scene.fits_whole", lambda device, scene: True)
+    monkeypatch.setattr("potr_cl.raster.resident.fits_whole", lambda device, scene: True)
     made = []
     for where, name in (("stages.pruning.removal", "NamedSplats"), ("views.targets", "SeenRasterizer")):
         where = f"potr_cl.{where}"
@@ -217,47 +217,47 @@ def test_workers_with_gpus_look_at_each_view_with_what_it_may_draw(keep, monkeyp
 
 def test_neighbours_go_to_the_same():
     scene, cameras = street(across=True)
-    sights = Visibility.of(scene, cameras, INRIA.near)
-    dealt = ViewShares.of(cameras, sights, [1.0, 1.0], scene, np.arange(len(scene)))
+    visibility = Visibility.of(scene, cameras, INRIA.near)
+    dealt = ViewShares.of(cameras, visibility, [1.0, 1.0], scene, np.arange(len(scene)))
     numbers = [share.numbers for share in dealt.shares]
     assert sorted(chain(*numbers)) == list(range(len(cameras)))
     assert all(own == sorted(own) for own in numbers)
     least = min(len(share.splats) for share in dealt.shares)
     assert least < 0.75 * len(scene)
-    in_turn = [sights.of_views(range(first, len(cameras), 2))[0] for first in range(2)]
+    in_turn = [visibility.of_views(range(first, len(cameras), 2))[0] for first in range(2)]
     assert sum(len(share.splats) for share in dealt.shares) < 0.9 * sum(map(len, in_turn))
 
 
 def test_twice_as_fast_gets_twice_as_much():
     scene, cameras = street(8, across=True)
-    sights = Visibility.of(scene, cameras, INRIA.near)
-    work = [int(sights.totals[own].sum()) for own in sights.dealt([2.0, 1.0])]
+    visibility = Visibility.of(scene, cameras, INRIA.near)
+    work = [int(visibility.totals[own].sum()) for own in visibility.dealt([2.0, 1.0])]
     assert 1.4 < work[0] / work[1] < 2.8
 
 
 def test_a_share_names_its_splats_by_their_places():
     scene, cameras = street(across=True)
-    sights = Visibility.of(scene, cameras, INRIA.near)
-    splats, own = sights.of_views([3, 4])
-    assert np.array_equal(splats, sights.groups.splats(sights.seen[3] | sights.seen[4]))
-    assert own.totals[3] == sights.totals[3]
-    assert own.totals[4] == sights.totals[4]
-    assert np.array_equal(splats[own.groups.splats(own.seen[3])], sights.groups.splats(sights.seen[3]))
+    visibility = Visibility.of(scene, cameras, INRIA.near)
+    splats, own = visibility.of_views([3, 4])
+    assert np.array_equal(splats, visibility.groups.splats(visibility.seen[3] | visibility.seen[4]))
+    assert own.totals[3] == visibility.totals[3]
+    assert own.totals[4] == visibility.totals[4]
+    assert np.array_equal(splats[own.groups.splats(own.seen[3])], visibility.groups.splats(visibility.seen[3]))
 
 
 def test_views_that_see_nothing_have_a_share_too():
     scene, cameras = street(across=True)
     away = dataclasses.replace(cameras[0], translation=cameras[0].translation + np.array([0, 0, -500.0]))
-    sights = Visibility.of(scene, [*cameras, away, away], INRIA.near)
-    assert sights.totals[-1] == 0
-    splats, _ = sights.of_views([len(cameras)])
+    visibility = Visibility.of(scene, [*cameras, away, away], INRIA.near)
+    assert visibility.totals[-1] == 0
+    splats, _ = visibility.of_views([len(cameras)])
     assert len(splats) > 0
-    assert all(len(each.splats) for each in sights.clusters([len(cameras), len(cameras) + 1]))
+    assert all(len(each.splats) for each in visibility.clusters([len(cameras), len(cameras) + 1]))
 
 
 def test_an_excerpt_arrives_as_a_scene():
     scene, _ = street(across=True)
-    sent = Excerpt(scene, np.array([3, 5, 900]))
+    sent = SceneSubset(scene, np.array([3, 5, 900]))
     there = pickle.loads(pickle.dumps(sent))
     assert type(there) is type(scene)
     assert np.array_equal(there.sh, scene.sh[[3, 5, 900]])

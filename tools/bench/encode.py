@@ -38,7 +38,7 @@ from potr_cl.raster.rules import GSPLAT, INRIA
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, Precision
 from potr_cl.stages.compaction.view_weights import ViewWeights
 from potr_cl.stages.pruning.removal import RemovalSweep
-from potr_cl.stages.pruning.staleness import SweepOptions
+from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.views.targets import RenderedTargets

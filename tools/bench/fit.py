@@ -23,7 +23,7 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Adam, Limits, Rates
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
-from potr_cl.stages.fitting.views import batches
+from potr_cl.stages.fitting.fit import batches
 from potr_cl.views.targets import RenderedTargets, Room, TargetPictures
 from tools.results import Column, Results
 from tools.workloads import in_turn, read, reduced, scene_parser

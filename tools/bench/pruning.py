@@ -21,10 +21,10 @@ import numpy as np
 from potr_cl.model.camera import train_views
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.pruning.on_device import prune_scene
+from potr_cl.stages.pruning.controller import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions
-from potr_cl.stages.pruning.staleness import SweepOptions
+from potr_cl.stages.pruning.sweep import SweepOptions
 from tools.results import Cell, Column, Results
 from tools.study.evaluation import EvaluatedScene
 from tools.workloads import scene_parser

@@ -61,8 +61,10 @@ def scenes(results: Results, folders: Sequence[Path], device: Device, passes: in
         views = train_views(cameras)[:limit]
         with Rasterizer(device, scene, GSPLAT) as rasterizer, ExitStack() as prepared:
             times = frame_times(rasterizer, views, passes)
-            some = [prepared.enter_context(rasterizer.prepare(view)) for view in views[:: max(len(views) // 8, 1)]]
-            intersections = statistics.mean(view.intersection_count for view in some)
+            some = [
+                prepared.enter_context(rasterizer.prepare_set([view])) for view in views[:: max(len(views) // 8, 1)]
+            ]
+            intersections = statistics.mean(view.capacity for view in some)
             longest = max(np.diff(device.download(v.offsets, (v.tiles + 1,), np.uint32)).max(initial=0) for v in some)
         metrics, rate = folder / "reference" / "metrics.json", 1 / statistics.mean(times)
         theirs = json.loads(metrics.read_text())["gsplat_fps_h200"] if metrics.exists() else None

@@ -22,6 +22,7 @@ ROOT = Path(__file__).parents[2]
 
 #: Tables that other pages hold, and the function that makes each.
 _TABLES = {
+    "devices": "tools.make.tables:devices_table",
     "figures": "tools.make.benchmarks:figures_table",
     "formats": "tools.make.tables:formats_table",
     "presets": "tools.make.tables:presets_table",

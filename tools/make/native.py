@@ -18,7 +18,7 @@ from pathlib import Path
 import potr_cl.codec.native
 
 SOURCES = Path(potr_cl.codec.native.__file__).parent
-_PLAIN = ["-O3"]
+PLAIN = ["-O3"]
 _SANITIZED = [
     "-O2",
     "-g",
@@ -27,8 +27,8 @@ _SANITIZED = [
     "-fno-sanitize-recover=all",
     "-DPOTR_SANITIZED",
 ]
-#: The same as setup.py's.
-_ALWAYS = ["-std=c11", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden", "-fPIC", "-shared"]
+#: The same as those of setup.py.
+ALWAYS = ["-std=c11", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden", "-fPIC", "-shared"]
 
 
 def compile_library(output: Path, sanitize: bool = False, compiler: str | None = None) -> None:
@@ -41,7 +41,7 @@ def compile_library(output: Path, sanitize: bool = False, compiler: str | None =
     if found is None:
         sys.exit("there is no C compiler: install gcc or clang")
     sources = sorted(str(source) for source in SOURCES.glob("*.c") if source.name != "module.c")
-    command = [found, *_ALWAYS, *(_SANITIZED if sanitize else _PLAIN), *sources, "-lm", "-o", str(output)]
+    command = [found, *ALWAYS, *(_SANITIZED if sanitize else PLAIN), *sources, "-lm", "-o", str(output)]
     if subprocess.run(command, check=False).returncode:
         sys.exit(f"failed: {' '.join(command)}")
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 from potr_cl.formats.registry import CAMERA_FORMATS, SCENE_FORMATS
 from potr_cl.opencl import quirks
@@ -34,6 +37,37 @@ def quirks_table() -> str:
     return table(
         ("quirk", "runtime and versions", "what goes wrong without it", "how to see if it is still needed"), rows
     )
+
+
+#: What users have posted (docs/devices.md), and the kernels whose times a row has.
+_REPORTS = Path(__file__).parents[2] / "docs" / "devices"
+_KERNELS = ("project", "sort_tiles", "composite", "removal", "refit_sweep", "derivatives", "compact")
+
+
+def devices_table(reports: Path = _REPORTS) -> str:
+    """The devices of the reports in a folder, for docs/devices.md."""
+    rows = []
+    for path in sorted(reports.glob("*.json")):
+        report = json.loads(path.read_text("utf-8"))
+        for entry in report["devices"]:
+            if "check" in entry:
+                said = entry.get("compiler", [])
+                system = f"{report['system']}, {report['machine']}"
+                told = (
+                    entry["name"],
+                    f"{entry['platform']}, {entry['driver']}",
+                    system,
+                    entry["check"],
+                    str(len(said)),
+                )
+                rows.append([*map(cell, told), *(_per_launch(entry.get("times", {}), name) for name in _KERNELS)])
+    head = ("device", "runtime and driver", "system", "self-check", "compiler warnings")
+    return table((*head, *(f"`{name}`" for name in _KERNELS)), rows)
+
+
+def _per_launch(times: dict[str, Any], kernel: str) -> str:
+    """Milliseconds."""
+    return f"{1e3 * times[kernel]['seconds'] / times[kernel]['launches']:.3g}" if kernel in times else ""
 
 
 def formats_table() -> str:

@@ -51,8 +51,8 @@ class Program:
 
     @property
     def defines(self) -> list[str]:
-        """For a compiler's command line."""
-        return [f"-D{name}={value}" for name, value in self.macros]
+        """For a compiler's command line; as GPUs get them that may have a watchdog (:mod:`potr_cl.opencl.pieces`)."""
+        return ["-DIN_PIECES=1", *(f"-D{name}={value}" for name, value in self.macros)]
 
     @property
     def needs_extensions(self) -> bool:

@@ -49,27 +49,27 @@ from potr_cl.opencl.memory import Memory
 from potr_cl.outputs.output import ColourGrid
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.raster import launch_gpu
-from potr_cl.raster import long_lists as long_lists_module
+from potr_cl.raster import launcher as raster_launcher
+from potr_cl.raster import preparing_memory as long_lists_module
 from potr_cl.raster.picked_splats import Picker
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import GSPLAT, INRIA
 from potr_cl.raster.scene_buffers import gathered, uploaded
-from potr_cl.raster.surely_seen import surely_seen
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
-from potr_cl.stages.pruning.on_device import prune_scene
+from potr_cl.stages.pruning.buffers import Survivors
+from potr_cl.stages.pruning.controller import prune_scene
+from potr_cl.stages.pruning.exchange import AddedChanges, AlivePacking, ChangedTotals
 from potr_cl.stages.pruning.removal import RemovalSweep, planned_sweep
 from potr_cl.stages.pruning.schedule import PruningOptions
-from potr_cl.stages.pruning.staleness import SweepOptions
-from potr_cl.stages.pruning.survivors import Survivors
-from potr_cl.stages.pruning.travelling_totals import AddedChanges, AlivePacking, ChangedTotals
+from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.stages.refitting import coefficients, sliced_arrays
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.exchange import Exchange
-from potr_cl.stages.refitting.layout import Layout
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
+from potr_cl.stages.refitting.sliced_arrays import Layout
 from potr_cl.views import reached
+from potr_cl.views.reached import surely_seen
 from potr_cl.views.targets import RenderedTargets
 from potr_cl.views.visibility import Visibility
 from tests.reference import raster as reference
@@ -148,13 +148,17 @@ def view_by_view(device: Device) -> None:
         return
     scene, views = _apart()
     with patch.object(splat_groups, "LARGEST", 8), uploaded(device, scene) as whole:
-        sights = Visibility.of(scene, views, INRIA.near)
+        visibility = Visibility.of(scene, views, INRIA.near)
         for memory in (None, 0):
-            with planned_sweep(device, whole, views, SweepOptions(0.0, memory=memory), visibility=sights) as removal:
+            with planned_sweep(
+                device, whole, views, SweepOptions(0.0, memory=memory), visibility=visibility
+            ) as removal:
                 removal.measure()
                 removal.remove(np.arange(0, len(scene), 5))
                 removal.measure()
-            with planned_sweep(device, whole, views, SweepOptions(0.05, memory=memory), visibility=sights) as removal:
+            with planned_sweep(
+                device, whole, views, SweepOptions(0.05, memory=memory), visibility=visibility
+            ) as removal:
                 prune_scene(removal, PruningOptions(1e-2, 3))
 
 
@@ -162,9 +166,9 @@ def part_by_part(device: Device) -> None:
     """The same scene in parts that see much of the same."""
     scene, views = _apart()
     with patch.object(splat_groups, "LARGEST", 8):
-        sights = Visibility.of(scene, views)
-        assert len(sights.clusters()) > 1
-        with planned_sweep(device, scene, views, SweepOptions(0.0), visibility=sights) as removal:
+        visibility = Visibility.of(scene, views)
+        assert len(visibility.clusters()) > 1
+        with planned_sweep(device, scene, views, SweepOptions(0.0), visibility=visibility) as removal:
             removal.measure()
             prune_scene(removal, PruningOptions(1e-2, 3))
 
@@ -210,7 +214,7 @@ def refits(device: Device) -> None:
             with (
                 patch.object(reached, "LEAST_SPLATS", least),
                 patch.object(reached, "WORTH_IT", 1.0),
-                patch.object(launch_gpu, "LONGEST", longest),
+                patch.object(raster_launcher, "LONGEST", longest),
                 patch.object(long_lists_module, "LONGEST", longest),
                 patch.object(long_lists_module, "PIECE", 64),
             ):

@@ -14,7 +14,7 @@ from potr_cl.model.camera import Camera
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.removal import RemovalSweep
-from potr_cl.stages.pruning.staleness import SweepOptions
+from potr_cl.stages.pruning.sweep import SweepOptions
 from tests.reference import raster as reference
 from tools.stress.cases import Case
 from tools.stress.derivatives import check_derivatives, tellable
@@ -100,7 +100,7 @@ class Lists:
 def rasterized(rasterizer: Rasterizer, view: Camera) -> Lists:
     """All that the rasterizer's stages leave."""
     device = rasterizer.device
-    with rasterizer.prepare(view) as prepared:
+    with rasterizer.prepare_set([view]) as prepared:
         image, transmittance = rasterizer.composite(prepared)
         shapes = device.download(prepared.shapes, (rasterizer.stride, 8), np.float32)[: rasterizer.splats]
         colours = device.download(prepared.colours, (rasterizer.stride, 4), np.float32)[: rasterizer.splats, :3]
@@ -110,7 +110,7 @@ def rasterized(rasterizer: Rasterizer, view: Camera) -> Lists:
             shapes.astype(np.float64),
             wide,
             device.download(prepared.offsets, (prepared.tiles + 1,), np.uint32),
-            device.download(prepared.intersections, (prepared.intersection_count,), np.uint32),
+            device.download(prepared.intersections, (prepared.capacity,), np.uint32),
             image.reshape(-1, 3).astype(np.float64),
             transmittance.ravel().astype(np.float64),
         )

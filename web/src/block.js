@@ -236,7 +236,9 @@ export class Decoder {
     }
     if (crowd !== crowded || leafLevels.length !== singles) refuse("positions: the octree's leaves do not match its multiplicities and tails");
     if (total !== splats || few) refuse(`positions: the octree holds ${total} splats, the header says ${splats}`);
-    if (leafLevels.some((level) => level > depth)) refuse(`positions: a leaf lies below the octree's deepest level ${depth}`);
+    let deepest = 0;
+    for (const level of leafLevels) if (level > deepest) deepest = level;
+    if (deepest > depth) refuse(`positions: a leaf lies below the octree's deepest level ${depth}`);
     const multiplicities = this.put(counts), means = this.reserve(12 * splats), tail = this.put(tails);
     const lengths = c.potr_leaves(
       ...streams, depth, this.put(leafLevels), multiplicities, splats, means,

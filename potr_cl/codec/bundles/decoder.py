@@ -19,7 +19,8 @@ from potr_cl.codec.bundles.ranges import Words, decode_stream, integer_type
 from potr_cl.codec.bundles.sections import MAIN, ORDER, ROTATION, Section
 from potr_cl.codec.bundles.streams import LOWEST, band, check_end, differences, no_words_left, step_terms, streams_of
 from potr_cl.codec.native.bundles import FINE, TOO_FEW_WORDS, BundledFile
-from potr_cl.codec.native.library import Functions, vectors
+from potr_cl.codec.native.declarations import CFunctions
+from potr_cl.codec.native.library import vectors
 from potr_cl.codec.native.table import definition
 from potr_cl.codec.sections import Property
 from potr_cl.codec.steps.rule import ColourSteps
@@ -86,19 +87,11 @@ class Reader:
 
     @cached_property
     def steps(self) -> ColourSteps | None:
-        """The steps of colours.
-
-        Raises:
-            DataError: damaged.
-        """
+        """The steps of colours. Raises DataError if damaged."""
         return self._open_steps()
 
     def section(self, key: Property) -> Section | None:
-        """A section; None if the file has none.
-
-        Raises:
-            DataError: damaged.
-        """
+        """A section; None if the file has none. Raises DataError if damaged."""
         if key not in self._sections:
             found = self._open_section(key)
             self._sections[key] = None if found is None else Section(key, found[0], self.bundles, found[1])
@@ -117,7 +110,12 @@ class Reader:
         file = self.bundled_file(wanted)
         if file is not None:
             work = file.work()
-            return joined([_levels_of(self, file, bundle, wanted, work) for bundle in range(first, last)])
+            parts = []
+            for bundle in range(first, last):
+                said, number, levels = file.levels(bundle, wanted.sections, wanted.rotations, work)
+                check_said(self, said, number)
+                parts.append(levels)
+            return joined(parts)
         run = _Run(self, first, last, wanted)
         for key in wanted.keys:
             run.decode(key)
@@ -125,11 +123,7 @@ class Reader:
         return run.levels
 
     def bundled_file(self, wanted: Wanted = EVERYTHING) -> BundledFile | None:
-        """What the native path decodes bundles from; None where NumPy is to be taken.
-
-        Raises:
-            DataError: damaged.
-        """
+        """What the native path decodes bundles from; None where NumPy is to be taken. Raises DataError if damaged."""
         # By whatever path, they are looked at before anything is decoded.
         sections = {ORDER.index(key): self.section(key) for key in wanted.keys}
         steps = self.steps if wanted.sections > 2 else None
@@ -152,7 +146,7 @@ def bundled_file(
 
 
 def _bundled_file_by_c(
-    functions: Functions,
+    c: CFunctions,
     splats: int,
     sections: Mapping[int, Section | None],
     steps: ColourSteps | None,
@@ -162,8 +156,7 @@ def _bundled_file_by_c(
     if not all(section.fits for section in there.values()):
         return NotImplemented
     if not kept:
-        words = {number: section.for_native() for number, section in there.items()}
-        kept.append(functions.bundled_file(splats, words, steps, vectors()))
+        kept.append(BundledFile(c, splats, there, steps, vectors()))
     return kept[0]
 
 
@@ -321,32 +314,8 @@ def _items(masks: NDArray[np.uint8], width: int) -> tuple[NDArray[np.int32], NDA
     return splat, places.astype(np.uint8)
 
 
-def _levels_of(reader: Reader, file: BundledFile, bundle: int, wanted: Wanted, work: NDArray[np.uint8]) -> Levels:
-    """A bundle's levels by the native path."""
-    said, number, found = file.integers(bundle, wanted.sections, wanted.rotations, work)
-    check_said(reader, said, number)
-    levels = Levels(bundle * BUNDLE, min((bundle + 1) * BUNDLE, reader.bundles.splats), found.opacities)
-    if wanted.sections > 1:
-        levels.scales = list(found.scales)
-    if wanted.sections > 2:
-        levels.dc = list(found.dc)
-    if wanted.rotations:
-        levels.rotations = list(found.rotations)
-    ends = np.cumsum((0, *found.items))
-    for k, key in enumerate(MAIN[3 : wanted.sections]):
-        if reader.section(key) is not None:
-            own = slice(ends[k], ends[k + 1])
-            splats = found.splats[own].astype(np.int32)
-            levels.ac.append(Items(splats, found.coefficients[own], found.channels[:, own]))
-    return levels
-
-
 def check_said(reader: Reader, said: int, number: int) -> None:
-    """What the native path says of a bundle, and of the section at fault.
-
-    Raises:
-        DataError: damaged.
-    """
+    """What the native path says of a bundle, and of the section at fault. Raises DataError if damaged."""
     if said == FINE:
         return
     section = reader.section(ORDER[number])

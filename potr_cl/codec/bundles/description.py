@@ -115,11 +115,7 @@ def read_models(raw: bytes, read: int, most_tokens: Sequence[int], what: str) ->
 
 
 def inflate(stored: memoryview, most: int, what: str) -> bytes:
-    """A stored description of at most ``most`` bytes.
-
-    Raises:
-        DataError: damaged.
-    """
+    """A stored description of at most ``most`` bytes. Raises DataError if damaged."""
     try:
         if not 0 <= zstandard.get_frame_parameters(stored).content_size <= most:
             raise DataError(f"section '{what}' describes its contexts at an impossible length")

@@ -38,10 +38,8 @@ from potr_cl.codec.bundles.streams import (
     streams_of,
     tokens_of,
 )
-from potr_cl.codec.native.bundles import fits
 from potr_cl.codec.native.bundles_encode import BundleEncoder
-from potr_cl.codec.native.bundles_encode import Model as NativeModel
-from potr_cl.codec.native.library import Functions
+from potr_cl.codec.native.declarations import CFunctions, fits
 from potr_cl.codec.native.table import definition
 from potr_cl.codec.sections import Property
 from potr_cl.host.threads import Run
@@ -54,9 +52,7 @@ _FEW = 1 << 15
 
 
 def encode(
-    values: Mapping[Property, Values],
-    classes: NDArray[np.int8],
-    run: Run = map,
+    values: Mapping[Property, Values], classes: NDArray[np.int8], run: Run = map
 ) -> dict[Property, bytes] | None:
     """Code all integers of splats that a file holds.
 
@@ -203,14 +199,12 @@ def _mapped(values: I64) -> I64:
 
 I32 = NDArray[np.int32]
 
-#: Names of the sections of an item a splat.
-_DENSE = {"opacity": MAIN[0], "scales": MAIN[1], "dc": MAIN[2], "rotations": ROTATION}
 #: Of a stream without an item.
-_NOTHING = NativeModel(np.zeros(256, np.uint8), np.full((1, 1), TOTAL, np.uint16))
+_NOTHING = Model(np.zeros(256, np.uint8), np.full((1, 1), TOTAL))
 
 
 def encode_natively(
-    functions: Functions,
+    c: CFunctions,
     values: Mapping[Property, Sequence[NDArray[np.integer]]],
     classes: NDArray[np.int8],
     known: frozenset[Property],
@@ -229,16 +223,7 @@ def encode_natively(
         for stream in own
     ]
     first_of_section = np.cumsum([0, *map(len, of_section)]).tolist()
-    of_degrees = [(3 * key.degree**2, section) for key, section in values.items() if key.degree]
-    encoder = functions.bundle_encoder(
-        bundles.splats,
-        {name: values[key] for name, key in _DENSE.items() if key in values},
-        {index - 3 + k: stream for index, section in of_degrees for k, stream in enumerate(section)},
-        [stream.sizes for stream in streams],
-        [len(stream.terms) for stream in streams],
-        [stream.coefficients for stream in streams],
-        np.ascontiguousarray(classes),
-    )
+    encoder = BundleEncoder(c, values, streams, np.ascontiguousarray(classes))
     at_least = samples_of_bundle(bundles.number)
     deque(run(lambda bundle: encoder.survey(bundle, at_least), range(bundles.number)), 0)
     numbers = [
@@ -250,20 +235,14 @@ def encode_natively(
     alphabets = tokens_of(encoder.largest().astype(np.int64)).astype(int) + 1
     jobs = enumerate(alphabets.tolist())
     found = run(lambda job: _fitted_model(encoder, *job), jobs)
-    models = [
-        model if own is None else NativeModel(own.classes, own.frequencies.astype(np.uint16))
-        for model, own in zip(found, without, strict=True)
-    ]
+    models = [model if own is None else own.model for model, own in zip(found, without, strict=True)]
     encoder.take_models(models)
     coded = list(run(encoder.code, range(bundles.number)))
     fitted = [
-        own or Fitted(stream, some, Model(model.classes, model.frequencies.astype(np.int64)))
+        own or Fitted(stream, some, model)
         for stream, some, model, own in zip(streams, numbers, models, without, strict=True)
     ]
-    states = {
-        MAIN[0]: [bundle.states for bundle in coded],
-        ROTATION: [bundle.rotation_states for bundle in coded],
-    }
+    states = {MAIN[0]: [bundle.states for bundle in coded], ROTATION: [bundle.rotation_states for bundle in coded]}
 
     def section(number: int) -> bytes:
         key = ORDER[number]
@@ -305,6 +284,6 @@ def _solved(stream: Stream, gram: I64) -> I64:
     return solve(gram[np.ix_(used, used)])
 
 
-def _fitted_model(encoder: BundleEncoder, number: int, alphabet: int) -> NativeModel:
+def _fitted_model(encoder: BundleEncoder, number: int, alphabet: int) -> Model:
     counts = encoder.counts(number, alphabet)
     return encoder.contexts(counts, alphabet, log_table()) if counts.any() else _NOTHING

@@ -79,11 +79,7 @@ class Words:
         np.copyto(self._first, self._last)
 
     def check(self) -> None:
-        """Check that there was a word whenever one was asked for.
-
-        Raises:
-            DataError: there was not.
-        """
+        """Check that there was a word whenever one was asked for. Raises DataError if there was not."""
         if (self._first > self._ends).any():
             raise no_words_left(self._what)
 
@@ -275,7 +271,4 @@ def intervals(fitted: Fitted) -> tuple[I64, I64]:
     """Frequency of each cell, and the sum of those below; the last cell leaves a state as it is."""
     frequencies = fitted.frequencies
     starts = np.cumsum(frequencies, axis=1) - frequencies
-    return (
-        np.append(frequencies[fitted.classes].ravel(), TOTAL),
-        np.append(starts[fitted.classes].ravel(), 0),
-    )
+    return (np.append(frequencies[fitted.classes].ravel(), TOTAL), np.append(starts[fitted.classes].ravel(), 0))

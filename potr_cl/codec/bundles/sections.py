@@ -18,7 +18,7 @@ from potr_cl.codec.bundles.description import Fitted, read_description, write_de
 from potr_cl.codec.bundles.layout import Bundles
 from potr_cl.codec.bundles.ranges import Words
 from potr_cl.codec.bundles.streams import LOWEST, largest_integer, streams_of
-from potr_cl.codec.native.bundles import SectionWords, StreamModel, fits
+from potr_cl.codec.native.declarations import fits
 from potr_cl.codec.sections import SH, Property
 from potr_cl.errors import DataError
 
@@ -77,22 +77,6 @@ class Section:
     def fits(self) -> bool:
         """Whether the native path can take its integers; real files' are narrow enough by far."""
         return all(fits(largest_integer(fitted.alphabet - 1)) for fitted in self.streams)
-
-    def for_native(self) -> SectionWords:
-        """What the native path takes of it."""
-        models = [
-            StreamModel(
-                fitted.classes,
-                fitted.frequencies,
-                fitted.stream.sizes,
-                fitted.terms.tolist(),
-                fitted.biases.tolist(),
-                fitted.recent,
-                fitted.constant,
-            )
-            for fitted in self.streams
-        ]
-        return SectionWords(models, self.words, self.counts, self.states)
 
     def _damaged(self, how: str) -> DataError:
         return DataError(f"section '{self.what}' {how}")

@@ -19,5 +19,5 @@ It gives the same bits as the NumPy modules around it, which are its definition 
 ``module.c``          nothing: it makes a Python module of the library, so that it is built and found as one
 ====================  =========================================================================================
 
-:mod:`potr_cl.codec.native.library` gives each C function NumPy arrays whose sizes it has checked.
+The modules beside them give each C function NumPy arrays whose sizes they have checked; ``library`` finds the library.
 """

@@ -7,15 +7,20 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.native.declarations import address
+from potr_cl.codec.bundles.description import Fitted
+from potr_cl.codec.bundles.layout import Items, Levels
+from potr_cl.codec.bundles.sections import Section
+from potr_cl.codec.native.declarations import LARGEST, CFunctions, address
 from potr_cl.codec.steps.rule import KNOTS, ColourSteps
 
+I8 = NDArray[np.int8]
+I32 = NDArray[np.int32]
 U8 = NDArray[np.uint8]
 U32 = NDArray[np.uint32]
 
@@ -25,8 +30,6 @@ _WEIGHTS, _BIASES = 12, 8
 #: Where the streams of each section begin, in the order of decoding, and how many there are; rotations come last.
 _STREAMS = (0, 1, 4, 7, 12, 17, 22, 25)
 SECTIONS, STREAMS = len(_STREAMS) - 1, _STREAMS[-1]
-#: Integers of a bundle are below this in magnitude, so that sums of three fit.
-_LARGEST = 1 << 29
 _COEFFICIENTS = 15
 
 _POINTER, _WORD, _NUMBER = ctypes.c_void_p, ctypes.c_uint64, ctypes.c_int32
@@ -102,65 +105,40 @@ def native_steps(steps: ColourSteps, splats: int) -> _Steps:
     )
 
 
-@dataclass(frozen=True)
-class StreamModel:
-    """What C takes of a stream.
+def step_classes(c: CFunctions, steps: ColourSteps, scales: I32, opacities: I32) -> tuple[I8, I8]:
+    """(N,) classes of the steps of DC, and of AC.
 
-    Attributes:
-        classes: (256,) uint8 context of each expected size, below the number of contexts.
-        frequencies: (contexts, tokens), at most 32 and 252.
-        sizes: (tokens,) of the tokens, below 2^15; as many as there are frequencies, or more.
-        terms: weights of its terms, at most 12.
-        biases: by coefficient, at most 8.
-        recent, constant: weight of the recent sizes, and what is added.
+    Args:
+        steps: of colours.
+        scales: (3, N) levels, 0 to 2^29 - 1.
+        opacities: (N,) levels, 0 to 2^29 - 1.
     """
-
-    classes: U8
-    frequencies: NDArray[np.integer]
-    sizes: NDArray[np.integer]
-    terms: Sequence[int]
-    biases: Sequence[int]
-    recent: int
-    constant: int
-
-
-@dataclass(frozen=True)
-class SectionWords:
-    """What C takes of a section.
-
-    Attributes:
-        models: of its streams.
-        words: bytes of 16-bit words.
-        counts: (bundles,) int64 words of each.
-        states: (lanes of all bundles,) uint32, for the sections that begin a chain.
-    """
-
-    models: Sequence[StreamModel]
-    words: U8
-    counts: NDArray[np.int64]
-    states: U32
+    n = len(opacities)
+    for levels in (scales, opacities):
+        if int(levels.min(initial=0)) < 0 or int(levels.max(initial=0)) >= LARGEST:
+            raise TypeError("the native path was given levels that are negative or too large")
+    dc, ac = np.empty((2, n), np.int8)
+    c["potr_steps_classes"](
+        ctypes.byref(native_steps(steps, n)),
+        address(scales, np.int32, 3 * n),
+        address(opacities, np.int32, n),
+        n,
+        address(dc, np.int8, n, True),
+        address(ac, np.int8, n, True),
+    )
+    return dc, ac
 
 
-@dataclass(frozen=True)
-class BundleIntegers:
-    """Integers of a bundle's n splats, int32; the first ones only, where no others were asked for.
-
-    Attributes:
-        opacities: (n,).
-        scales, rotations, dc: (3, n); of DC what its prediction has left.
-        splats, coefficients: (K,) of the AC coefficients that are not 0, degree by degree.
-        channels: (3, K).
-        items: of each degree.
-    """
-
-    opacities: NDArray[np.int32]
-    scales: NDArray[np.int32]
-    rotations: NDArray[np.int32]
-    dc: NDArray[np.int32]
-    splats: NDArray[np.uint16]
-    coefficients: U8
-    channels: NDArray[np.int32]
-    items: tuple[int, int, int]
+def colour_classes(
+    c: CFunctions, steps: ColourSteps, scales: Sequence[NDArray[np.integer]], opacities: NDArray[np.integer],
+    start: int = 0,
+) -> Any:  # fmt: skip
+    """The twin of :func:`potr_cl.codec.steps.rule.colour_classes`, which cannot know this module."""
+    group = 1 << steps.group_bits
+    if start % group or any(levels.dtype.itemsize > 2 for levels in (*scales, opacities)):
+        return NotImplemented
+    own = replace(steps, groups=steps.groups[start // group :][: -(-len(opacities) // group)])
+    return step_classes(c, own, np.stack(scales, dtype=np.int32), opacities.astype(np.int32))
 
 
 #: What C says of a bundle, and the section at fault.
@@ -171,7 +149,7 @@ class BundledFile:
     """A file's sections, from which bundles are decoded one by one, by any thread.
 
     Args:
-        functions: of the library.
+        c: the library's functions.
         splats: N of the file.
         sections: by their place in the order of decoding (opacity, scale, DC, degrees 1 to 3, rotation); opacity's at
             least.
@@ -184,25 +162,25 @@ class BundledFile:
 
     def __init__(
         self,
-        functions: Mapping[str, Any],
+        c: CFunctions,
         splats: int,
-        sections: Mapping[int, SectionWords],
+        sections: Mapping[int, Section],
         steps: ColourSteps | None = None,
         vectors: bool = True,
     ) -> None:
-        self._c = functions
-        self._vectors = bool(vectors and functions["potr_bundles_vectors"]())
+        self._c = c
+        self._vectors = bool(vectors and c["potr_bundles_vectors"]())
         self.splats = splats
         self._kept: list[NDArray[Any]] = []
         self._file = _File()
         self._file.splats = splats
         bundles, lanes = -(-splats // _BUNDLE), splats // _BUNDLE * (_BUNDLE // _LANE) + -(-(splats % _BUNDLE) // _LANE)
-        models: dict[int, StreamModel] = {}
+        models: dict[int, Fitted] = {}
         for number, section in sections.items():
             first, end = _STREAMS[number : number + 2]
-            if len(section.models) != end - first or len(section.counts) != bundles or int(section.counts.min()) < 0:
+            if len(section.streams) != end - first or len(section.counts) != bundles or int(section.counts.min()) < 0:
                 raise TypeError("the native path was given a section without all of its parts")
-            models.update(enumerate(section.models, start=first))
+            models.update(enumerate(section.streams, start=first))
             starts = np.zeros(bundles + 1, np.uint64)
             np.cumsum(section.counts, out=starts[1:])
             self._file.words[number] = self._keep(section.words, np.uint8, 2 * int(starts[-1]))
@@ -222,7 +200,7 @@ class BundledFile:
         self._kept.append(array)
         return address(array, dtype, number, writable)
 
-    def _describe(self, models: Mapping[int, StreamModel]) -> None:
+    def _describe(self, models: Mapping[int, Fitted]) -> None:
         """Tell C of streams, all at once: each call of NumPy takes as long as what C does for a stream."""
         number = len(models)
         contexts = [len(model.frequencies) for model in models.values()]
@@ -233,10 +211,10 @@ class BundledFile:
         at_slots = self._keep(slots, np.uint8, len(slots), True)
         at_intervals = self._keep(intervals, np.uint32, len(intervals), True)
         for row, model in zip(sizes, models.values(), strict=True):
-            alphabet = model.frequencies.shape[1]
-            if alphabet > min(len(model.sizes), _TOKENS):
+            alphabet, own = model.alphabet, model.stream.sizes
+            if alphabet > min(len(own), _TOKENS):
                 raise TypeError("the native path was given tokens without sizes")
-            row[:alphabet] = model.sizes[:alphabet]
+            row[:alphabet] = own[:alphabet]
         if (classes.reshape(number, 256).max(axis=1) >= contexts).any():
             raise TypeError("the native path was given contexts without frequencies")
         at_sizes, at_classes = self._keep(sizes, np.int16, sizes.size), self._keep(classes, np.uint8, 256 * number)
@@ -244,7 +222,7 @@ class BundledFile:
         for k, (place, model) in enumerate(models.items()):
             if len(model.terms) > _WEIGHTS or len(model.biases) > _BIASES:
                 raise TypeError("the native path was given too many weights")
-            to, alphabet = self._file.streams[place], model.frequencies.shape[1]
+            to, alphabet = self._file.streams[place], model.alphabet
             to.slots, to.intervals = at_slots, at_intervals
             to.sizes, to.classes = at_sizes + 2 * _TOKENS * k, at_classes + 256 * k
             frequencies = np.ascontiguousarray(model.frequencies, np.uint16)
@@ -253,8 +231,8 @@ class BundledFile:
                 raise TypeError("the native path was given frequencies that do not add up")
             # The next stream's begin where the bytes too many of this one would be.
             at_slots, at_intervals = at_slots + contexts[k] * _TOTAL, at_intervals + 4 * contexts[k] * _TOKENS
-            to.weights[: len(model.terms)] = model.terms
-            to.biases[: len(model.biases)] = model.biases
+            to.weights[: len(model.terms)] = model.terms.tolist()
+            to.biases[: len(model.biases)] = model.biases.tolist()
             to.recent, to.constant, to.alphabet = model.recent, model.constant, alphabet
             to.by_vectors = bool(small[k])
 
@@ -266,7 +244,7 @@ class BundledFile:
         self._c["potr_bundles_begin"](address(aligned, np.uint8, len(aligned), True))
         return aligned
 
-    def integers(self, bundle: int, sections: int, rotations: bool, work: U8) -> tuple[int, int, BundleIntegers]:
+    def levels(self, bundle: int, sections: int, rotations: bool, work: U8) -> tuple[int, int, Levels]:
         """Decode a bundle.
 
         Args:
@@ -276,7 +254,7 @@ class BundledFile:
             work: of :meth:`work`.
 
         Returns:
-            What C says, the section at fault, and the integers, if nothing is.
+            What C says, the section at fault, and the integers, int32, if nothing is.
         """
         n = self.check(bundle, sections, rotations)
         integers = [np.zeros((k, n), np.int32) for k in (1, 3, 3, 3)]
@@ -290,20 +268,19 @@ class BundledFile:
         )
         section = ctypes.c_int()
         said = self._c["potr_bundles_levels"](
-            ctypes.byref(self._file),
-            bundle,
-            sections,
-            rotations,
-            address(work, np.uint8, len(work), True),
-            ctypes.byref(out),
-            ctypes.byref(section),
-        )
+            ctypes.byref(self._file), bundle, sections, rotations, address(work, np.uint8, len(work), True),
+            ctypes.byref(out), ctypes.byref(section),
+        )  # fmt: skip
         opacities, scales, turned, dc = integers
-        items = (int(out.items[0]), int(out.items[1]), int(out.items[2]))
-        number = sum(items)
-        found = BundleIntegers(
-            opacities[0], scales, turned, dc, splats[:number], coefficients[:number], channels[:, :number], items
-        )
+        found = Levels(bundle * _BUNDLE, bundle * _BUNDLE + n, opacities[0])
+        found.scales = list(scales) if sections > 1 else None
+        found.dc = list(dc) if sections > 2 else None
+        found.rotations = list(turned) if rotations else None
+        ends = np.cumsum((0, *out.items))
+        for degree in range(sections - 3):
+            if self._file.words[3 + degree]:
+                own = slice(ends[degree], ends[degree + 1])
+                found.ac.append(Items(splats[own].astype(np.int32), coefficients[own], channels[:, own]))
         return said, section.value, found
 
     @property
@@ -316,16 +293,7 @@ class BundledFile:
         return max((number - 2 for number in range(3, sections) if self._file.words[number]), default=0)
 
     def check(self, bundle: int, sections: int, rotations: bool) -> int:
-        """Splats of a bundle, of which so much can be decoded.
-
-        Raises:
-            TypeError: it cannot.
-        """
+        """Splats of a bundle, of which so much can be decoded. Raises TypeError if it cannot."""
         if not 0 <= bundle * _BUNDLE < self.splats or not 1 <= sections < SECTIONS or (rotations and sections < 2):
             raise TypeError("the native path was asked for what is not there")
         return min(self.splats - bundle * _BUNDLE, _BUNDLE)
-
-
-def fits(largest: int) -> bool:
-    """Whether C can take integers of at most some magnitude."""
-    return largest < _LARGEST

@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.codec.bundles.description import Model
+from potr_cl.codec.bundles.streams import Stream
 from potr_cl.codec.native.bundles import SECTIONS, STREAMS
-from potr_cl.codec.native.declarations import address
+from potr_cl.codec.native.declarations import CFunctions, address
+from potr_cl.codec.sections import SH, Property
+from potr_cl.host.threads import Spare
 
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]
 U16 = NDArray[np.uint16]
 U32 = NDArray[np.uint32]
-T = TypeVar("T")
 
 #: Rows of the sums of products, and numbers of a stream.
 COLUMNS, NUMBERS = 22, 21
@@ -58,19 +60,6 @@ class _Stream(ctypes.Structure):
 
 
 @dataclass(frozen=True)
-class Model:
-    """What was fitted to a stream, but for its numbers.
-
-    Attributes:
-        classes: (256,) context of each expected size.
-        frequencies: (contexts, alphabet) uint16.
-    """
-
-    classes: U8
-    frequencies: U16
-
-
-@dataclass(frozen=True)
 class CodedBundle:
     """A bundle as it is stored.
 
@@ -85,79 +74,56 @@ class CodedBundle:
     rotation_states: U32
 
 
-class _Pool(Generic[T]):
-    """Room that threads work in: as many as there are threads at work."""
-
-    def __init__(self, make: Callable[[], T]) -> None:
-        self._make = make
-        self._free: list[T] = []
-
-    @contextmanager
-    def taken(self) -> Iterator[T]:
-        try:
-            room = self._free.pop()
-        except IndexError:
-            room = self._make()
-        yield room
-        self._free.append(room)
-
-    def all(self) -> list[T]:
-        """All that was made, while nobody is at work."""
-        return self._free
-
-
 class BundleEncoder:
     """A file's integers, whose bundles any thread may go through.
 
     Args:
-        functions: of the library.
-        splats: N.
-        dense: integers of opacity, scales, rotations and DC, int32 (N,) each, by the names "opacity", "scales",
-            "rotations", "dc"; sections that are left out are 0.
-        ac: by coefficient and channel, from 0 to 44; whole degrees.
-        sizes: (tokens,) of the tokens of each stream.
-        terms, coefficients: how many each has.
+        c: the library's functions.
+        values: integers of each section, int32 (N,) each; opacities at least. Sections that are left out are 0.
+        streams: of all sections, in the order of decoding.
         classes: (N,) of the steps of DC, -32 to 31.
     """
 
     def __init__(
         self,
-        functions: Mapping[str, Any],
-        splats: int,
-        dense: Mapping[str, Sequence[I32]],
-        ac: Mapping[int, I32],
-        sizes: Sequence[NDArray[np.integer]],
-        terms: Sequence[int],
-        coefficients: Sequence[int],
+        c: CFunctions,
+        values: Mapping[Property, Sequence[I32]],
+        streams: Sequence[Stream],
         classes: NDArray[np.int8],
     ) -> None:
-        self._c = functions
-        self._splats = splats
+        self._c = c
+        (opacity,) = values[Property.OPACITY]
+        self._splats = splats = len(opacity)
         self._kept: list[NDArray[Any]] = []
         self._integers = _Integers()
         self._integers.splats = splats
-        (opacity,) = dense["opacity"]
         self._integers.opacity = self._keep(opacity, np.int32, splats)
         self._integers.classes = self._keep(classes, np.int8, splats)
-        for name in ("scales", "rotations", "dc"):
-            for k, values in enumerate(dense.get(name, ())):
-                getattr(self._integers, name)[k] = self._keep(values, np.int32, splats)
-        for k, values in ac.items():
-            self._integers.ac[k] = self._keep(values, np.int32, splats)
-        if any(len({k in ac for k in degree}) > 1 for degree in (range(9), range(9, 24), range(24, 45))):
-            raise TypeError("the native path was given a part of a degree")
+        places = {
+            Property.SCALE: (self._integers.scales, 0),
+            Property.ROTATION: (self._integers.rotations, 0),
+            **{prop: (self._integers.ac, 3 * degree**2 - 3) for degree, prop in enumerate(SH)},
+            Property.SH0: (self._integers.dc, 0),
+        }
+        for prop, (to, first) in places.items():
+            own = values.get(prop, ())
+            if own and len(own) != prop.streams:
+                raise TypeError("the native path was given a part of a section")
+            for k, integers in enumerate(own, start=first):
+                to[k] = self._keep(integers, np.int32, splats)
         self._streams = (_Stream * STREAMS)()
-        self._work = _Pool(lambda: np.zeros(functions["potr_bundles_encoding"](), np.uint8))
-        self._sums = _Pool(lambda: (np.zeros((STREAMS, COLUMNS, COLUMNS), np.int64), np.zeros(STREAMS, np.uint32)))
-        self._counts = _Pool(lambda: np.zeros((STREAMS, _TOKENS, _TOKENS), np.uint32))
-        self._words = _Pool(lambda: np.empty(_WORDS * _BUNDLE + 2, np.uint16))
-        for to, size, number, some in zip(self._streams, sizes, terms, coefficients, strict=True):
+        self._work = Spare(lambda: np.zeros(c["potr_bundles_encoding"](), np.uint8))
+        self._sums = Spare(lambda: (np.zeros((STREAMS, COLUMNS, COLUMNS), np.int64), np.zeros(STREAMS, np.uint32)))
+        self._counts = Spare(lambda: np.zeros((STREAMS, _TOKENS, _TOKENS), np.uint32))
+        self._words = Spare(lambda: np.empty(_WORDS * _BUNDLE + 2, np.uint16))
+        for place, stream in zip(self._streams, streams, strict=True):
+            number, some = len(stream.terms), stream.coefficients
             if number > 12 or number + some > NUMBERS - 2:
                 raise TypeError("the native path was given too many terms")
-            all_sizes = np.zeros(_TOKENS, np.int16)
-            all_sizes[: len(size)] = size
-            to.sizes = self._keep(all_sizes, np.int16, _TOKENS)
-            to.terms, to.coefficients = number, some
+            sizes = np.zeros(_TOKENS, np.int16)
+            sizes[: len(stream.sizes)] = stream.sizes
+            place.sizes = self._keep(sizes, np.int16, _TOKENS)
+            place.terms, place.coefficients = number, some
 
     def _keep(self, array: NDArray[Any], dtype: type[np.generic], number: int) -> int:
         self._kept.append(array)
@@ -237,7 +203,7 @@ class BundleEncoder:
             address(classes, np.uint8, _TOKENS, True),
             address(frequencies, np.uint16, len(frequencies), True),
         )
-        return Model(classes, frequencies[: number * alphabet].reshape(number, alphabet))
+        return Model(classes, frequencies[: number * alphabet].reshape(number, alphabet).astype(np.int64))
 
     def take_models(self, models: Sequence[Model]) -> None:
         """What :meth:`code` codes with; every token of the counted bundles has a frequency."""

@@ -5,7 +5,8 @@ takes them: where their numbers are (:func:`address`).
 from __future__ import annotations
 
 import ctypes
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +16,7 @@ _REAL = ctypes.c_float
 
 #: Argument types and result of each function, in the order of the C declarations.
 _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
-    "potr_octree_levels": (
-        _NUMBER,
-        [_POINTER, _SIZE, _POINTER, _SIZE, _NUMBER, _NUMBER, _POINTER, _POINTER, _POINTER],
-    ),
+    "potr_octree_levels": (_NUMBER, [_POINTER, _SIZE, _POINTER, _SIZE, _NUMBER, _NUMBER, _POINTER, _POINTER, _POINTER]),
     "potr_octree_cut": (_SIZE, []),
     "potr_octree_cuts": (
         _SIZE,
@@ -38,10 +36,7 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
     "potr_octree_sizes": (_SIZE, []),
     "potr_octree_survey": (None, [_POINTER, _SIZE, _SIZE, _NUMBER, *[_POINTER] * 3]),
     "potr_octree_streams": (None, [_POINTER, _SIZE, _SIZE, _NUMBER, *[_POINTER] * 8]),
-    "potr_octree_decoded": (
-        None,
-        [_POINTER, _SIZE, _SIZE, _NUMBER, *[_POINTER] * 4, _SIZE, _SIZE, _POINTER],
-    ),
+    "potr_octree_decoded": (None, [_POINTER, _SIZE, _SIZE, _NUMBER, *[_POINTER] * 4, _SIZE, _SIZE, _POINTER]),
     "potr_bundles_table": (_NUMBER, [_POINTER, _SIZE, _SIZE, *[_POINTER] * 3]),
     "potr_bundles_vectors": (_NUMBER, []),
     "potr_bundles_work": (_SIZE, []),
@@ -96,7 +91,11 @@ _SHORT = {
 }
 
 
-def declared(path: str) -> dict[str, Any]:
+#: The functions of the library by name. They may be called from several threads at a time.
+CFunctions: TypeAlias = "Mapping[str, Any]"
+
+
+def declared(path: str) -> CFunctions:
     """The functions of a library by name, told what they take.
 
     Raises:
@@ -109,6 +108,15 @@ def declared(path: str) -> dict[str, Any]:
         functions[name] = (keeping if name in _SHORT else library)[name]
         functions[name].restype, functions[name].argtypes = result, arguments
     return functions
+
+
+#: Integers of splats are below this in magnitude, so that sums of three fit.
+LARGEST = 1 << 29
+
+
+def fits(largest: int) -> bool:
+    """Whether C can take integers of at most some magnitude."""
+    return largest < LARGEST
 
 
 def address(array: NDArray[Any], dtype: type[np.generic], number: int, writable: bool = False) -> int:

@@ -1,20 +1,19 @@
-"""Octrees by C: :class:`OctreeFunctions` finds a tree sound, :class:`Walk` finds its leaves' centres, part by part
-(octree.c); :class:`OctreeBuilding` makes octrees of centres (octree_build.c).
+"""Octrees by C: :func:`tree` finds a tree sound, :class:`Walk` finds its leaves' centres, part by part (octree.c); the
+other functions make octrees of centres (octree_build.c).
 
-C trusts what it is told: that is made here, of arrays whose sizes are checked.
+C trusts what it is told: that is made here, of arrays whose sizes are checked. All gives the same bits as NumPy, may be
+called from several threads at a time, and leaves the interpreter free.
 """
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.native.declarations import address
+from potr_cl.codec.native.declarations import CFunctions, address
 from potr_cl.host.threads import Run
 from potr_cl.model.order import are_many, over_ranges
 
@@ -31,7 +30,7 @@ _DEEPEST_NARROW = 32
 
 @dataclass(frozen=True)
 class Tree:
-    """A tree that was found to be sound, by :meth:`OctreeFunctions.tree`.
+    """A tree that was found to be sound, by :func:`tree`.
 
     Attributes:
         occupancy, several: its streams.
@@ -48,36 +47,22 @@ class Tree:
     crowded: int
 
 
-class OctreeFunctions:
-    """What the library offers for octrees.
-
-    Args:
-        functions: of the library.
-    """
-
-    def __init__(self, functions: Mapping[str, Any]) -> None:
-        self._c = functions
-
-    def tree(self, occupancy: U8, several: U8, depth: int, crowded_root: bool) -> Tree | None:
-        """Check a tree; None if its streams contradict each other. ``depth`` is 0 to 52."""
-        levels = np.empty(_TREE_WORDS, np.uint64)
-        singles, crowded = ctypes.c_uint64(), ctypes.c_uint64()
-        wrong = self._c["potr_octree_levels"](
-            address(occupancy, np.uint8, len(occupancy)),
-            len(occupancy),
-            address(several, np.uint8, len(several)),
-            len(several),
-            depth,
-            crowded_root,
-            address(levels, np.uint64, _TREE_WORDS, True),
-            ctypes.byref(singles),
-            ctypes.byref(crowded),
-        )
-        return None if wrong else Tree(occupancy, several, depth, levels, singles.value, crowded.value)
-
-    def walk(self, tree: Tree, leaf_levels: U8, multiplicities: U64, splats: int, parts: int) -> Walk:
-        """A walk through a tree's leaves, see :class:`Walk`."""
-        return Walk(self._c, tree, leaf_levels, multiplicities, splats, parts)
+def tree(c: CFunctions, occupancy: U8, several: U8, depth: int, crowded_root: bool) -> Tree | None:
+    """Check a tree; None if its streams contradict each other. ``depth`` is 0 to 52."""
+    levels = np.empty(_TREE_WORDS, np.uint64)
+    singles, crowded = ctypes.c_uint64(), ctypes.c_uint64()
+    wrong = c["potr_octree_levels"](
+        address(occupancy, np.uint8, len(occupancy)),
+        len(occupancy),
+        address(several, np.uint8, len(several)),
+        len(several),
+        depth,
+        crowded_root,
+        address(levels, np.uint64, _TREE_WORDS, True),
+        ctypes.byref(singles),
+        ctypes.byref(crowded),
+    )
+    return None if wrong else Tree(occupancy, several, depth, levels, singles.value, crowded.value)
 
 
 class _Leaves(ctypes.Structure):
@@ -90,7 +75,7 @@ class Walk:
     First :meth:`leaves` of each part, in any order, then :meth:`check_tails`, then :meth:`centres` of each part.
 
     Args:
-        functions: of the library.
+        c: the library's functions.
         tree: sound.
         leaf_levels: one a leaf with a lone splat, none beyond the tree's depth.
         multiplicities: of the other leaves; with these there are ``splats``, N.
@@ -106,26 +91,20 @@ class Walk:
     """
 
     def __init__(
-        self,
-        functions: Mapping[str, Any],
-        tree: Tree,
-        leaf_levels: U8,
-        multiplicities: U64,
-        splats: int,
-        parts: int,
+        self, c: CFunctions, tree: Tree, leaf_levels: U8, multiplicities: U64, splats: int, parts: int
     ) -> None:
         if len(leaf_levels) and int(leaf_levels.max()) > tree.depth:
             raise TypeError("the native path was given leaves below the octree")
-        self._c, self._tree = functions, tree
+        self._c, self._tree = c, tree
         self._leaf_levels, self._multiplicities = leaf_levels, multiplicities
-        self._size = functions["potr_octree_cut"]()
+        self._size = c["potr_octree_cut"]()
         self._cuts = np.empty((parts + 1) * self._size // 8, np.uint64)
         self._levels_at = address(leaf_levels, np.uint8, tree.singles)
         self._multiplicities_at = address(multiplicities, np.uint64, tree.crowded)
         self._occupancy_at = address(tree.occupancy, np.uint8, len(tree.occupancy))
         self._several_at = address(tree.several, np.uint8, len(tree.several))
         self._cuts_at = address(self._cuts, np.uint64, len(self._cuts), True)
-        self.parts: int = functions["potr_octree_cuts"](
+        self.parts: int = c["potr_octree_cuts"](
             self._occupancy_at,
             len(tree.occupancy),
             self._several_at,
@@ -235,162 +214,160 @@ _DECODED = 1 << 15
 _COUNTED = 54  # of counts
 
 
-class OctreeBuilding:
-    """The same bits as NumPy gives. All may be called from several threads at a time, and leave the interpreter free.
+def bounds(c: CFunctions, means: F32, tolerance: F64) -> tuple[F64, F64, F64, float]:
+    """The least and the largest coordinates of (n, 3) centres, (3,) each; (n,) limits, and the least of them.
 
     Args:
-        functions: of the library, by name.
+        means: (n, 3). tolerance: (n,) or (1,); limits are these, but never finer than float32 holds a coordinate.
     """
+    n = len(means)
+    limit, found = np.empty(n), np.empty(7)
+    step = 0 if len(tolerance) == 1 else 1
+    c["potr_octree_bounds"](
+        address(means, np.float32, 3 * n),
+        n,
+        address(tolerance, np.float64, n if step else 1),
+        step,
+        address(limit, np.float64, n, True),
+        address(found, np.float64, 7, True),
+    )
+    return found[:3], found[3:6], limit, float(found[6])
 
-    def __init__(self, functions: Mapping[str, Any]) -> None:
-        self._c = functions
 
-    def bounds(self, means: F32, tolerance: F64) -> tuple[F64, F64, F64, float]:
-        """The least and the largest coordinates of (n, 3) centres, (3,) each; (n,) limits, and the least of them.
+def words(c: CFunctions, means: F32, low: F64, ratio: float, depth: int, run: Run = map) -> U64:
+    """(words, n) Morton words of (n, 3) centres, the most significant first, 21 levels a word.
 
-        Args:
-            means: (n, 3). tolerance: (n,) or (1,); limits are these, but never finer than float32 holds a coordinate.
-        """
-        n = len(means)
-        limit, found = np.empty(n), np.empty(7)
-        step = 0 if len(tolerance) == 1 else 1
-        self._c["potr_octree_bounds"](
-            address(means, np.float32, 3 * n),
+    Args:
+        means: none is below ``low`` (3,). ratio: cells of the deepest level in a unit of length. depth: 0 to 52.
+        run: shares the work out.
+    """
+    n, number = len(means), max(-(-depth // _LEVELS_A_WORD), 1)
+    words = np.empty((number, n), np.uint64)
+    points, corner = address(means, np.float32, 3 * n), address(low, np.float64, 3)
+    result = address(words, np.uint64, number * n, True)
+
+    def find(first: int) -> None:
+        some = min(_AT_A_TIME, n - first)
+        c["potr_octree_words"](
+            points + 12 * first, some, corner, ratio, 2.0**depth, depth, number, n, result + 8 * first
+        )
+
+    for _ in run(find, range(0, n, _AT_A_TIME)):
+        pass
+    return words
+
+
+def wanted(c: CFunctions, limit: F64, half_diagonal: float, depth: int) -> I8:
+    """(n,) levels of leaves for (n,) limits > 0; -1 where they depend on how a logarithm is rounded."""
+    levels = np.empty(len(limit), np.int8)
+    c["potr_octree_wanted"](
+        address(limit, np.float64, len(limit)),
+        len(limit),
+        half_diagonal,
+        depth,
+        address(levels, np.int8, len(limit), True),
+    )
+    return levels
+
+
+def order(c: CFunctions, words: U64, run: Run = map) -> tuple[I64, U64]:
+    """(n,) the order of (words, n) Morton words, equal ones as they stand; and the words in that order.
+
+    ``run`` shares the work on many out.
+    """
+    if not are_many(words.shape[1]):
+        return _order(c, words)
+    ordered = np.empty_like(words)
+
+    def finish(members: I64, place: int) -> None:
+        order, own = _order(c, np.ascontiguousarray(words[:, members]))
+        members[:] = members[order]
+        ordered[:, place : place + len(members)] = own
+
+    return over_ranges(words[0], finish, run), ordered
+
+
+def _order(c: CFunctions, words: U64) -> tuple[I64, U64]:
+    n = words.shape[1]
+    scratch = np.empty(int(c["potr_octree_sorting"]()), np.uint8)
+    order, other_order, other_keys = np.arange(n), np.empty(n, np.int64), np.empty(n, np.uint64)
+    for word in words[::-1]:
+        keys = word[order]
+        if c["potr_octree_sort"](
             n,
-            address(tolerance, np.float64, n if step else 1),
-            step,
-            address(limit, np.float64, n, True),
-            address(found, np.float64, 7, True),
-        )
-        return found[:3], found[3:6], limit, float(found[6])
+            address(scratch.view(np.uint64), np.uint64, scratch.size // 8, True),
+            address(keys, np.uint64, n, True),
+            address(order, np.int64, n, True),
+            address(other_keys, np.uint64, n, True),
+            address(other_order, np.int64, n, True),
+        ):
+            order, other_order, keys = other_order, order, other_keys
+    if len(words) == 1:  # the words came with their numbers
+        return order, keys[None]
+    return order, np.ascontiguousarray(words[:, order])
 
-    def words(self, means: F32, low: F64, ratio: float, depth: int, run: Run = map) -> U64:
-        """(words, n) Morton words of (n, 3) centres, the most significant first, 21 levels a word.
 
-        Args:
-            means: none is below ``low`` (3,). ratio: cells of the deepest level in a unit of length. depth: 0 to 52.
-            run: shares the work out.
-        """
-        n, number = len(means), max(-(-depth // _LEVELS_A_WORD), 1)
-        words = np.empty((number, n), np.uint64)
-        points, corner = address(means, np.float32, 3 * n), address(low, np.float64, 3)
-        result = address(words, np.uint64, number * n, True)
+def streams(c: CFunctions, words: U64, depth: int, order: I64, wanted: I8) -> tuple[U8, U8, U64, U8, U8]:
+    """Occupancy, several-flags, multiplicities, levels of leaves, and tails.
 
-        def find(first: int) -> None:
-            some = min(_AT_A_TIME, n - first)
-            self._c["potr_octree_words"](
-                points + 12 * first, some, corner, ratio, 2.0**depth, depth, number, n, result + 8 * first
-            )
+    Args:
+        words: (words, n) in the order of the leaves.
+        depth: 0 to 52, which the words reach.
+        order: (n,) number of each splat. wanted: (n,) levels by that number, 0 to ``depth``.
+    """
+    number, n = words.shape
+    _check(words, depth, order, wanted)
+    sizes = np.empty(3 * _COUNTED + 2, np.uint64)
+    if c["potr_octree_sizes"]() != sizes.nbytes:
+        raise TypeError("the native path counts in another way")
+    given = (
+        address(words, np.uint64, number * n), n, number, depth,
+        address(order, np.int64, n), address(wanted, np.int8, n), address(sizes, np.uint64, sizes.size, True),
+    )  # fmt: skip
+    c["potr_octree_survey"](*given)
+    nodes, children, tails = sizes[:-2].reshape(3, _COUNTED)
+    singles, packed = (int(size) for size in sizes[-2:])
+    longer = np.cumsum(tails[:0:-1])  # leaves whose tail has at least so many levels
+    occupancy = np.zeros(int(nodes.sum()), np.uint8)
+    several = np.zeros((int(children.sum()) + 7) // 8, np.uint8)
+    multiplicities, lengths = np.zeros(packed, np.uint64), np.zeros(singles, np.uint8)
+    planes = np.zeros(3 * int(((longer + np.uint64(7)) // np.uint64(8)).sum()), np.uint8)
+    c["potr_octree_streams"](
+        *given,
+        *(address(each, np.uint8, each.size, True) for each in (occupancy, several)),
+        address(multiplicities, np.uint64, packed, True),
+        *(address(each, np.uint8, each.size, True) for each in (lengths, planes)),
+    )
+    return occupancy, several, multiplicities, lengths, planes
 
-        for _ in run(find, range(0, n, _AT_A_TIME)):
-            pass
-        return words
 
-    def wanted(self, limit: F64, half_diagonal: float, depth: int) -> I8:
-        """(n,) levels of leaves for (n,) limits > 0; -1 where they depend on how a logarithm is rounded."""
-        levels = np.empty(len(limit), np.int8)
-        self._c["potr_octree_wanted"](
-            address(limit, np.float64, len(limit)),
-            len(limit),
-            half_diagonal,
-            depth,
-            address(levels, np.int8, len(limit), True),
-        )
-        return levels
+def decoded(
+    c: CFunctions, words: U64, depth: int, order: I64, wanted: I8, sides: F64, origin: F64, run: Run = map
+) -> F32:
+    """(n, 3) centres as a decoder of the streams finds them, in the order of the leaves.
 
-    def order(self, words: U64, run: Run = map) -> tuple[I64, U64]:
-        """(n,) the order of (words, n) Morton words, equal ones as they stand; and the words in that order.
+    Args:
+        words, depth, order, wanted: as of :func:`streams`.
+        sides: (depth + 1,) edges of the cells of each level.
+        origin: (3,).
+        run: shares the work out.
+    """
+    number, n = words.shape
+    _check(words, depth, order, wanted)
+    means = np.empty((n, 3), np.float32)
+    given = (
+        address(words, np.uint64, number * n), n, number, depth,
+        address(order, np.int64, n), address(wanted, np.int8, n),
+        address(sides, np.float64, depth + 1), address(origin, np.float64, 3),
+    )  # fmt: skip
+    result = address(means, np.float32, 3 * n, True)
 
-        ``run`` shares the work on many out.
-        """
-        if not are_many(words.shape[1]):
-            return self._order(words)
-        ordered = np.empty_like(words)
+    def find(first: int) -> None:
+        c["potr_octree_decoded"](*given, first, min(first + _DECODED, n), result)
 
-        def finish(members: I64, place: int) -> None:
-            order, own = self._order(np.ascontiguousarray(words[:, members]))
-            members[:] = members[order]
-            ordered[:, place : place + len(members)] = own
-
-        return over_ranges(words[0], finish, run), ordered
-
-    def _order(self, words: U64) -> tuple[I64, U64]:
-        n = words.shape[1]
-        scratch = np.empty(int(self._c["potr_octree_sorting"]()), np.uint8)
-        order, other_order, other_keys = np.arange(n), np.empty(n, np.int64), np.empty(n, np.uint64)
-        for word in words[::-1]:
-            keys = word[order]
-            if self._c["potr_octree_sort"](
-                n,
-                address(scratch.view(np.uint64), np.uint64, scratch.size // 8, True),
-                address(keys, np.uint64, n, True),
-                address(order, np.int64, n, True),
-                address(other_keys, np.uint64, n, True),
-                address(other_order, np.int64, n, True),
-            ):
-                order, other_order, keys = other_order, order, other_keys
-        if len(words) == 1:  # the words came with their numbers
-            return order, keys[None]
-        return order, np.ascontiguousarray(words[:, order])
-
-    def streams(self, words: U64, depth: int, order: I64, wanted: I8) -> tuple[U8, U8, U64, U8, U8]:
-        """Occupancy, several-flags, multiplicities, levels of leaves, and tails.
-
-        Args:
-            words: (words, n) in the order of the leaves.
-            depth: 0 to 52, which the words reach.
-            order: (n,) number of each splat. wanted: (n,) levels by that number, 0 to ``depth``.
-        """
-        number, n = words.shape
-        _check(words, depth, order, wanted)
-        sizes = np.empty(3 * _COUNTED + 2, np.uint64)
-        if self._c["potr_octree_sizes"]() != sizes.nbytes:
-            raise TypeError("the native path counts in another way")
-        given = (
-            address(words, np.uint64, number * n), n, number, depth,
-            address(order, np.int64, n), address(wanted, np.int8, n), address(sizes, np.uint64, sizes.size, True),
-        )  # fmt: skip
-        self._c["potr_octree_survey"](*given)
-        nodes, children, tails = sizes[:-2].reshape(3, _COUNTED)
-        singles, packed = (int(size) for size in sizes[-2:])
-        longer = np.cumsum(tails[:0:-1])  # leaves whose tail has at least so many levels
-        occupancy = np.zeros(int(nodes.sum()), np.uint8)
-        several = np.zeros((int(children.sum()) + 7) // 8, np.uint8)
-        multiplicities, lengths = np.zeros(packed, np.uint64), np.zeros(singles, np.uint8)
-        planes = np.zeros(3 * int(((longer + np.uint64(7)) // np.uint64(8)).sum()), np.uint8)
-        self._c["potr_octree_streams"](
-            *given,
-            *(address(each, np.uint8, each.size, True) for each in (occupancy, several)),
-            address(multiplicities, np.uint64, packed, True),
-            *(address(each, np.uint8, each.size, True) for each in (lengths, planes)),
-        )
-        return occupancy, several, multiplicities, lengths, planes
-
-    def decoded(self, words: U64, depth: int, order: I64, wanted: I8, sides: F64, origin: F64, run: Run = map) -> F32:
-        """(n, 3) centres as a decoder of the streams finds them, in the order of the leaves.
-
-        Args:
-            words, depth, order, wanted: as of :meth:`streams`.
-            sides: (depth + 1,) edges of the cells of each level.
-            origin: (3,).
-            run: shares the work out.
-        """
-        number, n = words.shape
-        _check(words, depth, order, wanted)
-        means = np.empty((n, 3), np.float32)
-        given = (
-            address(words, np.uint64, number * n), n, number, depth,
-            address(order, np.int64, n), address(wanted, np.int8, n),
-            address(sides, np.float64, depth + 1), address(origin, np.float64, 3),
-        )  # fmt: skip
-        result = address(means, np.float32, 3 * n, True)
-
-        def find(first: int) -> None:
-            self._c["potr_octree_decoded"](*given, first, min(first + _DECODED, n), result)
-
-        for _ in run(find, range(0, n, _DECODED)):
-            pass
-        return means
+    for _ in run(find, range(0, n, _DECODED)):
+        pass
+    return means
 
 
 def _check(words: U64, depth: int, order: I64, wanted: I8) -> None:

@@ -12,6 +12,8 @@ from functools import cache, wraps
 from importlib import import_module
 from typing import Any, ParamSpec, TypeVar
 
+from potr_cl.codec.native.library import native
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -28,7 +30,7 @@ TABLE = {
     "codec.quantize:canonical_rotations": "codec.quantize:_canonical_rotations_by_c",
     "codec.quantize:nonzero_levels": "codec.quantize:_nonzero_levels_by_c",
     "codec.splat_levels:splat_levels": "codec.splat_levels:_splat_levels_by_c",
-    "codec.steps.rule:colour_classes": "codec.steps.rule:_colour_classes_by_c",
+    "codec.steps.rule:colour_classes": "codec.native.bundles:colour_classes",
     "codec.steps.prediction:to_residuals": "codec.steps.prediction:_to_residuals_by_c",
     "outputs.feedback:unit_factors": "outputs.feedback:_unit_factors_by_c",
 }
@@ -44,8 +46,6 @@ def definition(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def either(*args: P.args, **kwargs: P.kwargs) -> R:
-        from potr_cl.codec.native.library import native  # which itself needs definitions
-
         functions = native()
         if functions is not None:
             found: R = resolved(twin)(functions, *args, **kwargs)

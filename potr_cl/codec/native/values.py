@@ -5,16 +5,17 @@ levels (:class:`Tables`), and how threads share the bundles out (:class:`BundleS
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.native.declarations import address
+from potr_cl.codec.native.declarations import CFunctions, address
 from potr_cl.codec.steps.rule import CLASSES
+from potr_cl.host.threads import Spare
 
 if TYPE_CHECKING:
     from potr_cl.codec.native.bundles import BundledFile
@@ -105,26 +106,14 @@ class PackedValues:
         return PACKED_COLUMNS * BUNDLE + 4 * items
 
 
+_rooms = Spare(PackedValues, most=24)
+
+
 @contextmanager
 def packing_rooms(number: int) -> Iterator[list[PackedValues]]:
-    """Memory for so many bundles, which the next file gets too: what was written to before is there at once."""
-    rooms = [_room() for _ in range(number)]
-    try:
-        yield rooms
-    finally:
-        _spare_rooms.extend(rooms[: max(_MOST_ROOMS - len(_spare_rooms), 0)])
-
-
-def _room() -> PackedValues:
-    try:
-        return _spare_rooms.pop()
-    except IndexError:  # whatever other threads do meanwhile
-        return PackedValues()
-
-
-#: Rooms that nobody has now, and how many are kept.
-_spare_rooms: list[PackedValues] = []
-_MOST_ROOMS = 24
+    """Memory for so many bundles, which the next file gets too."""
+    with ExitStack() as stack:
+        yield [stack.enter_context(_rooms.taken()) for _ in range(number)]
 
 
 @dataclass(frozen=True)
@@ -234,11 +223,6 @@ def _optional(array: F32 | None, number: int) -> int | None:
 _AT_A_TIME = 64
 
 
-#: What threads work with, while nobody has it, and how much of it is kept.
-_spare: list[NDArray[np.uint8]] = []
-_MOST_SPARE = 16
-
-
 class _Share(ctypes.Structure):
     _fields_ = (
         ("file", _POINTER),
@@ -254,18 +238,22 @@ class _Share(ctypes.Structure):
     )
 
 
+#: What threads work with: of each the memory, once one of them has asked how much it takes.
+_spare: Spare[list[NDArray[np.uint8]]] = Spare(list, most=16)
+
+
 class BundleShare:
     """The bundles of a file, of which each thread takes the next that nobody has taken.
 
     Threads may begin before the file is open: they wait for it, and leave the interpreter to others.
 
     Args:
-        functions: of the library.
+        c: the library's functions.
         bundles: of the file.
     """
 
-    def __init__(self, functions: Mapping[str, Any], bundles: int) -> None:
-        self._c = functions
+    def __init__(self, c: CFunctions, bundles: int) -> None:
+        self._c = c
         self._said = np.full(bundles, -1, np.int32)
         said = address(self._said, np.int32, bundles, True)
         self._share = _Share(said=said, rooms=1, bundles=bundles, end=bundles)
@@ -283,7 +271,7 @@ class BundleShare:
 
         Args:
             file: that has the bundles.
-            sections, rotations: what of them, as of :meth:`potr_cl.codec.native.bundles.BundledFile.integers`.
+            sections, rotations: what of them, as of :meth:`potr_cl.codec.native.bundles.BundledFile.levels`.
             values: where it goes: arrays of all splats, or memory for some bundles, which take turns. Then they wait
                 until there is room for them (:meth:`allow`).
             tables: what makes values of levels.
@@ -303,19 +291,14 @@ class BundleShare:
 
     def do(self) -> None:
         """A thread's share."""
-        size = self._c["potr_bundles_work"]()
-        try:
-            memory = _spare.pop()  # which was written to before, and is there at once
-        except IndexError:
-            memory = np.empty(size + 64, np.uint8)
-        start = -memory.ctypes.data % 64
-        work = address(memory[start : start + size], np.uint8, size, True)
-        try:
+        with _spare.taken() as memory:
+            size = self._c["potr_bundles_work"]()
+            if not memory:
+                memory.append(np.empty(size + 64, np.uint8))
+            start = -memory[0].ctypes.data % 64
+            work = address(memory[0][start : start + size], np.uint8, size, True)
             while self._c["potr_bundles_share"](ctypes.byref(self._share), work, _AT_A_TIME):
                 pass
-        finally:
-            if len(_spare) < _MOST_SPARE:
-                _spare.append(memory)
 
     def allow(self, limit: int) -> None:
         """There is room for the bundles before number ``limit``: what was packed of earlier ones is needed no more."""
@@ -334,7 +317,7 @@ class BundleShare:
 
         Returns:
             What C says of it, and the section at fault, as
-            :meth:`potr_cl.codec.native.bundles.BundledFile.integers` does. BEYOND_TABLE: its values are not whole.
+            :meth:`potr_cl.codec.native.bundles.BundledFile.levels` does. BEYOND_TABLE: its values are not whole.
         """
         if not 0 <= bundle < len(self._said):
             raise TypeError("the native path was asked for what is not there")

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.native.library import Functions
-from potr_cl.codec.native.octree import OctreeBuilding
+from potr_cl.codec.native import octree as native_octree
+from potr_cl.codec.native.declarations import CFunctions
 from potr_cl.codec.native.table import definition
 from potr_cl.codec.octree.parser import DEEPEST_LEVEL, U8, U64, OctreeStreams, check_centres, parse
 from potr_cl.host.threads import Run
@@ -126,32 +126,31 @@ def leaf_order(means: NDArray[np.float32], tolerance: F64 | float) -> NDArray[np
     return _depth_first(_morton_words(grid, depth))
 
 
-def _leaf_order_by_c(functions: Functions, means: NDArray[np.float32], tolerance: F64 | float) -> NDArray[np.int64]:
-    *_, words = _words_of(functions.octree_build, means, tolerance)
-    return functions.octree_build.order(words)[0]
+def _leaf_order_by_c(c: CFunctions, means: NDArray[np.float32], tolerance: F64 | float) -> NDArray[np.int64]:
+    *_, words = _words_of(c, means, tolerance)
+    return native_octree.order(c, words)[0]
 
 
 def _begin_by_c(
-    functions: Functions, means: NDArray[np.float32], tolerance: F64 | float, absolute: bool = False, run: Run = map
+    c: CFunctions, means: NDArray[np.float32], tolerance: F64 | float, absolute: bool = False, run: Run = map
 ) -> Any:
     if not absolute:
         return NotImplemented
-    building = functions.octree_build
-    low, side, limit, depth, words = _words_of(building, means, tolerance, run)
-    order, words = building.order(words, run)
+    low, side, limit, depth, words = _words_of(c, means, tolerance, run)
+    order, words = native_octree.order(c, words, run)
     half_diagonal = _half_diagonal(side)
-    wanted = building.wanted(limit, half_diagonal, depth) if half_diagonal else np.zeros(len(limit), np.int8)
+    wanted = native_octree.wanted(c, limit, half_diagonal, depth) if half_diagonal else np.zeros(len(limit), np.int8)
     unclear = np.flatnonzero(wanted < 0)
     wanted[unclear] = _levels_for(side, limit[unclear], depth)
     origin = (float(low[0]), float(low[1]), float(low[2]))
 
     def streams() -> OctreeStreams:
-        found = building.streams(words, depth, order, wanted)
+        found = native_octree.streams(c, words, depth, order, wanted)
         return OctreeStreams(origin, side, depth, *found)
 
     def decoded(run: Run) -> NDArray[np.float32]:
         sides = np.ldexp(side, -np.arange(depth + 1))
-        centres = building.decoded(words, depth, order, wanted, sides, np.array(origin), run)
+        centres = native_octree.decoded(c, words, depth, order, wanted, sides, np.array(origin), run)
         check_centres(origin, side, centres)
         return centres
 
@@ -159,15 +158,16 @@ def _begin_by_c(
 
 
 def _words_of(
-    functions: OctreeBuilding, means: NDArray[np.float32], tolerance: F64 | float, run: Run = map
+    c: CFunctions, means: NDArray[np.float32], tolerance: F64 | float, run: Run = map
 ) -> tuple[F64, float, F64, int, U64]:
     """The cube's corner and side; tolerances; the deepest level, and Morton words."""
     means = np.ascontiguousarray(means, np.float32)
     tolerances = np.ascontiguousarray(np.atleast_1d(tolerance), np.float64)
-    low, high, limit, finest = functions.bounds(means, tolerances)
+    low, high, limit, finest = native_octree.bounds(c, means, tolerances)
     side = float((high - low).max())
     depth = _depth_for(side, finest)
-    return low, side, limit, depth, functions.words(means, low, 2.0**depth / side if side > 0 else 0.0, depth, run)
+    words = native_octree.words(c, means, low, 2.0**depth / side if side > 0 else 0.0, depth, run)
+    return low, side, limit, depth, words
 
 
 def _gridded(
@@ -304,13 +304,7 @@ def _serialise_tree(
 
 
 def _leaf_levels(
-    axes: list[F64],
-    low: list[float],
-    side: float,
-    grid: list[U64],
-    alone: NDArray[np.int8],
-    depth: int,
-    limit: F64,
+    axes: list[F64], low: list[float], side: float, grid: list[U64], alone: NDArray[np.int8], depth: int, limit: F64
 ) -> NDArray[np.int8]:
     """The first level from ``alone`` on whose cell centre lies within the limit; ``depth`` at the latest."""
     level_of = np.full(len(alone), depth, np.int8)

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.native.library import Functions
+from potr_cl.codec.native import octree as native_octree
+from potr_cl.codec.native.declarations import CFunctions
 from potr_cl.codec.native.table import definition
 from potr_cl.errors import DataError
 from potr_cl.host.threads import Run
@@ -145,20 +146,16 @@ def parse(streams: OctreeStreams, splats: int, run: Run = map, parts: int = 1) -
 
 
 def _parse_by_c(
-    functions: Functions, streams: OctreeStreams, splats: int, run: Run = map, parts: int = 1
+    c: CFunctions, streams: OctreeStreams, splats: int, run: Run = map, parts: int = 1
 ) -> NDArray[np.float32]:
     depth = _checked_depth(streams.depth)
-    tree = functions.octree.tree(streams.occupancy, streams.several, depth, _crowded_root(streams))
+    tree = native_octree.tree(c, streams.occupancy, streams.several, depth, _crowded_root(streams))
     if tree is None:
         raise _no_tree()
     _check_leaves(streams, tree.singles, tree.crowded, splats)
     _check_leaf_levels(streams)
-    walk = functions.octree.walk(
-        tree,
-        streams.leaf_levels,
-        streams.multiplicities,
-        splats,
-        max(1, min(parts, splats // _PART)),
+    walk = native_octree.Walk(
+        c, tree, streams.leaf_levels, streams.multiplicities, splats, max(1, min(parts, splats // _PART))
     )
     list(run(walk.leaves, range(walk.parts)))
     counts = walk.counts

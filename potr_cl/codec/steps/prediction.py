@@ -11,7 +11,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.native.library import Functions
+from potr_cl.codec.native import quantising
+from potr_cl.codec.native.declarations import CFunctions
 from potr_cl.codec.native.table import definition
 from potr_cl.codec.steps.rule import CLASSES
 
@@ -62,8 +63,8 @@ def to_residuals(levels: I64, classes: I8) -> I64:
     return levels - ((total * inverses + _HALF) >> _MEAN_SHIFT)
 
 
-def _to_residuals_by_c(functions: Functions, levels: I64, classes: I8) -> I64:
-    return functions.quantising.predicted(np.ascontiguousarray(levels), np.ascontiguousarray(classes), RUN, *tables())
+def _to_residuals_by_c(c: CFunctions, levels: I64, classes: I8) -> I64:
+    return quantising.predicted(c, np.ascontiguousarray(levels), np.ascontiguousarray(classes), RUN, *tables())
 
 
 def from_residuals(residuals: I64, classes: I8) -> I64:

@@ -11,18 +11,14 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.native.table import definition
 from potr_cl.errors import DataError
-
-if TYPE_CHECKING:
-    from potr_cl.codec.native.library import Functions
 
 I64 = NDArray[np.int64]
 I8 = NDArray[np.int8]
@@ -93,11 +89,7 @@ class ColourSteps:
 
     @staticmethod
     def from_bytes(raw: bytes, splats: int) -> ColourSteps:
-        """Undo :meth:`to_bytes`; nothing in the bytes is trusted.
-
-        Raises:
-            DataError: damaged.
-        """
+        """Undo :meth:`to_bytes`; nothing in the bytes is trusted. Raises DataError if damaged."""
         impossible = DataError("section 'steps' describes impossible steps")
         if len(raw) < _HEAD.size:
             raise impossible
@@ -165,16 +157,6 @@ class ColourSteps:
 def colour_classes(steps: ColourSteps, scales: Sequence[Levels], opacities: Levels, start: int = 0) -> tuple[I8, I8]:
     """:meth:`ColourSteps.classes`."""
     return steps.classes(scales, opacities, start)
-
-
-def _colour_classes_by_c(
-    functions: Functions, steps: ColourSteps, scales: Sequence[Levels], opacities: Levels, start: int = 0
-) -> Any:
-    group = 1 << steps.group_bits
-    if start % group or any(levels.dtype.itemsize > 2 for levels in (*scales, opacities)):
-        return NotImplemented
-    own = replace(steps, groups=steps.groups[start // group :][: -(-len(opacities) // group)])
-    return functions.step_classes(own, np.stack(scales, dtype=np.int32), opacities.astype(np.int32))
 
 
 def logarithms(levels: Levels) -> I64:

@@ -36,19 +36,9 @@ _log = logging.getLogger("potr_cl")
 
 
 def load(path: Path) -> list[Camera]:
-    """Read the views of a cameras.json.
+    """The views of a cameras.json, in file order; see ``load`` of :class:`potr_cl.formats.declaration.CameraFormat`.
 
     Ground truth is looked for in the folder ``images`` beside it.
-
-    Args:
-        path: of the file.
-
-    Returns:
-        The views, in file order.
-
-    Raises:
-        UsageError: the file cannot be opened.
-        DataError: it is no cameras.json, or a view of it is damaged.
     """
     return parse(read_json(path), path)
 

@@ -100,20 +100,11 @@ def is_model(folder: Path) -> bool:
 
 
 def load(folder: Path) -> list[Camera]:
-    """Read the views of a sparse model.
+    """The views of a sparse model, cameras and images as .bin or .txt, ordered by the names of their images.
 
     Each 8th image by name is a test view, as in the field's benchmarks. Ground truth is looked for in a folder
-    ``images`` beside the model or up to two folders above it.
-
-    Args:
-        folder: holds cameras.bin and images.bin, or the same as .txt.
-
-    Returns:
-        The views, ordered by the names of their images.
-
-    Raises:
-        UsageError: a file cannot be opened.
-        DataError: the model is damaged, or a camera is of a model that is not read.
+    ``images`` beside the model or up to two folders above it. What is raised says
+    :class:`potr_cl.formats.declaration.CameraFormat`.
     """
     ending = ".bin" if (folder / "cameras.bin").exists() else ".txt"
     lenses, images = _lenses(folder / f"cameras{ending}"), _images(folder / f"images{ending}")

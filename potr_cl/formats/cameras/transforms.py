@@ -79,19 +79,10 @@ class _Frame:
 
 
 def load(path: Path) -> list[Camera]:
-    """Read the views of one transforms file.
+    """The views of a file, in its order; see ``load`` of :class:`potr_cl.formats.declaration.CameraFormat`.
 
-    Args:
-        path: of the file; if its name ends in ``_test`` or ``_val`` its views are test views, if in ``_train``
-            training views, else see the module's text.
-
-    Returns:
-        The views, in file order.
-
-    Raises:
-        UsageError: the file cannot be opened.
-        DataError: it is no transforms file, a frame of it is damaged, or its camera is no pinhole, not even a distorted
-            one.
+    If its name ends in ``_test`` or ``_val`` they are test views, if in ``_train`` training views, else see the
+    module's text.
     """
     return parse([(read_json(path), path)])
 

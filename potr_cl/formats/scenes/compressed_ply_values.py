@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from potr_cl.codec import octree
 from potr_cl.codec.logarithm import natural_logarithm
-from potr_cl.formats.scenes.scene_files import OTHER_PARTS, SH_0, unfilled, with_largest
+from potr_cl.formats.scenes.scene_files import OTHER_PARTS, SH_0, with_largest
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray, Scene
 
@@ -130,7 +130,7 @@ def unpacked(chunk: bytes, vertex: bytes, sh: bytes) -> Scene:
     all_bounds = np.frombuffer(chunk, "<f4").reshape(-1, 3, 2, 3)
     all_words = np.frombuffer(vertex, "<u4").reshape(-1, 4)
     levels = np.frombuffer(sh, np.uint8).reshape(len(all_words), 3, -1).transpose(0, 2, 1)
-    scene = unfilled(len(all_words), 1 + levels.shape[1])
+    scene = Scene.blank(len(all_words), 1 + levels.shape[1], by_splat=True)
 
     def unpack(start: int) -> None:
         words, bounds = all_words[start : start + _BLOCK], all_bounds[start // CHUNK : (start + _BLOCK) // CHUNK]

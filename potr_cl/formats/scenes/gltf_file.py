@@ -99,11 +99,7 @@ class Asset:
         return list(dict.fromkeys([Path(self.path), *beside]))
 
     def entry(self, kind: str, index: Any) -> dict[str, Any]:
-        """One of the objects of a list of the description.
-
-        Raises:
-            DataError: there is no such object.
-        """
+        """One of the objects of a list of the description. Raises DataError if there is no such object."""
         entries = self.description.get(kind)
         if not isinstance(entries, list) or type(index) is not int or not 0 <= index < len(entries):
             raise self.damaged(f"there is no {shown(index)} among its {kind}")
@@ -113,11 +109,7 @@ class Asset:
         return found
 
     def count(self, accessor: Any) -> int:
-        """How many values an accessor says that it has.
-
-        Raises:
-            DataError: no number that can be.
-        """
+        """How many values an accessor says that it has. Raises DataError if it is impossible."""
         return self.whole(self.entry("accessors", accessor), "count", least=1)
 
     def values(self, accessor: Any, parts: int) -> FloatArray:
@@ -160,19 +152,11 @@ class Asset:
         return values
 
     def content(self, view: Any) -> memoryview:
-        """The bytes of a view.
-
-        Raises:
-            DataError: there is no such view, or it does not lie within the file.
-        """
+        """The bytes of a view. Raises DataError if there is no such view, or it does not lie within the file."""
         return self._view(self.entry("bufferViews", view))
 
     def whole(self, entry: dict[str, Any], key: str, default: int | None = None, least: int = 0) -> int:
-        """A whole number of the description.
-
-        Raises:
-            DataError: it is none, or too small or large.
-        """
+        """A whole number of the description. Raises DataError if it is none, or too small or large."""
         value = entry.get(key, default)
         if type(value) is not int or not least <= value < _MOST:
             raise self.damaged(f"an impossible '{key}': {shown(value)}")

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes.scene_files import byte_logits, cleaned, log_of_scales, opened, unfilled
+from potr_cl.formats.scenes.scene_files import byte_logits, cleaned, log_of_scales, opened
 from potr_cl.formats.scenes.splat import colours
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
 
@@ -84,7 +84,7 @@ def _read(path: str | os.PathLike[str], data: bytes) -> Scene:
     if count == 0:
         raise DataError(f"'{path}' has no splats")
     coefficients = SH_COEFFICIENTS[max(section.degree for section in sections)]
-    scene = unfilled(count, coefficients)
+    scene = Scene.blank(count, coefficients, by_splat=True)
     scene.sh[:] = 0  # sections may be of lower degrees
     # Zero is what writers leave where they have no bounds.
     bounds = np.float32(low or -_SH_BOUND), np.float32(high or _SH_BOUND)

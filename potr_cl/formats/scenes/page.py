@@ -1,4 +1,5 @@
-"""Scenes in web pages: a .potr file and what shows it, one file that opens without a server or a network.
+"""Scenes from this package's own files (:data:`POTR`), and in web pages: a .potr file and what shows it, one file that
+opens without a server or a network.
 
 What pages are made of, ``page.html`` beside this module, has the viewer, its decoder and their licences in it; ``python
 -m tools.make.web`` builds it from web/. Of a page that is read, nothing but the .potr file is looked at.
@@ -8,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import gzip
 import html
 import json
 import re
@@ -40,6 +42,39 @@ def check_viewer() -> None:
             "this installation has no viewer for pages: in a clone, 'pip install -e . ziglang' and "
             "'python -m tools.make.web' build it (it needs Node 20 and npm; see docs/web.md)"
         )
+
+
+def viewer_script() -> bytes | None:
+    """The script of the viewer in pages; None if this installation has none."""
+    if not TEMPLATE.exists():
+        return None
+    found = re.search(rb'<script id="viewer"[^>]*>([^<]*)<', TEMPLATE.read_bytes())
+    assert found is not None
+    return gzip.decompress(base64.b64decode(found[1]))
+
+
+def potr_of(scene: Scene, source: Path | None, **quality: float) -> bytes:
+    """A scene as a .potr file.
+
+    Args:
+        scene: all of its splats are written, rounded.
+        source: of the scene; the .potr file that it is, or has in it, is taken as it is.
+        quality: how finely to round, as of :meth:`potr_cl.codec.quantize.HyperParameters.from_quality`; as ``encode``
+            does, if not given.
+
+    Raises:
+        DataError: no splat is left, or a value is too large.
+    """
+    if source is not None:
+        with source.open("rb") as file:
+            if file.read(len(MAGIC)) == MAGIC:
+                return MAGIC + file.read()
+        if source.suffix.lower() in FORMAT.suffixes:
+            return scene_in(source.read_bytes())
+    clean, _ = scene.cleaned()
+    if not len(clean):
+        raise DataError("the scene has no splats")
+    return b"".join(code_scene(clean, HyperParameters.from_quality(**{"q": _QUALITY, **quality}, preset="best")).pieces)
 
 
 def page_around(
@@ -75,11 +110,7 @@ def sizes(page: bytes) -> dict[str, int]:
 
 
 def scene_in(page: bytes) -> bytes:
-    """The .potr file in a page.
-
-    Raises:
-        DataError: there is none.
-    """
+    """The .potr file in a page. Raises DataError if there is none."""
     begin = page.find(BEGIN) + len(BEGIN)
     end = page.find(END, begin)
     if begin < len(BEGIN) or end < 0:
@@ -112,22 +143,19 @@ def save(
         source: of the scene; the .potr file that it is, or has in it, goes into the page as it is.
     """
     check_viewer()
-    potr = None if source is None else _potr_of(source)
-    if potr is None:
-        clean, _ = scene.cleaned()
-        if not len(clean):
-            raise DataError("the scene has no splats")
-        potr = b"".join(code_scene(clean, HyperParameters.from_quality(_QUALITY, "best")).pieces)
-    write_pieces(path, page_around(potr, len(scene), title, author))
+    write_pieces(path, page_around(potr_of(scene, source), len(scene), title, author))
 
 
-def _potr_of(source: Path) -> bytes | None:
-    with open(source, "rb") as file:
-        if file.read(len(MAGIC)) == MAGIC:
-            file.seek(0)
-            return file.read()
-    return scene_in(source.read_bytes()) if source.suffix.lower() in FORMAT.suffixes else None
-
+#: They are only read here: what makes them is the whole pipeline of encode.
+POTR = SceneFormat(
+    name="potr_cl",
+    suffixes=(".potr",),
+    note="this package's own: what `encode` makes of a scene in any of these formats",
+    load=decode,
+    not_written="a .potr file is made by the command encode, which reads all that convert reads",
+    starts=(MAGIC,),
+    packed=True,
+)
 
 FORMAT = SceneFormat(
     name="web page",

@@ -19,7 +19,7 @@ from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes.ply_antialiasing import ANTIALIASED_COMMENT, FILTER_3D, folded, marked
 from potr_cl.formats.scenes.ply_rows import Target, read_rows
-from potr_cl.formats.scenes.scene_files import NO_EXTENT, cleaned, unfilled
+from potr_cl.formats.scenes.scene_files import NO_EXTENT, cleaned
 from potr_cl.host.atomic_write import write_pieces
 from potr_cl.host.inputs import unchanged
 from potr_cl.model.scene import MIP_SPLATTING_LOW_PASS, SH_COEFFICIENTS, Scene
@@ -114,11 +114,7 @@ def save_parts(path: str | os.PathLike[str], parts: Iterable[Scene], splats: int
 
 
 def pieces_of_parts(parts: Iterable[Scene], splats: int) -> Iterator[bytes | memoryview]:
-    """The bytes of :func:`save_parts`, as those of :func:`pieces`.
-
-    Raises:
-        DataError: as :func:`save_parts`.
-    """
+    """The bytes of :func:`save_parts`, as those of :func:`pieces`. Raises DataError if as :func:`save_parts`."""
     kind: tuple[int, bool, float] | None = None
     left = splats
     for part in parts:
@@ -204,7 +200,7 @@ def _read(path: str | os.PathLike[str], stream: io.FileIO, size: int) -> Scene:
     if scales < 3:
         _log.warning("'%s' has two scales a splat (2DGS): the third is read as 1e-9 unit, along the third axis", path)
 
-    scene = unfilled(count, 1 + kept // 3)
+    scene = Scene.blank(count, 1 + kept // 3, by_splat=True)
     targets = _targets(scene, rest // 3, scales)
     if scales < 3:
         scene.log_scales[:, 2] = NO_EXTENT

@@ -7,14 +7,13 @@ import os
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
-from queue import Empty, SimpleQueue
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import DataError
-from potr_cl.host.threads import thread_pool
+from potr_cl.host.threads import Spare, thread_pool
 from potr_cl.model.scene import FloatArray
 
 #: Rows that are read at a time: few enough for a cache, and so many that threads seldom wait for the interpreter.
@@ -68,22 +67,18 @@ def read_rows(
     starts = range(0, count, height)
     read = _Reader(stream)
     fills = [_quick(target, dtype) or target.fill for target in targets]
-    spare: SimpleQueue[NDArray[np.void]] = SimpleQueue()
+    spare = Spare(lambda: np.empty(min(height, count), dtype))
 
     def one(start: int) -> None:
-        try:
-            rows = spare.get_nowait()
-        except Empty:
-            rows = np.empty(min(height, count), dtype)
-        own = rows[: min(height, count - start)]
-        got = read(own.view(np.uint8).data, offset + start * dtype.itemsize)
-        if got < own.nbytes:
-            raise DataError(f"'{path}' is truncated: it ends within splat {start + got // dtype.itemsize}")
-        # A float64 beyond float32 becomes infinite, and its splat is dropped with the other non-finite ones.
-        with np.errstate(over="ignore"):
-            for fill in fills:
-                fill(start, own)
-        spare.put(rows)
+        with spare.taken() as rows:
+            own = rows[: min(height, count - start)]
+            got = read(own.view(np.uint8).data, offset + start * dtype.itemsize)
+            if got < own.nbytes:
+                raise DataError(f"'{path}' is truncated: it ends within splat {start + got // dtype.itemsize}")
+            # A float64 beyond float32 becomes infinite, and its splat is dropped with the other non-finite ones.
+            with np.errstate(over="ignore"):
+                for fill in fills:
+                    fill(start, own)
 
     if len(starts) < 2:
         for start in starts:

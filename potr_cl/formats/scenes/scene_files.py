@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from potr_cl.codec import octree
 from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.errors import DataError, PotrError, UsageError
-from potr_cl.host import mapped
 from potr_cl.host.inputs import check_claim, refuse_lfs_pointer, unchanged
 from potr_cl.model.scene import LOW_PASS, CleanReport, FloatArray, Scene
 
@@ -115,17 +114,6 @@ def shown(value: object) -> str:
     """A value out of a file, for a message: not long."""
     said = repr(value)
     return said if len(said) <= _LONGEST_SAID else said[:_LONGEST_SAID] + "…"
-
-
-def unfilled(splats: int, coefficients: int) -> Scene:
-    """A scene of so many splats and SH coefficients a channel, whose arrays the reader of a format fills."""
-    return Scene(
-        np.empty((splats, 3), np.float32),
-        np.empty((splats, 3), np.float32),
-        np.empty((splats, 4), np.float32),
-        np.empty(splats, np.float32),
-        mapped.array((splats, coefficients, 3), np.float32, "SH coefficients", first=True),
-    )
 
 
 def joined(scenes: list[Scene]) -> Scene:

@@ -10,7 +10,7 @@ import json
 import math
 import os
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -27,7 +27,6 @@ from potr_cl.formats.scenes.scene_files import (
     reading,
     related,
     tell_of_low_pass,
-    unfilled,
     unit_quaternions,
 )
 from potr_cl.formats.scenes.sog_images import (
@@ -40,14 +39,7 @@ from potr_cl.formats.scenes.sog_images import (
     bundle,
     write_folder,
 )
-from potr_cl.formats.scenes.sog_values import (
-    areas,
-    in_order,
-    palette_of,
-    quantised,
-    unpacked_means,
-    unpacked_rotations,
-)
+from potr_cl.formats.scenes.sog_values import areas, in_order, palette_of, quantised, unpacked_means, unpacked_rotations
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
 
@@ -66,9 +58,11 @@ def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
     """
     folder = file_in_folder(path, DESCRIPTION)
     if folder is not None:
-        parts = Folder(folder)
+        description, images = read_folder(folder)
         with reading(path):
-            return cleaned(path, Sog(path, parts.description(), parts.stored, parts.size, trust).scene())
+            return cleaned(
+                path, Sog(path, description, images.__getitem__, folder_bytes(description, images), trust).scene()
+            )
     with opened(path) as (file, size):
         archive = _opened_archive(path, file, size)
         scene = Sog(path, archive.read(DESCRIPTION), archive.read, size, trust).scene()
@@ -124,38 +118,24 @@ FORMAT = SceneFormat(
 )
 
 
-class Folder:
-    """The files of a SOG folder, each of which is read once.
-
-    Args:
-        path: of its description.
-
-    Attributes:
-        size: bytes of the description and the images that it names.
+def read_folder(path: Path) -> tuple[bytes, dict[str, bytes]]:
+    """The description of a SOG folder, at ``path``, and the images that it names, each read once.
 
     Raises:
         UsageError: one of the files cannot be opened.
         DataError: the description is damaged, or names a file outside of the folder.
     """
+    description, names = _described(path)
+    images = {}
+    for name in names:
+        with opened(related(path, name)) as (file, _):
+            images[name] = file.read()
+    return description, images
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._description, names = _described(path)
-        self._images = {name: self._read(name) for name in names}
-        self.size = len(self._description) + sum(map(len, self._images.values()))
 
-    def description(self) -> bytes:
-        """The bytes of meta.json."""
-        return self._description
-
-    def stored(self, name: str) -> bytes:
-        """The bytes of an image."""
-        return self._images[name]
-
-    def _read(self, name: str) -> bytes:
-        with opened(related(self._path, name)) as (file, _):
-            content: bytes = file.read()
-        return content
+def folder_bytes(description: bytes, images: Mapping[str, bytes]) -> int:
+    """Of all files of a SOG folder that were read."""
+    return len(description) + sum(map(len, images.values()))
 
 
 def _described(path: Path) -> tuple[bytes, list[str]]:
@@ -202,12 +182,7 @@ class Sog:
     """
 
     def __init__(
-        self,
-        path: str | os.PathLike[str],
-        description: bytes,
-        read: Callable[[str], bytes],
-        size: int,
-        trust: bool,
+        self, path: str | os.PathLike[str], description: bytes, read: Callable[[str], bytes], size: int, trust: bool
     ) -> None:
         self._path, self._read = path, read
         meta = json.loads(description)
@@ -237,7 +212,7 @@ class Sog:
         for name, images in (("means", 2), ("quats", 1), ("scales", 1), ("sh0", 1)):
             for index in range(images):
                 self._check_pixels(name, index)
-        scene = unfilled(count, coefficients)
+        scene = Scene.blank(count, coefficients, by_splat=True)
         self._fill_means(scene.means)
         quaternions, scales = self._pixels("quats", 0), self._pixels("scales", 0)
         book = self._codebook("scales")

@@ -87,11 +87,7 @@ class SogImages:
 
 
 def bundle(images: SogImages) -> bytes:
-    """The bytes of a .sog file.
-
-    Raises:
-        DataError: there are more splats than an image has pixels.
-    """
+    """The bytes of a .sog file. Raises DataError if there are more splats than an image has pixels."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for name, content in members(images):
@@ -180,11 +176,7 @@ def _image(picture: tuple[str, U8, int, int]) -> tuple[str, bytes]:
 
 
 def _size(splats: int) -> tuple[int, int]:
-    """Width and height of an image with a pixel for each splat.
-
-    Raises:
-        DataError: there is none.
-    """
+    """Width and height of an image with a pixel for each splat. Raises DataError if there is none."""
     root = math.isqrt(splats - 1) + 1
     width = min(-(-root // _SIDE), _LARGEST_SIDE // _SIDE) * _SIDE
     rows = -(-splats // width)

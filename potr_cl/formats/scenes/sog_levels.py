@@ -28,7 +28,7 @@ from potr_cl.formats.scenes.scene_files import (
     related,
     shown,
 )
-from potr_cl.formats.scenes.sog import Folder, Sog
+from potr_cl.formats.scenes.sog import Sog, folder_bytes, read_folder
 from potr_cl.model.scene import Scene
 
 _log = logging.getLogger("potr_cl")
@@ -60,15 +60,15 @@ def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
         names.setdefault(meta.environment, [])
     if not names:
         raise DataError(f"'{path}': level {level or 0} has no splats")
-    folders = [(Folder(file), file, parts) for file, parts in names.items()]
-    total = sum(folder.size for folder, _, _ in folders)
+    folders = [read_folder(file) for file in names]
+    total = sum(folder_bytes(*folder) for folder in folders)
     # All are described before one is unpacked: each by itself may hold some splats for nothing.
     sogs = []
-    for folder, where, _ in folders:
+    for where, (text, images) in zip(names, folders, strict=True):
         with reading(where):
-            sogs.append(Sog(where, folder.description(), folder.stored, folder.size, True))
+            sogs.append(Sog(where, text, images.__getitem__, folder_bytes(text, images), True))
     check_splats(path, sum(sog.count for sog in sogs), total, trust)
-    scenes = [_part(file, sog, parts) for sog, (_, file, parts) in zip(sogs, folders, strict=True)]
+    scenes = [_part(file, sog, parts) for sog, (file, parts) in zip(sogs, names.items(), strict=True)]
     if meta.levels > 1 and level is None:
         _log.warning(
             "'%s' has %d levels of detail: the finest is read; '%s#1' is the next one", path, meta.levels, path
@@ -130,11 +130,7 @@ class _Meta:
         self.environment = None if environment is None else related(path, environment)
 
     def ranges(self, level: int) -> dict[int, list[_Range]]:
-        """Which splats of which files belong to a level.
-
-        Raises:
-            UsageError: there is no such level.
-        """
+        """Which splats of which files belong to a level. Raises UsageError if there is no such level."""
         if level >= self.levels:
             there = "only level 0" if self.levels == 1 else f"the levels 0 to {self.levels - 1}"
             raise UsageError(f"'{self._path}' has {there}, and no level {level}")

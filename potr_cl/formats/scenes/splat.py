@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes.scene_files import SH_0, byte_logits, cleaned, log_of_scales, opened, unfilled
+from potr_cl.formats.scenes.scene_files import SH_0, byte_logits, cleaned, log_of_scales, opened
 from potr_cl.model.scene import FloatArray, Scene
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4), ("rotation", "u1", 4)])
@@ -31,7 +31,7 @@ def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
                 f"'{path}' is no .splat file, or is truncated: it has {size} bytes, and each splat takes "
                 f"{_ROW.itemsize}"
             )
-        scene = unfilled(count, 1)
+        scene = Scene.blank(count, 1, by_splat=True)
         for start in range(0, count, _BLOCK):
             block = slice(start, min(start + _BLOCK, count))
             content = file.read((block.stop - start) * _ROW.itemsize)

@@ -42,11 +42,7 @@ _EXTENSION_BYTES = 1 << 20
 #: Those that are written, the usual one first.
 _VERSIONS = (2, 3, 4)
 #: The same with what sets each apart.
-VERSIONS = {
-    2: "read by every tool we tested",
-    3: "with finer rotations",
-    4: "packed by zstd, for new readers only",
-}
+VERSIONS = {2: "read by every tool we tested", 3: "with finer rotations", 4: "packed by zstd, for new readers only"}
 #: Of each stream of version 4. Level 12 takes twice as long for 1 % less.
 _ZSTD_LEVEL = 8
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.quantize import canonical_rotations
-from potr_cl.formats.scenes.scene_files import byte_logits, unfilled, with_largest
+from potr_cl.formats.scenes.scene_files import byte_logits, with_largest
 from potr_cl.model.scene import FloatArray, Scene
 
 #: The version whose positions are half floats.
@@ -47,7 +47,7 @@ def unpacked(
     positions, opacities, colours, scales, rotations, rest = (
         np.frombuffer(part, np.uint8).reshape(count, -1) for part in properties
     )
-    scene = unfilled(count, coefficients)
+    scene = Scene.blank(count, coefficients, by_splat=True)
     byte, logits = np.arange(256).astype(np.float32), byte_logits()
     dc = (byte / np.float32(255) - np.float32(0.5)) / np.float32(_COLOUR_SCALE)
     for start in range(0, count, _BLOCK):

@@ -8,21 +8,115 @@ coefficients but the constant (DC) one are pulled towards zero. Kernels: cl/comp
 from __future__ import annotations
 
 import contextlib
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
-from potr_cl.model.scene import Scene
+from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
-from potr_cl.opencl.kernel import Kernel
-from potr_cl.opencl.memory import Memory
-from potr_cl.stages.compaction.launch import LaunchShape, launch_shape
-from potr_cl.stages.compaction.slot import Slot
+from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.stages.compaction.view_weights import ViewWeights
+
+
+class Slot(Owner):
+    """Device memory and a queue for one batch of splats.
+
+    Two slots take turns, so that the host fills one while the device works on the other. GPUs copy from and to pinned
+    memory, which they do on their own and several times as fast as from ordinary memory; CPUs copy from where data lie.
+
+    Args:
+        device: to which the batches go.
+        sizes: bytes of each buffer and what it holds, by name. The first is the one that comes back.
+        pinned: whether to copy by way of pinned memory.
+
+    Attributes:
+        buffers: by name. queue: that fills them and fetches the first one.
+    """
+
+    def __init__(self, device: Device, sizes: Mapping[str, tuple[int, str]], pinned: bool) -> None:
+        self._device = device
+        self._memory = Memory(device)
+        self._target: FloatArray | None = None
+        self._compacted: FloatArray | None = None
+        self._copied: Future[None] | None = None
+        self._events: list[cl.Event] = []  # letting go of one waits for it
+        self._mapped: dict[str, NDArray[np.uint8]] = {}
+        self._fetched: NDArray[np.uint8] | None = None
+        self._maps: list[cl.MemoryMap] = []
+        self._result = next(iter(sizes))
+        with device.all_or_nothing(), device.errors("cannot hold the splats to compact"):
+            self.queue = device.queue
+            if device.several_queues:
+                self.queue = cl.CommandQueue(device.context, device.info.handle, properties=device.queue.properties)
+            self.buffers = {name: self._memory.allocate(nbytes, what) for name, (nbytes, what) in sizes.items()}
+            if pinned:
+                self._mapped = {name: self._pinned(nbytes) for name, (nbytes, _) in sizes.items()}
+                # Results are fetched while the next batch is filled in.
+                self._fetched = self._pinned(sizes[self._result][0])
+
+    def _pinned(self, nbytes: int) -> NDArray[np.uint8]:
+        flags = cl.mem_flags.READ_WRITE | cl.mem_flags.ALLOC_HOST_PTR
+        buffer = cl.Buffer(self._device.context, flags, nbytes)
+        access = cl.map_flags.READ | cl.map_flags.WRITE
+        mapped: NDArray[np.uint8] = cl.enqueue_map_buffer(self.queue, buffer, access, 0, (nbytes,), np.uint8)[0]
+        self._maps.append(mapped.base)
+        return mapped
+
+    def _staged(self, name: str, array: NDArray[Any]) -> NDArray[Any]:
+        """The array where the device copies it from."""
+        if not self._mapped:
+            return np.ascontiguousarray(array)
+        staged = self._mapped[name][: array.nbytes].view(array.dtype).reshape(array.shape)
+        np.copyto(staged, array)
+        return staged
+
+    def upload(self, arrays: Mapping[str, NDArray[Any]], pool: ThreadPoolExecutor) -> None:
+        """Fill the buffers of these names."""
+        staged = pool.map(self._staged, arrays.keys(), arrays.values())
+        with self._device.errors("failed to take the splats to compact"):
+            for name, array in zip(arrays, staged, strict=True):
+                if array.nbytes:
+                    self._events.append(cl.enqueue_copy(self.queue, self.buffers[name], array, is_blocking=False))
+            self.queue.flush()
+
+    def download(self, target: FloatArray) -> None:
+        """Begin to fetch the first buffer to a contiguous array; :meth:`collect` ends it."""
+        if self._copied is not None:
+            self._copied.result()
+        self._target = self._compacted = target
+        if self._fetched is not None:
+            self._compacted = self._fetched[: target.nbytes].view(np.float32).reshape(target.shape)
+        source = self.buffers[self._result]
+        with self._device.errors("failed while computing"):
+            self._events.append(cl.enqueue_copy(self.queue, self._compacted, source, is_blocking=False))
+            self.queue.flush()
+
+    def collect(self, pool: ThreadPoolExecutor) -> None:
+        """Wait for what :meth:`download` began. The target is complete once the pool is."""
+        if self._target is None or self._compacted is None:
+            return
+        with self._device.errors("failed while computing"):
+            self.queue.finish()
+        self._events.clear()
+        if self._fetched is not None:
+            self._copied = pool.submit(np.copyto, self._target, self._compacted)
+        self._target = None
+
+    def close(self) -> None:
+        with contextlib.suppress(cl.Error):
+            self.queue.finish()
+        self._events.clear()
+        for mapped in self._maps:
+            mapped.release(self.queue)
+        self._maps.clear()
+        self._memory.close()
+
 
 ColourModel = Literal["ycocg", "rgb"]
 Weighting = Literal["importance", "visibility"]
@@ -124,8 +218,17 @@ class Compactor:
         _check(splats, camera_centres, weights)
         if count == 1:
             return scene
-        shape = launch_shape(self.device)
-        kernel = self._kernel(count, options, shape)
+        gpu = self.device.family == "gpu"
+        # A CPU's work-groups have one work-item: these kernels keep kilobytes of private memory each.
+        lanes, group = (1, 64) if gpu else (self.device.vector_width, 1)
+        kernel = self.device.kernel(
+            "compact/ridge.cl",
+            "compact",
+            ORTHOGONAL=int(options.precision == "orthogonal"),
+            LANES=lanes,
+            SH_COUNT=count,
+            BLOCK=4 if gpu else 8,  # rows of the basis matrix that are reduced at a time
+        )
 
         share = camera_centres.shape[1] if camera_centres.ndim == 3 else 1
         camera_centres = camera_centres.reshape(-1, 3)
@@ -148,7 +251,7 @@ class Compactor:
         with contextlib.ExitStack() as stack:
             memory = stack.enter_context(Memory(self.device))
             device_centres = memory.upload(centres, "the cameras")
-            slots = [stack.enter_context(Slot(self.device, sizes, shape.pinned)) for _ in range(min(len(batches), 2))]
+            slots = [stack.enter_context(Slot(self.device, sizes, gpu)) for _ in range(min(len(batches), 2))]
             pool = stack.enter_context(ThreadPoolExecutor(_COPIERS))
             for number, (start, stop) in enumerate(batches):
                 slot = slots[number % len(slots)]
@@ -166,20 +269,14 @@ class Compactor:
                         scale_factor=options.sf_sh if options.two_pass else 0,
                         ycocg=options.colour_model == "ycocg",
                     )
-                    groups = -(-seen // (shape.lanes * shape.group))
-                    kernel.launch((groups * shape.group,), (shape.group,), slot.queue)
+                    groups = -(-seen // (lanes * group))
+                    kernel.launch((groups * group,), (group,), slot.queue)
                 slot.download(result[start:stop])
             for slot in slots:
                 slot.collect(pool)
         # These came back as they were.
         result[np.diff(offsets) == 0, 1:] = 0
         return replace(scene, sh=result)
-
-    def _kernel(self, sh_count: int, options: CompactionOptions, shape: LaunchShape) -> Kernel:
-        macros = {"LANES": shape.lanes, "SH_COUNT": sh_count, "BLOCK": shape.block}
-        return self.device.kernel(
-            "compact/ridge.cl", "compact", ORTHOGONAL=int(options.precision == "orthogonal"), **macros
-        )
 
     def _batches(self, offsets: NDArray[np.int64], sh_count: int) -> list[tuple[int, int]]:
         """Runs of splats of which two fit the memory budget, and one each of the device's buffers."""

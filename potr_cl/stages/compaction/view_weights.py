@@ -10,10 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
+from potr_cl.model.camera import Camera
 
 #: Weights are in pixels of an image of this many: lambda then means the same whatever size the views are rendered at.
 #: Half a megapixel is about the size of the images on which the paper's figures for lambda were measured.
 REFERENCE_PIXELS = 500_000
+
+
+def pixel_weight(camera: Camera) -> float:
+    """What a pixel of a view counts, so that all views count the same whatever their size."""
+    return REFERENCE_PIXELS / (camera.width * camera.height)
+
 
 #: The largest weight whose squares and sums stay finite in single precision.
 _LARGEST_WEIGHT = 1e12

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -10,11 +11,32 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
+from potr_cl.codec.quantize import LEAST_LOGIT, ZERO_SCALE, canonical_rotations
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Memory, Owner
+from potr_cl.raster.activation import LARGEST_SCALE, unit_quaternions
 from potr_cl.raster.scene_buffers import SPLAT_GROUP, SceneBuffers
 from potr_cl.stages.fitting.derivatives import Columns
-from potr_cl.stages.fitting.parameters import UNROUNDED, Factors, Parameters
+
+
+@dataclass(frozen=True)
+class Factors:
+    """What a file rounds shapes and opacities with: a step is 1 / factor. 0: they are not rounded.
+
+    Attributes:
+        scale: of standard deviations, world units.
+        rotation: of quaternions, times the root of the splat's largest scale level.
+        opacity: of logits.
+    """
+
+    scale: float = 0.0
+    rotation: float = 0.0
+    opacity: float = 0.0
+
+
+UNROUNDED = Factors()
+
 
 #: How fast the moments forget (Kingma and Ba, 2015), and the averages: after about so many steps.
 _DECAY_MEAN, _DECAY_SQUARE = 0.9, 0.999
@@ -57,7 +79,7 @@ class Limits:
     opacity_logits: tuple[float, float]
 
 
-class Adam(Parameters):
+class Adam(Owner):
     """The parameters of a scene, the moments of their gradient, and their averages over the last steps.
 
     Each step goes down the gradient of a few views, and away from where others would have it: the parameters sway about
@@ -70,11 +92,13 @@ class Adam(Parameters):
         columns: which parameter is in which column.
         rates: of a step.
         limits: of the parameters.
-        factors: what the rasterizer's scene is rounded with; the gradient is taken for that of the parameters, as if
-            nothing were (the straight-through estimator of Bengio et al., 2013).
+        factors: what the rasterizer's scene is rounded with, while ``values`` are not; the scene has to be
+            :func:`in_form_of_files` then. The gradient is taken for that of the parameters, as if nothing were rounded
+            (the straight-through estimator of Bengio et al., 2013).
 
-    Raises:
-        DeviceError: it does not fit the device, or the kernels cannot be built.
+    Attributes:
+        buffers, columns: as given.
+        values: (columns, stride) float32, the parameters; quaternions of length 1 at first.
     """
 
     def __init__(
@@ -87,21 +111,22 @@ class Adam(Parameters):
         limits: Limits,
         factors: Factors = UNROUNDED,
     ) -> None:
-        super().__init__(device, scene, buffers, columns, factors)
-        self._taken = 0
+        self._device, self._scene, self.buffers, self.columns = device, scene, buffers, columns
+        self._factors, self._taken = factors, 0
         # AC coefficients that stand still are left out: four fifths of all columns. Their average is what they are.
         self._moving = columns.count if rates.ac else columns.ac.start
-        try:
+        self._start = _columns_of(scene, columns, buffers.stride)
+        self._memory = Memory(device)
+        with device.all_or_nothing():
+            self.values = self._memory.upload(self._start, "the parameters")
+            self._kept = self._memory.upload(self._start, "the best parameters")
             nbytes = self.values.size
             self._moments = [self._memory.allocate(nbytes, "the gradient's moments") for _ in range(2)]
             for moment in self._moments:
                 device.fill(moment, np.float32(0), nbytes)
             self._averages = self._memory.upload(self._start, "the averages")
             self._steps = self._memory.upload(_steps(columns, rates, limits), "the steps")
-            self._step = device.shared_kernel("fit/adam.cl", "adam")
-        except BaseException:
-            self.close()
-            raise
+            self._activate, self._step = (device.shared_kernel("fit/adam.cl", name) for name in ("activate", "adam"))
 
     def step(self, gradient: cl.Buffer, part: float) -> None:
         """Take a step, and give the rasterizer its scene.
@@ -160,6 +185,72 @@ class Adam(Parameters):
         finally:
             self.values = moving
             self.give()
+
+    def give(self, colours: bool = True) -> None:
+        """Write the parameters to the rasterizer's buffers, as its projection takes them.
+
+        Args:
+            colours: whether also the SH coefficients, which lie there just as they do here.
+        """
+        buffers = self.buffers
+        self._activate.bind(
+            parameters=self.values,
+            splats=buffers.splats,
+            stride=buffers.stride,
+            sh_columns=self.columns.sh if colours else 0,
+            largest_scale=LARGEST_SCALE,
+            sf_scale=self._factors.scale,
+            zero_scale=ZERO_SCALE,
+            sf_rotation=self._factors.rotation,
+            sf_opacity=self._factors.opacity,
+            least_logit=LEAST_LOGIT,
+            means=buffers.means,
+            scales=buffers.scales,
+            quaternions=buffers.quaternions,
+            log2_opacities=buffers.log2_opacities,
+            sh=buffers.sh,
+        )
+        self._activate.launch((buffers.stride,), (SPLAT_GROUP,))
+
+    def keep(self) -> None:
+        """Remember the parameters as they are, in place of what was remembered before."""
+        cl.enqueue_copy(self._device.queue, self._kept, self.values)
+
+    def kept(self) -> Scene:
+        """The scene as it was when :meth:`keep` was called last. Splats that have not moved are the same bit by bit."""
+        columns = self.columns
+        found = self._device.download(self._kept, self._start.shape, np.float32)
+        moved = np.flatnonzero((found != self._start)[:, : len(self._scene)].any(axis=0))
+        rows = found[:, moved].T
+        scene = self._scene
+        arrays = {}
+        for name in ("means", "log_scales", "quaternions", "opacity_logits"):
+            former = getattr(scene, name)
+            arrays[name] = former.copy()
+            arrays[name][moved] = rows[:, getattr(columns, name)].reshape(len(moved), *former.shape[1:])
+        sh = np.array(scene.sh, np.float32)
+        sh[moved] = rows[:, 11:].reshape(len(moved), *sh.shape[1:])
+        return Scene(**arrays, sh=sh, antialiased=scene.antialiased, low_pass=scene.low_pass)
+
+
+def in_form_of_files(scene: Scene) -> Scene:
+    """The same splats, of their equivalent forms each in the one that a file has: what :class:`Factors` are for."""
+    imaginary, log_scales = canonical_rotations(scene.quaternions, scene.log_scales)
+    real = np.sqrt(np.maximum(1 - (imaginary**2).sum(axis=1), 0))
+    quaternions = np.column_stack([real, imaginary]).astype(np.float32)
+    return dataclasses.replace(scene, quaternions=quaternions, log_scales=log_scales)
+
+
+def _columns_of(scene: Scene, columns: Columns, stride: int) -> FloatArray:
+    """(columns, stride) the parameters of a scene; quaternions of length 1."""
+    result = np.zeros((columns.count, stride), np.float32)
+    some = slice(0, len(scene))
+    result[columns.means, some] = scene.means.T
+    result[columns.log_scales, some] = scene.log_scales.T
+    result[columns.quaternions, some] = unit_quaternions(scene.quaternions).T
+    result[columns.opacity_logits, some] = scene.opacity_logits
+    result[11:, some] = scene.sh.reshape(len(scene), -1).T
+    return result
 
 
 def _steps(columns: Columns, rates: Rates, limits: Limits) -> FloatArray:

@@ -28,11 +28,15 @@ from potr_cl.opencl.narrow import Narrowed, Narrowing
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.raster.scene_buffers import SPLAT_GROUP
+from potr_cl.raster.sweep import TileSweep, fixed_point_scale
 from potr_cl.raster.view_set import ViewSet
-from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
-from potr_cl.stages.fitting.fixed_point import fixed_point_scale
-from potr_cl.stages.fitting.sweep import Sweep
+from potr_cl.stages.compaction.view_weights import pixel_weight
 
+#: Pixels' numbers beyond this are cut in the kernels (macros of cl/fit/sums.clh), and so are their products with the
+#: difference of a splat's colour to the one behind it: no sum can overflow.
+_LARGEST_VALUE, _LARGEST_GAP = 64.0, 256.0
+#: U² + V² of sums.clh is less wherever alpha reaches 1/255.
+_LARGEST_SQUARE = 8.1
 #: Bytes of a splat's sums in a view: nine 64-bit integers.
 _SUMS = 72
 
@@ -76,9 +80,6 @@ class PictureDerivatives(Owner):
         rasterizer: of the scene.
         columns: which parameter is in which column of the gradient.
         gradient: (columns, stride) float32, what :meth:`add` adds to; zero at first.
-
-    Raises:
-        DeviceError: the scene does not fit the device, or the kernels cannot be built.
     """
 
     def __init__(
@@ -89,7 +90,9 @@ class PictureDerivatives(Owner):
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
         self._device = device
-        self._sweep = Sweep(device, rules)
+        self._sweep = TileSweep(
+            device, rules, "fit/derivatives", "derivatives", LARGEST_VALUE=_LARGEST_VALUE, LARGEST_GAP=_LARGEST_GAP
+        )
         self._memory = Memory(device)
         self._totals = Scratch(device, "the derivatives' sums")
         self._factors = Scratch(device, "the views' weights")
@@ -126,10 +129,7 @@ class PictureDerivatives(Owner):
             target: (pixels, 3) float32, the pictures of the views, one behind the other.
             given: whether ``target`` holds v; if not, v is the views' difference to these pictures.
             unit: by what v is multiplied while it is summed up: with large numbers small differences keep their digits,
-                but what exceeds ``LARGEST_VALUE`` then is cut.
-
-        Raises:
-            DeviceError: a view does not fit the device, or the device failed.
+                but what exceeds ``_LARGEST_VALUE`` then is cut.
         """
         pixels = 0
         at_a_time = self._sweep.most_views
@@ -145,28 +145,28 @@ class PictureDerivatives(Owner):
                     raise
                 at_a_time = (len(some) + 1) // 2
                 continue
-            self.add_prepared(views, target, pixels, given, unit)
+            scale = _scale(some)
+            self._sweep_over(views, target, pixels, scale, unit, given)
+            self._follow(views, scale * (1.0 if given else unit))
             number += len(some)
             pixels += views.pixels
 
-    def add_prepared(
-        self, views: ViewSet, target: cl.Buffer, first_pixel: int = 0, given: bool = False, unit: float = 1.0
+    def _sweep_over(
+        self, views: ViewSet, target: cl.Buffer, first_pixel: int, scale: float, unit: float, given: bool = False
     ) -> None:
-        """:meth:`add` views that the rasterizer has prepared since the parameters changed last.
-
-        Args:
-            views: as many as one launch can do.
-            target, given, unit: as of :meth:`add`.
-            first_pixel: where the views' pixels begin in ``target``.
-
-        Raises:
-            DeviceError: the sums do not fit the device, or the device failed.
-        """
-        self._reserve(views)
-        scale = _scale([view.camera for view in views.views])
-        background = self.rasterizer.background
-        self._sweep.run(views, background, target, first_pixel, given, unit, scale, self._totals.buffer)
-        self._follow(views, scale * (1.0 if given else unit))
+        """Enqueue the sums of cl/fit/sums.clh over the pixels of some views, times ``scale``."""
+        self._sweep.run(
+            views,
+            views.shapes,
+            views.colours,
+            self.rasterizer.background,
+            target=target,
+            first_pixel=first_pixel,
+            given=given,
+            unit=unit,
+            scale=scale,
+            totals=self._totals.buffer,
+        )
 
     def sums(
         self, cameras: Sequence[Camera], places: Sequence[int], target: cl.Buffer, unit: float
@@ -188,8 +188,7 @@ class PictureDerivatives(Owner):
                 continue
             views = self._prepared([cameras[place] for place in own])
             self._reserve(views)
-            scale, background = _scale([cameras[place] for place in group]), self.rasterizer.background
-            self._sweep.run(views, background, target, pixels, False, unit, scale, self._totals.buffer)
+            self._sweep_over(views, target, pixels, _scale([cameras[place] for place in group]), unit)
             pixels += views.pixels
             count = _SUMS // 8 * views.stride
             for number, place in enumerate(own):
@@ -199,11 +198,7 @@ class PictureDerivatives(Owner):
         return found
 
     def add_sums(self, cameras: Sequence[Camera], sums: Sequence[tuple[int, Narrowed]], unit: float) -> None:
-        """:meth:`add` views of which all sums are known: the same bits.
-
-        Raises:
-            DeviceError: the views' projections and sums do not fit the device, or the device failed.
-        """
+        """:meth:`add` views of which all sums are known: the same bits."""
         known = dict(sums)
         for group in self._launches(cameras):
             some = [cameras[place] for place in group]
@@ -242,7 +237,7 @@ class PictureDerivatives(Owner):
     def _follow(self, views: ViewSet, scale: float) -> None:
         """From the sums, which were multiplied by this, to the gradient."""
         cameras = [view.camera for view in views.views]
-        factors = [REFERENCE_PIXELS / (camera.width * camera.height) / scale for camera in cameras]
+        factors = [pixel_weight(camera) / scale for camera in cameras]
         if factors != self._written:  # whoever writes waits for the device
             written = np.array(factors, np.float32)
             cl.enqueue_copy(self._device.queue, self._factors.buffer, written, is_blocking=True)
@@ -285,4 +280,5 @@ class PictureDerivatives(Owner):
 
 def _scale(cameras: Sequence[Camera]) -> float:
     """The fixed point of views that a launch does."""
-    return fixed_point_scale(max(each.width for each in cameras), max(each.height for each in cameras))
+    largest = max(_LARGEST_VALUE, _LARGEST_GAP * _LARGEST_SQUARE)
+    return fixed_point_scale(max(each.width for each in cameras), max(each.height for each in cameras), largest)

@@ -13,10 +13,10 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -24,16 +24,67 @@ from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import Drawable
-from potr_cl.stages.fitting.adam import Adam, Limits, Rates
-from potr_cl.stages.fitting.at_photographs import FittedToPhotographs
-from potr_cl.stages.fitting.files import TwoFiles
-from potr_cl.stages.fitting.judges import Judges
-from potr_cl.stages.fitting.parameters import UNROUNDED, Factors
-from potr_cl.stages.fitting.together import Batch, Descent, Ground, Helpers, Together, room_for_pictures, together
-from potr_cl.stages.fitting.views import batches, share_out
+from potr_cl.stages.fitting.adam import UNROUNDED, Adam, Factors, Limits, Rates
+from potr_cl.stages.fitting.fitted import Fitted, decibels
+from potr_cl.stages.fitting.together import Batch, Descent, Ground, Together, room_for_pictures, together
+from potr_cl.stages.held_out import share_out
+from potr_cl.views.shares import HelpFrom
 from potr_cl.views.targets import TargetPictures, Targets
+
+#: Work-items that sum up a picture's squared differences, and those of a group.
+_ITEMS, _GROUP = 1 << 14, 64
+
+
+class Judges(Owner):
+    """Views that are held out of a fit.
+
+    Args:
+        device: to compute on.
+        rasterizer: of the scene, which may change between two calls.
+        cameras: all views.
+        pictures: what they should show.
+        held_out: the numbers of those that judge.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        rasterizer: Rasterizer,
+        cameras: Sequence[Camera],
+        pictures: TargetPictures,
+        held_out: Sequence[int],
+    ) -> None:
+        self._device, self._rasterizer, self._cameras, self._pictures = device, rasterizer, cameras, pictures
+        self._held_out = list(held_out)
+        self._kernel = device.shared_kernel("fit/squared_error.cl", "squared_error")
+        self._memory = Memory(device)
+        self._sums = self._memory.allocate(4 * _ITEMS * max(len(self), 1), "the judges' sums")
+
+    def __len__(self) -> int:
+        return len(self._held_out)
+
+    def error(self) -> float:
+        """The mean squared error of the scene as it is now, all views the same."""
+        for place, number in enumerate(self._held_out):
+            image, _ = self._rasterizer.render_device(self._cameras[number])
+            self._kernel.bind(
+                picture=image,
+                target=self._pictures.of([number]),
+                count=self._values(number),
+                sums=self._sums,
+                first_sum=_ITEMS * place,
+            )
+            self._kernel.launch((_ITEMS,), (_GROUP,))
+        sums = self._device.download(self._sums, (len(self), _ITEMS), np.float32).sum(axis=1, dtype=np.float64)
+        return float(np.mean(sums / [self._values(number) for number in self._held_out]))
+
+    def _values(self, number: int) -> int:
+        camera = self._cameras[number]
+        return 3 * camera.width * camera.height
+
 
 logger = logging.getLogger("potr_cl")
 
@@ -48,9 +99,6 @@ _LARGEST_UNIT = 2.0**20
 #: is larger than these, or smaller than a part of them.
 RATES = Rates(means=0.005, log_scales=1e-2, quaternions=2e-3, opacity_logits=4e-2, dc=5e-3, ac=5e-4)
 _USUAL_ERROR, _SLOWEST = 1 / 128, 0.02
-#: A fit has gained enough to be taken without a look at files if what it leaves of the cost is below the one part, and
-#: of the error, where it has made up for no splats, below the other (docs/benchmarks/findings.md).
-_MUCH_CHEAPER, _MUCH = 0.9, 0.4
 
 
 @dataclass(frozen=True)
@@ -94,78 +142,6 @@ class FitOptions:
                 raise UsageError(f"the fit's {name} rate is {getattr(self, name):g}, it must be above 0 and at most 1")
 
 
-@dataclass(frozen=True)
-class Fitted:
-    """What a fit did.
-
-    Attributes:
-        scene: the one that is kept.
-        steps: that were taken, and kept: of these, up to the round that is kept.
-        errors: mean squared error of the held-out views before the first round, and after each.
-        held_out: how many views these are.
-        ended_early: whether someone has asked it to end.
-        spared: how many splats were removed before it for it to make up for.
-        without: the error of these views before those were removed; None where none were.
-        settled: mean squared error of these views after each fit that followed a choice of coefficients or a rounding.
-        photographs: what a further fit to photographs did; None if there were none.
-        cost: what the scene costs, error and splats together, as a part of what it cost before those were removed.
-        files: that were made to see whether the fit pays; None where there was no doubt.
-    """
-
-    scene: Scene
-    steps: int
-    kept: int
-    errors: tuple[float, ...]
-    held_out: int
-    ended_early: bool = False
-    spared: int = 0
-    without: float | None = None
-    settled: tuple[float, ...] = ()
-    photographs: FittedToPhotographs | None = None
-    cost: float = 0.0
-    files: TwoFiles | None = None
-
-    @property
-    def in_doubt(self) -> bool:
-        """Whether what was gained is so little that the file may lose it again."""
-        little = self.without is not None and not self.spared and self.error > _MUCH * self.without
-        return little or self.cost > _MUCH_CHEAPER
-
-    @property
-    def error(self) -> float:
-        """Of the held-out views, of the scene that is kept."""
-        return min(self.errors)
-
-    @property
-    def psnr(self) -> tuple[float, float]:
-        """Of the held-out views before and after, in decibels."""
-        return _decibels(self.errors[0]), _decibels(min(self.errors))
-
-    @property
-    def facts(self) -> dict[str, Any]:
-        """All but the scene, by name."""
-        names = ("steps", "kept", "held_out", "ended_early", "spared", "without")
-        facts = {name: getattr(self, name) for name in names}
-        facts |= {"errors": list(self.errors), "settled": list(self.settled)}
-        facts |= {"cost": self.cost, "files": None if self.files is None else self.files.facts}
-        return facts | {"photographs": None if self.photographs is None else self.photographs.facts}
-
-    def __str__(self) -> str:
-        before, after = self.psnr
-        views = f"{self.held_out} view{'s' if self.held_out > 1 else ''} held out"
-        steps = f"{self.kept} of {self.steps} steps are kept"
-        if self.ended_early:
-            steps += ", interrupted"
-        said = f"{steps}: PSNR {before:.2f} dB before, {after:.2f} dB after, {views}"
-        if self.spared and self.without is not None:
-            said += f"; {_decibels(self.without):.2f} dB with {self.spared:,} splats more, without it"
-        if self.settled:
-            said += f"; {_decibels(self.settled[-1]):.2f} dB with geometry and coefficients as in the file"
-        for each in (self.files, self.photographs):
-            said += "" if each is None else f"; {each}"
-        return said
-
-
 class SupportsBool(Protocol):
     """What is true or false whenever it is looked at."""
 
@@ -190,7 +166,7 @@ def fit_scene(
     held_out: Sequence[int] | None = None,
     fit_to: Sequence[int] | None = None,
     factors: Factors = UNROUNDED,
-    helpers: Helpers | None = None,
+    help_from: HelpFrom | None = None,
 ) -> Fitted:
     """Fit all parameters of a scene to pictures of some views.
 
@@ -208,8 +184,8 @@ def fit_scene(
         held_out: numbers of the views to judge by; None: some of the given ones.
         fit_to: numbers of the views to look at, where the judges are given; None: all others.
         factors: what a file will round shapes and opacities with. All is looked at as it is rounded, but what comes of
-            it is not. The scene as :class:`potr_cl.stages.fitting.parameters.Parameters` takes it then.
-        helpers: do some of the views; the result is the same.
+            it is not. The scene as :class:`potr_cl.stages.fitting.adam.Adam` takes it then.
+        help_from: do some of the views; the result is the same.
 
     Raises:
         UsageError: there are fewer than two given views, so that none can be held out.
@@ -233,7 +209,7 @@ def fit_scene(
         batch = min(options.batch, len(fit_to))
         with (
             Judges(device, descent.derivatives.rasterizer, cameras, pictures, held_out) as judges,
-            together(descent, ground, helpers if options.steps else None, options.memory, batch) as steps,
+            together(descent, ground, help_from if options.steps else None, options.memory, batch) as steps,
         ):
             return _run(options, steps, descent.adam, judges, fit_to, progress, tell or logger.debug, asked)
 
@@ -314,16 +290,11 @@ def _run(
                 kept, since = done, 0
             else:
                 since += 1
-        now, first = _decibels(errors[-1]), _decibels(errors[0])
+        now, first = decibels(errors[-1]), decibels(errors[0])
         tell(f"fit: {done} steps, held-out views {now:.2f} dB, {first:.2f} dB at first")
         if since >= options.patience:
             break
     return Fitted(adam.kept(), done, kept, tuple(errors), len(judges), bool(asked))
-
-
-def _decibels(error: float) -> float:
-    """The PSNR of a mean squared error of colours from 0 to 1."""
-    return -10 * math.log10(max(error, 1e-20))
 
 
 def _usual_size(scene: Scene) -> float:
@@ -345,3 +316,21 @@ def _unit(error: float) -> float:
     if not 0 < error < math.inf:
         return 1.0
     return min(max(2.0 ** math.floor(math.log2(_USUAL_DIFFERENCE / math.sqrt(error))), 1.0), _LARGEST_UNIT)
+
+
+def batches(numbers: Sequence[int], size: int, seed: int) -> Iterator[list[int]]:
+    """Views in batches, for ever: all of them in a random order, then all again in another.
+
+    Args:
+        numbers: of the views, at least one.
+        size: of a batch; less if there are not so many views.
+        seed: of the order.
+    """
+    rng = np.random.default_rng(seed)
+    size = min(size, len(numbers))
+    waiting: list[int] = []
+    while True:
+        while len(waiting) < size:
+            waiting += [int(number) for number in rng.permutation(numbers)]
+        yield waiting[:size]
+        waiting = waiting[size:]

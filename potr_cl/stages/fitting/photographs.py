@@ -17,9 +17,9 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.stages.fitting.adam import Rates
-from potr_cl.stages.fitting.at_photographs import FittedToPhotographs
 from potr_cl.stages.fitting.fit import FitOptions, FitProgress, SupportsBool, fit_scene, kept_pictures
-from potr_cl.stages.refitting.photographs import hold_out
+from potr_cl.stages.fitting.fitted import FittedToPhotographs
+from potr_cl.stages.held_out import hold_out
 from potr_cl.views.targets import Photographs, PhotographTargets
 
 #: The trial: its steps, the parts after which held-out photographs are looked at, and its rates as parts of the fit's.

@@ -24,14 +24,13 @@ from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.fitting.adam import Rates
+from potr_cl.stages.fitting.adam import UNROUNDED, Factors, Rates, in_form_of_files
 from potr_cl.stages.fitting.fit import FitOptions, SupportsBool, fit_scene
-from potr_cl.stages.fitting.parameters import UNROUNDED, Factors, in_form_of_files
-from potr_cl.stages.fitting.together import Helpers
-from potr_cl.stages.fitting.views import share_out
+from potr_cl.stages.held_out import share_out
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.stage import State, Workbench
+from potr_cl.views.shares import HelpFrom
 from potr_cl.views.targets import RenderedTargets, TargetPictures, Targets
 
 #: Steps of the solution that coefficients are chosen by; the last solution, of the re-fit, takes more.
@@ -65,14 +64,14 @@ class Looking:
         views: of the fit; the last ``added`` of them are not given ones. added: see there.
         targets: what these should show.
         rasterizer: of the scene that they show.
-        helpers: do some of the views of fits.
+        help_from: do some of the views of fits.
     """
 
     views: Sequence[Camera]
     added: int
     targets: Targets | TargetPictures
     rasterizer: Rasterizer
-    helpers: Helpers | None = None
+    help_from: HelpFrom | None = None
 
 
 def settle(
@@ -100,9 +99,6 @@ def settle(
         the steps of now, if the output is a .potr file in one block of version 2 or later: what others hold is not
         known here. What is learnt are the parameters that coefficients were chosen with. And the mean squared
         error of the held-out views after each fit.
-
-    Raises:
-        DeviceError: it does not fit the device.
     """
     errors: list[float] = []
 
@@ -114,16 +110,16 @@ def settle(
         )
         found = fit_scene(
             bench.opened, scene, looking.views, looking.targets, more, looking.added, bench.background,
-            tell=bench.tell, asked=asked, factors=factors, helpers=looking.helpers,
+            tell=bench.tell, asked=asked, factors=factors, help_from=looking.help_from,
         )  # fmt: skip
         errors.append(found.error)
         progress(steps)
         return found.scene
 
     still = ("ac",)
-    if settling.choosing and bench.parameters.drop and not state.learnt.compacted:
+    if settling.choosing and bench.parameters.drop and not state.results.compacted:
         scene = fitted(_with_chosen(state, bench, looking), settling.choosing, settling.gentle, still)
-        state = dataclasses.replace(state, scene=scene, geometry=None).having_learnt(chosen=bench.parameters)
+        state = dataclasses.replace(state, scene=scene, geometry=None).with_results(chosen=bench.parameters)
     rounded = bench.output.geometry(state.scene, bench.request(state)) if settling.rounding else None
     if not isinstance(rounded, Geometry) or not isinstance(QUANTISERS[rounded.parameters.quantiser], Balanced):
         return state, tuple(errors)

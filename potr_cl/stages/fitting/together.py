@@ -21,15 +21,15 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
 from potr_cl.opencl.narrow import Narrowed
-from potr_cl.raster.kept_scene import KeptScene, lying_on
+from potr_cl.raster.resident import ResidentScene, scene_on
 from potr_cl.raster.scene_buffers import Drawable
-from potr_cl.stages.fitting.adam import Adam, Limits, Rates
+from potr_cl.stages.fitting.adam import UNROUNDED, Adam, Factors, Limits, Rates
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
-from potr_cl.stages.fitting.parameters import UNROUNDED, Factors
+from potr_cl.views.shares import HelpFrom
 from potr_cl.views.targets import Room, TargetPictures, targets_of
 from potr_cl.workers.helping import Helping
 from potr_cl.workers.parts import Each, Parts
-from potr_cl.workers.pool import Part, Pool
+from potr_cl.workers.pool import Part
 
 #: Part of a device's memory not yet taken that target pictures may take unless the caller says how much.
 _SHARE = 0.25
@@ -38,19 +38,6 @@ _TRIED, _FIRST = 6, 2
 
 #: Sums of some of a batch's views, by their places.
 Sums = list[tuple[int, Narrowed]]
-
-
-@dataclass(frozen=True)
-class Helpers:
-    """Workers that do some of the views of a fit.
-
-    Attributes:
-        pool: the workers.
-        source: the scene whose pictures are the targets, perhaps kept on devices.
-    """
-
-    pool: Pool
-    source: Scene | KeptScene
 
 
 @dataclass(frozen=True)
@@ -103,9 +90,6 @@ class Descent(Owner):
     Attributes:
         derivatives, adam: of the scene.
         taken: steps, so far.
-
-    Raises:
-        DeviceError: the scene does not fit the device.
     """
 
     def __init__(self, device: Device, ground: Ground, pictures: TargetPictures) -> None:
@@ -147,10 +131,6 @@ class Descent(Owner):
     def _of(self, batch: Batch) -> list[Camera]:
         return [self._cameras[number] for number in batch.numbers]
 
-    def close(self) -> None:
-        """Give all device memory back."""
-        self._owned.close()
-
 
 class FitPart(Part):
     """A :class:`Descent` that follows another one.
@@ -162,9 +142,9 @@ class FitPart(Part):
         source: the scene whose pictures are the targets.
     """
 
-    def __init__(self, device: Device, memory: int | None, ground: Ground, source: Drawable | KeptScene) -> None:
+    def __init__(self, device: Device, memory: int | None, ground: Ground, source: Drawable | ResidentScene) -> None:
         with ExitStack() as owned:
-            scene = owned.enter_context(lying_on(device, source))
+            scene = owned.enter_context(scene_on(device, source))
             targets = owned.enter_context(targets_of(device, scene, ground.cameras, ground.background))
             room = room_for_pictures(device, memory)
             pictures = owned.enter_context(TargetPictures(device, ground.cameras, room, targets))
@@ -192,10 +172,6 @@ class FitPart(Part):
         self._descent.adam.adopt(taken, state)
         self._descent.taken = taken
 
-    def close(self) -> None:
-        """Give all device memory back."""
-        self._owned.close()
-
 
 class Together:
     """A fit that others help with, as long as this is faster.
@@ -213,11 +189,7 @@ class Together:
         self._since, self._seconds = 0.0, list[float]()
 
     def step(self, batch: Batch) -> None:
-        """Take a step.
-
-        Raises:
-            DeviceError: the first device failed.
-        """
+        """Take a step."""
         self._look_at_the_time()
         if self._helping.parts is None or _FIRST + _TRIED <= self._steps < _FIRST + 2 * _TRIED:
             self._descent.step(batch)
@@ -265,25 +237,25 @@ class Together:
 
 @contextmanager
 def together(
-    descent: Descent, ground: Ground, helpers: Helpers | None, memory: int | None, batch: int
+    descent: Descent, ground: Ground, help_from: HelpFrom | None, memory: int | None, batch: int
 ) -> Iterator[Together]:
     """A fit by all who are there.
 
     Args:
         descent: the first device's.
         ground: where it begins.
-        helpers: who does views besides; None: nobody.
+        help_from: who does views besides; None: nobody.
         memory: bytes of a device's memory that target pictures may take; None: a quarter of what is free.
         batch: views of a step: there is no use for more workers.
     """
-    pool = None if helpers is None or helpers.pool.first is not descent.device else helpers.pool
+    pool = None if help_from is None or help_from.pool.first is not descent.device else help_from.pool
     with Helping(descent.device, "fit") as helping:
 
         def opened(stack: ExitStack) -> Parts | None:
             assert pool is not None
-            assert helpers is not None
+            assert help_from is not None
             count = min(len(pool.workers()), batch - pool.takes_part)
-            given = [stack.enter_context(pool.shared(each)) for each in (ground, helpers.source)]
+            given = [stack.enter_context(pool.shared(each)) for each in (ground, help_from.source)]
             if count <= 0:
                 return None
             parts = stack.enter_context(Parts(pool, FitPart, [given] * count, memory))

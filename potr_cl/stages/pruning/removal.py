@@ -7,10 +7,9 @@ totals a splat, in units that follow from all views. So it makes no difference t
 together, with which splats, and which of them stay on the device: that is the plan's matter
 (:mod:`potr_cl.views.plan`), and the engine's (:mod:`potr_cl.views.engine`).
 
-The parts: staleness.py (what may be traded for speed, and which tiles the host has swept again), resident.py and
-streamed.py (measuring views that stay on the device and views that do not), prepared_set.py (what is kept of them, and
-who numbers splats how), launcher.py (the kernels of either family), survivors.py (which splats are left) and
-fixed_point.py (the totals' units).
+The parts: sweep.py (what may be traded for speed, the totals' units, and the kernels of either family), resident.py and
+streamed.py (measuring views that stay on the device and views that do not), buffers.py (which splats are left, what is
+kept of views, and who numbers splats how), helpers.py (others that measure some views).
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyopencl as cl
@@ -32,20 +31,19 @@ from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
 from potr_cl.raster.view_set import ViewSet
-from potr_cl.stages.pruning.fixed_point import FixedPoint
-from potr_cl.stages.pruning.launcher import launchers
-from potr_cl.stages.pruning.prepared_set import Ledger, PreparedSet
+from potr_cl.stages.pruning.buffers import Bits, Ledger, PreparedSet, Survivors
 from potr_cl.stages.pruning.resident import Queues, ResidentSweep
-from potr_cl.stages.pruning.staleness import SweepOptions
 from potr_cl.stages.pruning.streamed import StreamedSweep
-from potr_cl.stages.pruning.survivors import Bits, Survivors
+from potr_cl.stages.pruning.sweep import FixedPoint, SweepOptions, family_of
 from potr_cl.views import plan as plans
 from potr_cl.views.budget import default_memory, tiles_of
 from potr_cl.views.engine import ViewEngine
 from potr_cl.views.plan import ViewPlan
 from potr_cl.views.subsets import CopiedSplats, NamedSplats, SplatSource, Subset, WholeScene
 from potr_cl.views.visibility import Visibility
-from potr_cl.workers.parts import Pending
+
+if TYPE_CHECKING:
+    from potr_cl.stages.pruning.helpers import RemovalHelpers
 
 F64 = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -53,27 +51,6 @@ Indices = NDArray[np.int64]
 #: The total that spares a splat: a ΔMSE of about 1, by the bounds of :class:`FixedPoint`; and what limits it is beyond.
 _SPARED, LARGEST_LIMIT = 1 << 58, 0.1
 _GROUP = 64
-
-
-class Others(Protocol):
-    """Measure some of the views; :class:`potr_cl.stages.pruning.shared_removal.OtherViews` is one."""
-
-    @property
-    def steers(self) -> bool: ...
-
-    def begin(self) -> Pending: ...
-
-    def take(self, pending: Pending, totals: cl.Buffer) -> None: ...
-
-    def remove(self, marked: Bits) -> None: ...
-
-    def are_left(self, marks: cl.Buffer, first: bool = False) -> None: ...
-
-    def replace_sh(self, sh: FloatArray) -> Pending: ...
-
-    def sweep_changed(self) -> Pending: ...
-
-    def importances(self) -> list[Iterator[tuple[int, Indices, F64]]]: ...
 
 
 class RemovalSweep(Owner):
@@ -88,13 +65,13 @@ class RemovalSweep(Owner):
         numbers: of the views that are measured here, ascending, where others are measured elsewhere; None: all.
         plan: of these views; None: all of them with all splats.
         spared: (N,) splats whose effects are to be beyond :data:`LARGEST_LIMIT`, so that they are never removed.
-        others: measure the other views. All totals are integers in units that follow from all views, so it makes no
+        helpers: measure the other views. All totals are integers in units that follow from all views, so it makes no
             difference to any bit who measures which.
 
     Attributes:
         device: where the totals and the marks are. splats: N.
         totals: (N, 2) int64 in the device's memory, and units: ΔMSE and I of 1 there.
-        marks: (N,) uint8 in the device's memory, :class:`~potr_cl.stages.pruning.survivors.SplatState`. A controller on
+        marks: (N,) uint8 in the device's memory, :class:`~potr_cl.stages.pruning.buffers.SplatState`. A controller on
             the device marks splats as JUST_REMOVED and calls :meth:`remove_marked`; when it marks the next ones, it
             changes the earlier marks to REMOVED.
         fixed_point: the totals' units, those of all views.
@@ -114,7 +91,7 @@ class RemovalSweep(Owner):
         numbers: Sequence[int] | None = None,
         plan: ViewPlan | None = None,
         spared: NDArray[np.bool_] | None = None,
-        others: Others | None = None,
+        helpers: RemovalHelpers | None = None,
     ) -> None:
         source = scene if isinstance(scene, SplatSource) else WholeScene(scene)
         if not cameras:
@@ -126,13 +103,13 @@ class RemovalSweep(Owner):
         if plan is None:
             room = default_memory(self.device) if options.memory is None else options.memory
             plan = plans.whole(range(len(cameras)) if numbers is None else numbers, self.splats, room)
-        self._cameras, self._pending, self._others = cameras, list[cl.Event](), others
+        self._cameras, self._pending, self._helpers = cameras, list[cl.Event](), helpers
         with ExitStack() as owned:
             owned.callback(source.close)
             self._memory = owned.enter_context(Memory(self.device))
             self.totals: cl.Buffer = self._memory.allocate(16 * source.stride, "the removal effects")
             self._own = self.totals
-            if others is not None:
+            if helpers is not None:
                 self.device.fill(self.totals, np.int64(0))
                 if plan.groups:
                     self._own = self._memory.allocate(16 * source.stride, "the removal effects")
@@ -141,7 +118,7 @@ class RemovalSweep(Owner):
                 Survivors(self.device, self.splats, source.stride, lambda: self._queues.wait())
             )
             self.marks: cl.Buffer = self._survivors.buffer
-            family = launchers(self.device)
+            family = family_of(self.device)
             self._queues = Queues(self.device, 1)
             self._engine = ViewEngine(source, cameras, plan, self._attach, family.most_views, progress)
             owned.enter_context(self._engine)
@@ -162,11 +139,11 @@ class RemovalSweep(Owner):
             owned.enter_context(self._resident)
             self._streamed = StreamedSweep(self._engine, self._survivors, options, self.fixed_point)
             owned.enter_context(self._streamed)
-            if others is not None:
-                others.are_left(self.marks, first=True)
+            if helpers is not None:
+                helpers.are_left(self.marks, first=True)
             self._owned = owned.pop_all()
         self._measured = self._streamed_added = False
-        elsewhere = len(cameras) - len(plan.numbers) if others else 0
+        elsewhere = len(cameras) - len(plan.numbers) if helpers else 0
         self.resident_views = elsewhere + len(self._engine.idle) + sum(len(ready.numbers) for ready in resident)
 
     def _attach(
@@ -193,8 +170,8 @@ class RemovalSweep(Owner):
         """Itself, for a controller on the device; None if the host has to decide: where it is asked which tiles are
         swept, or where streamed views are measured so often that nothing is gained."""
         often = self._engine.streamed and not self._engine.plan.patience
-        others = self._others is None or self._others.steers
-        return self if self._resident.device_lists and not often and others else None
+        helpers = self._helpers is None or self._helpers.steers
+        return self if self._resident.device_lists and not often and helpers else None
 
     @property
     def alive(self) -> NDArray[np.bool_]:
@@ -205,8 +182,8 @@ class RemovalSweep(Owner):
 
     def measure_on_device(self, alone: bool = False) -> None:
         """Bring :attr:`totals` up to date; ``alone``: only what is measured here."""
-        streamed, resident, others = self._streamed, self._resident, None if alone else self._others
-        pending = None if others is None else others.begin()
+        streamed, resident, helpers = self._streamed, self._resident, None if alone else self._helpers
+        pending = None if helpers is None else helpers.begin()
         if self._engine.plan.groups:
             resident.list_stale()
             resident.sweep()
@@ -226,20 +203,20 @@ class RemovalSweep(Owner):
                 add_totals(self.device, self._own, streamed.totals, self.splats)
                 self._streamed_added = True
             self._measured = True
-        if others is not None and pending is not None:
-            others.take(pending, self.totals)
+        if helpers is not None and pending is not None:
+            helpers.take(pending, self.totals)
             if self._own is not self.totals:
                 add_totals(self.device, self.totals, self._own, self.splats)
 
     def remove_marked(self) -> None:
         """Take the splats out that are marked JUST_REMOVED."""
-        if self._others is not None:
+        if self._helpers is not None:
             # They go on with it while this device does its own, and whoever tells them more waits for them.
-            self._others.remove(self._survivors.just_marked())
+            self._helpers.remove(self._survivors.just_marked())
         self._resident.note_removal()
         self._survivors.marked_by_device()
-        if self._others is not None:
-            self._others.are_left(self.marks)
+        if self._helpers is not None:
+            self._helpers.are_left(self.marks)
 
     def mark(self, splats: Bits) -> None:
         """Mark splats that a controller elsewhere has chosen, as its :meth:`just_marked` gives them.
@@ -266,20 +243,20 @@ class RemovalSweep(Owner):
 
     def remove(self, splats: Indices) -> None:
         """Take splats, (n,) by number, out of all lists; note how much each tile loses."""
-        if self._others is not None:
+        if self._helpers is not None:
             gone = np.zeros(self.splats, bool)
             gone[splats] = True
-            self._others.remove(np.packbits(gone, bitorder="little"))
+            self._helpers.remove(np.packbits(gone, bitorder="little"))
         self._see_targets()
         self._resident.prepare_removal()
         self._survivors.remove(splats)
         self._resident.note_removal()
-        if self._others is not None:
-            self._others.are_left(self.marks)
+        if self._helpers is not None:
+            self._helpers.are_left(self.marks)
 
     def replace_sh(self, sh: FloatArray) -> None:
         """Continue with other colours, (N, M, 3) float32 of the same degree. The target pictures stay as they are."""
-        pending = None if self._others is None else self._others.replace_sh(sh)
+        pending = None if self._helpers is None else self._helpers.replace_sh(sh)
         self._see_targets()
         self._engine.source.replace_sh(sh)
         self.project_again()
@@ -311,12 +288,12 @@ class RemovalSweep(Owner):
         Raises:
             UsageError: nothing has been measured yet.
         """
-        pending = None if self._others is None else self._others.sweep_changed()
+        pending = None if self._helpers is None else self._helpers.sweep_changed()
         self.sweep_changed()
         others: list[Iterator[tuple[int, Indices, F64]]] = []
-        if self._others is not None and pending is not None:
+        if self._helpers is not None and pending is not None:
             pending.results()
-            others = self._others.importances()
+            others = self._helpers.importances()
         yield from heapq.merge(self.known_importances(), *others, key=lambda found: found[0])
 
     def sweep_changed(self) -> None:
@@ -361,10 +338,6 @@ class RemovalSweep(Owner):
         left = alive[splats]
         return splats[left], total[seen[left]] / view.pixels
 
-    def close(self) -> None:
-        """Give all device memory back."""
-        self._owned.close()
-
 
 def add_totals(device: Device, totals: cl.Buffer, more: cl.Buffer, splats: int, how: str = "add_totals") -> None:
     """Enqueue: totals of so many splats += others, or -= with "subtract_totals"."""
@@ -385,20 +358,17 @@ def planned_sweep(
     progress: Callable[[int, int], None] | None = None,
     scene: Scene | None = None,
     spared: NDArray[np.bool_] | None = None,
-    others: Others | None = None,
+    helpers: RemovalHelpers | None = None,
 ) -> Iterator[RemovalSweep]:
     """A removal sweep over some views, as long as the context lasts.
 
     Args:
         device: that computes.
         drawable: the uncompressed scene, perhaps on the device.
-        cameras, options, numbers, progress, spared, others: as of :class:`RemovalSweep`.
+        cameras, options, numbers, progress, spared, helpers: as of :class:`RemovalSweep`.
         background: R, G, B behind the scene.
         visibility: what the views may draw, where each had better be looked at with that; None: with all splats.
         scene: the uncompressed scene on the host; None: it is there only if ``drawable`` is.
-
-    Raises:
-        DeviceError: the scene or a view does not fit the device.
     """
     scene = drawable if isinstance(drawable, Scene) else scene
     memory = default_memory(device) if options.memory is None else options.memory
@@ -419,7 +389,7 @@ def planned_sweep(
                 plan = plans.by_cluster(clusters, memory, scene.nbytes // max(len(scene), 1))
         else:
             source = owned.enter_context(Rasterizer(device, drawable, background=background))
-        yield owned.enter_context(RemovalSweep(source, cameras, options, progress, numbers, plan, spared, others))
+        yield owned.enter_context(RemovalSweep(source, cameras, options, progress, numbers, plan, spared, helpers))
 
 
 def _can_name(device: Device, options: SweepOptions) -> bool:

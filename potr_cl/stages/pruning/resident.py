@@ -3,7 +3,7 @@
 The totals hold what each tile added at its last sweep; sweeping a tile again replaces its part exactly, because all
 sums are integers. GPU kernels list the tiles to sweep themselves, right after a removal, and the host learns only how
 many they are; for CPU kernels, and where views take turns, the host chooses when it comes to the sweep
-(:class:`~potr_cl.stages.pruning.staleness.TileSchedule`).
+(:class:`TileSchedule`).
 """
 
 from __future__ import annotations
@@ -18,14 +18,13 @@ from numpy.typing import NDArray
 
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
-from potr_cl.stages.pruning.fixed_point import FixedPoint
-from potr_cl.stages.pruning.launcher import SetKernels, SweepBuffers, SweepLauncher, launcher_for, launchers
-from potr_cl.stages.pruning.prepared_set import Ledger, PreparedSet
-from potr_cl.stages.pruning.staleness import SweepOptions, TileSchedule, by_set
-from potr_cl.stages.pruning.survivors import Survivors
+from potr_cl.stages.pruning.buffers import Ledger, PreparedSet, Survivors
+from potr_cl.stages.pruning.sweep import FixedPoint, SetKernels, SweepBuffers, SweepLauncher, SweepOptions, family_of
 from potr_cl.views.engine import ViewEngine
 
 T = TypeVar("T")
+
+Indices = NDArray[np.int64]
 
 
 class Queues:
@@ -52,14 +51,67 @@ class Queues:
                 queue.flush()
 
     def wait(self) -> None:
-        """Return once all is done.
-
-        Raises:
-            DeviceError: the device failed.
-        """
+        """Return once all is done."""
         with self._device.errors("failed while computing"):
             for queue in self._queues:
                 queue.finish()
+
+
+class TileSchedule:
+    """Chooses the tiles of a measurement by staleness, and in turns.
+
+    A tile's staleness is the importance removed from it since its last sweep, as a part of its area; infinite before
+    the first sweep.
+
+    Args:
+        options: tolerance and turns.
+        views: (number among the cameras, tiles) of the views whose tiles are numbered through, in their order.
+    """
+
+    def __init__(self, options: SweepOptions, views: Sequence[tuple[int, int]]) -> None:
+        self._options = options
+        self._numbers = np.array([number for number, _ in views], np.int64)
+        self._tiles = np.array([tiles for _, tiles in views], np.int64)
+
+    def choose(self, measurement: int, stale: NDArray[np.float32]) -> Indices:
+        """The tiles that a measurement sweeps, ascending.
+
+        Args:
+            measurement: its number, from 0. The first takes no turns.
+            stale: (tiles,) each tile's staleness.
+        """
+        options = self._options
+        wanted = stale > options.tolerance
+        if options.turns > 1 and measurement > 0:
+            wanted &= np.repeat((measurement + self._numbers) % options.turns == 0, self._tiles)
+        return np.flatnonzero(wanted)
+
+    def changed(self, stale: NDArray[np.float32]) -> Indices:
+        """The tiles that anything was removed from since their last sweep, ascending."""
+        return np.flatnonzero(stale > 0)
+
+    def note_swept(self, stale: NDArray[np.float32], tiles: Indices) -> None:
+        """Write into ``stale`` that tiles were swept. With a negative tolerance they are stale again at once."""
+        stale[tiles] = 0 if self._options.tolerance >= 0 else np.inf
+
+
+def by_set(tiles: Indices, firsts: Sequence[int]) -> tuple[NDArray[np.uint32], list[int]]:
+    """Tiles that are numbered through all sets as the list that sets are swept from.
+
+    Args:
+        tiles: their numbers, ascending.
+        firsts: each set's first tile, ascending, and the end of the last one.
+
+    Returns:
+        (firsts[-1],) uint32, from each set's first tile on the numbers of its chosen tiles within it; and how many
+        these are, set by set.
+    """
+    starts = np.searchsorted(tiles, firsts)
+    counts = np.diff(starts)
+    listed = np.zeros(firsts[-1], np.uint32)
+    own = np.repeat(np.asarray(firsts[:-1], np.int64), counts)
+    listed[own + np.arange(len(tiles)) - np.repeat(starts[:-1], counts)] = tiles - own
+    return listed, counts.tolist()
 
 
 class ResidentSweep(Owner):
@@ -89,7 +141,7 @@ class ResidentSweep(Owner):
         self._engine, self._ledgers, self._survivors = engine, ledgers, survivors
         self._queues, self._options, self._device = queues, options, engine.device
         self._sets = sets = engine.resident
-        self.device_lists = launchers(self._device).lists_tiles and options.only_by_tolerance
+        self.device_lists = family_of(self._device).lists_tiles and options.only_by_tolerance
         self.tiles_swept = self._measurements = 0
         self._firsts = np.cumsum([0, *(ready.views.tiles for ready in sets)]).tolist()
         self._counts: list[int] | None = None  # listed tiles of each set; None: the host has yet to choose
@@ -110,7 +162,7 @@ class ResidentSweep(Owner):
                 launcher: SweepLauncher | None = None
                 for place, (ready, ledger) in enumerate(zip(sets, ledgers, strict=True)):
                     if launcher is None or ready.subset is not sets[place - 1].subset:
-                        launcher = launcher_for(ready.subset.rasterizer, options, fixed_point)
+                        launcher = SweepLauncher(ready.subset.rasterizer, options, fixed_point)
                     ready.work.first_tile = self._firsts[place]
                     buffers = SweepBuffers(
                         ledger.marks, self._tiles, self._stale, self._listed, ledger.totals, ledger.numbers
@@ -238,6 +290,3 @@ class ResidentSweep(Owner):
             stale = self._staleness()
             self._schedule.note_swept(stale, tiles)
             self._device.copy(self._stale, stale)
-
-    def close(self) -> None:
-        self._memory.close()

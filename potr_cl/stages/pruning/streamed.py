@@ -15,15 +15,12 @@ from potr_cl.host import mapped
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.ferry import Cargo, Ferry
 from potr_cl.opencl.memory import Memory, Owner, Scratch
-from potr_cl.stages.pruning.fixed_point import FixedPoint
-from potr_cl.stages.pruning.launcher import SetKernels, SweepBuffers, launcher_for
-from potr_cl.stages.pruning.prepared_set import Ledger, PreparedSet, shared_kernel
-from potr_cl.stages.pruning.staleness import SweepOptions
-from potr_cl.stages.pruning.survivors import SplatState, Survivors
+from potr_cl.stages.pruning.buffers import Ledger, PreparedSet, SplatState, Survivors, shared_kernel
+from potr_cl.stages.pruning.sweep import FixedPoint, SetKernels, SweepBuffers, SweepLauncher, SweepOptions
 from potr_cl.views.budget import target_bytes
 from potr_cl.views.engine import Ready, ViewEngine
-from potr_cl.views.groups import ViewGroup
 from potr_cl.views.subsets import Left, Subset
+from potr_cl.views.visibility import ViewGroup
 
 #: Splats that a work-group of the kernel `lost` looks at, and its work-items.
 _LOST_CHUNK, _GROUP = 4096, 64
@@ -149,7 +146,7 @@ class StreamedSweep(Owner):
 
     def _bound(self, ready: Ready[PreparedSet], buffers: SweepBuffers, first_time: bool) -> SetKernels:
         """A set's kernels, which find no removed splats in its lists."""
-        launcher = launcher_for(ready.subset.rasterizer, self._options, self._fixed_point)
+        launcher = SweepLauncher(ready.subset.rasterizer, self._options, self._fixed_point)
         kernels = launcher.bind(ready.work, ready.geometry, buffers, first_time=first_time)
         if not self._engine.source.selects:
             kernels.take_out()

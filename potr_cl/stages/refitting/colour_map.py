@@ -5,13 +5,12 @@ colour is cut at 0. Colours that are cut at some x count as constant: :meth:`Col
 are, and :meth:`ColourMap.normal` goes by that.
 
 A product with Aᵀ W A is a sum over views (own_views.py). The sums are integers. So it makes no difference to any bit if
-other devices do some of the views (:class:`Helpers`, which shared_map.py is): here all are added up.
+other devices do some of the views (helpers.py): here all are added up.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Protocol
 
 import pyopencl as cl
 
@@ -19,27 +18,10 @@ from potr_cl.opencl.memory import Memory
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.coefficients import Coefficients, Vector
-from potr_cl.stages.refitting.layout import Ridge
+from potr_cl.stages.refitting.helpers import ColourHelpers
 from potr_cl.stages.refitting.own_views import Look, OwnViews
+from potr_cl.stages.refitting.sliced_arrays import Ridge
 from potr_cl.views.targets import Targets
-
-
-class Helpers(Protocol):
-    """Do some of the views of a :class:`ColourMap`."""
-
-    def begin_gradient(self, x: cl.Buffer, blocks: bool, constant: bool) -> None:
-        """Have them begin with a gradient of their views."""
-
-    def begin_normal(self, direction: cl.Buffer, at: cl.Buffer, unit: float, constant: bool, part: int | None) -> None:
-        """Have them begin with a product of the normal matrix."""
-
-    def add(self, sums: cl.Buffer, blocks: cl.Buffer | None) -> dict[int, float]:
-        """Wait for them, and add what they found to the sums on this device.
-
-        Returns:
-            The errors of their views by number, after a gradient.
-        """
-        ...
 
 
 class ColourMap:
@@ -55,17 +37,12 @@ class ColourMap:
         total_weight: the sum over all pixels and channels of their weights: a squared error over it is a mean one.
     """
 
-    def __init__(self, coefficients: Coefficients, own: OwnViews, helpers: Helpers | None = None) -> None:
+    def __init__(self, coefficients: Coefficients, own: OwnViews, helpers: ColourHelpers | None = None) -> None:
         self._coefficients, self.own, self._helpers = coefficients, own, helpers
         self.total_weight = 3 * REFERENCE_PIXELS * own.count
 
     def gradient(
-        self,
-        x: Vector,
-        targets: Targets,
-        result: Vector,
-        blocks: SplatBlocks | None = None,
-        constant: bool = False,
+        self, x: Vector, targets: Targets, result: Vector, blocks: SplatBlocks | None = None, constant: bool = False
     ) -> float:
         """result += Aᵀ W (pictures(x) - targets), half the gradient of the squared error at x.
 
@@ -80,9 +57,6 @@ class ColourMap:
 
         Returns:
             The squared error |pictures(x) - targets|² by W.
-
-        Raises:
-            DeviceError: the device failed. What the targets raise.
         """
         own, coefficients, unit = self.own, self._coefficients, 1 / self.own.one
         ranges = [] if blocks is None else blocks.ranges
@@ -126,9 +100,6 @@ class ColourMap:
             ridge: of the coefficients that may change; the result's others become 0.
             constant: the direction's AC coefficients are all 0, and the pictures' part of the result's is left out.
             part: number of the part of the views that stands for all of them, modulo their number. None: all.
-
-        Raises:
-            DeviceError: the device failed.
         """
         own, coefficients = self.own, self._coefficients
         part = None if part is None else part % own.parts

@@ -1,67 +1,36 @@
 """The linear least-squares problem of a re-fit and its solutions, for one scene and its views: :class:`ColourRefit`.
 
-It puts together the vectors of coefficients (placement.py), the map from them to pictures (colour_map.py), perhaps with
-workers that do some of the views (shared_map.py), and the solver (solver.py).
+It puts together the vectors of coefficients (coefficients.py), the map from them to pictures (colour_map.py), perhaps
+with workers that do some of the views (helpers.py), and the solver (solver.py).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera
-from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
-from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.raster.scene_buffers import stride_of
 from potr_cl.stages.refitting.blocks import SplatBlocks
-from potr_cl.stages.refitting.coefficients import Coefficients
+from potr_cl.stages.refitting.coefficients import Coefficients, Residency, residency_of
 from potr_cl.stages.refitting.colour_map import ColourMap
-from potr_cl.stages.refitting.coming_scene import AnyScene, ComingScene, arrived, colourless
-from potr_cl.stages.refitting.layout import Layout
+from potr_cl.stages.refitting.helpers import ColourHelpers, colour_parts, colour_shares
 from potr_cl.stages.refitting.own_views import OwnViews
-from potr_cl.stages.refitting.placement import Place, placed
-from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
-from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts, colour_shares
+from potr_cl.stages.refitting.refit_options import AnyScene, ComingScene, RefitOptions, Refitted, arrived, colourless
+from potr_cl.stages.refitting.sliced_arrays import Layout
 from potr_cl.stages.refitting.solver import ColourSolver, Solved
-from potr_cl.stages.refitting.view_kernels import Sweep
+from potr_cl.stages.refitting.view_kernels import RefitSweep
 from potr_cl.views.reached import Reach, reached_splats
-from potr_cl.views.shares import ViewShares
-from potr_cl.views.targets import PicturesAhead, Targets
-from potr_cl.workers.dealing import Shares
-from potr_cl.workers.pool import Pool
-
-
-@dataclass(frozen=True)
-class HelpFrom:
-    """Workers that do some of the views of a re-fit.
-
-    Attributes:
-        pool: the workers.
-        source: the scene whose pictures are the targets, perhaps kept on devices, or with pictures of it there; or who
-            does which views, and has what these see of it.
-    """
-
-    pool: Pool
-    source: Scene | KeptScene | PicturesAhead | ViewShares
-
-    def shares(self, views: int) -> Shares:
-        """Who does which of so many views.
-
-        Raises:
-            WorkerLost: no worker is left.
-        """
-        if isinstance(self.source, ViewShares):
-            return Shares([], [share.numbers for share in self.source.shares], self.source.names)
-        return colour_shares(self.pool, views)
+from potr_cl.views.shares import HelpFrom, ViewShares
+from potr_cl.views.targets import Targets
 
 
 class ColourRefit(Owner):
@@ -72,7 +41,7 @@ class ColourRefit(Owner):
         scene: whose geometry, opacities and SH degree are used. If it is still to come, all is made ready meanwhile
             that its colours are enough for.
         cameras: the views that count, all the same whatever their size.
-        rules, background: of the rasterizer.
+        background: of the rasterizer.
         memory: bytes of device memory that prepared views and targets may take, together with the vectors where these
             take much; None: views take two fifths of what is free, or a quarter where that is the host's
             memory.
@@ -93,7 +62,6 @@ class ColourRefit(Owner):
         device: Device,
         scene: AnyScene,
         cameras: Sequence[Camera],
-        rules: RasterRules = INRIA,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         memory: int | None = None,
         help_from: HelpFrom | None = None,
@@ -104,19 +72,20 @@ class ColourRefit(Owner):
         with ExitStack() as owned:
             own: Sequence[int] = range(len(cameras))
             others = None
-            if help_from is not None and (share := help_from.shares(len(cameras))).others:
-                own, pool = share.own, help_from.pool
-                others = owned.enter_context(
-                    colour_parts(pool, share, scene, rules, background, help_from.source, cameras, memory)
-                )
-            sweep = Sweep(device, rules)
+            if help_from is not None:
+                pool, source = help_from.pool, help_from.source
+                share = source.dealt if isinstance(source, ViewShares) else colour_shares(pool, len(cameras))
+                if share.others:
+                    own = share.own
+                    others = owned.enter_context(colour_parts(pool, share, scene, background, source, cameras, memory))
+            sweep = RefitSweep(device)
             layout = Layout(len(scene), stride_of(len(scene)), scene.sh.shape[1], sweep.lanes)
             # The vectors come first: prepared views can do with less memory, and only take longer then.
             size = layout.splats, layout.sh_count
-            place = Place(memory) if others is not None else placed(device, *size, memory, slices)
+            place = Residency(memory) if others is not None else residency_of(device, *size, memory, slices)
 
             def looked_at(room: int | None) -> tuple[Rasterizer, Reach | None]:
-                rasterizer = owned.enter_context(Rasterizer(device, colourless(arrived(scene)), rules))
+                rasterizer = owned.enter_context(Rasterizer(device, colourless(arrived(scene))))
                 return rasterizer, reached_splats(rasterizer, cameras, own, room)
 
             looked = None
@@ -124,7 +93,7 @@ class ColourRefit(Owner):
                 looked = looked_at(memory)
                 scene = arrived(scene)
                 if looked[1] is not None:
-                    place = placed(device, *size, memory, slices, looked[1])
+                    place = residency_of(device, *size, memory, slices, looked[1])
             self.coefficients = owned.enter_context(Coefficients(device, layout, place.slice, place.resident))
             blocks = SplatBlocks(self.coefficients, place.blocks)
             self.solver = ColourSolver(self.coefficients, blocks)
@@ -134,7 +103,7 @@ class ColourRefit(Owner):
                 self._written = scene.sh
             helpers = None
             if others is not None:
-                helpers = owned.enter_context(SharedViews(self.coefficients, others, pool.in_process))
+                helpers = owned.enter_context(ColourHelpers(self.coefficients, others, pool.in_process))
             rasterizer, reach = looked or looked_at(place.views)
             views = owned.enter_context(
                 OwnViews(sweep, rasterizer, self.coefficients, cameras, background, place.views, own, reach)
@@ -162,9 +131,6 @@ class ColourRefit(Owner):
             active: (N, M, 3) in Y, Co, Cg: the coefficients that may change; all by default.
             hold: whether the other coefficients keep their values; if not, they become 0.
             progress: called with the steps done and their greatest number.
-
-        Raises:
-            DeviceError: the device failed.
         """
         self.start_from(sh, active, hold)
 
@@ -192,9 +158,6 @@ class ColourRefit(Owner):
         Args:
             targets, options: as :meth:`solve` takes them; none are given up.
             sh: (N, M, 3) R, G, B, the start; None: the solution before, perhaps rounded. AC coefficients stay.
-
-        Raises:
-            DeviceError: the device failed.
         """
         coefficients, solver = self.coefficients, self.solver
         if sh is not None:
@@ -224,7 +187,3 @@ class ColourRefit(Owner):
     def active(self) -> NDArray[np.bool_]:
         """(N, M, 3) in Y, Co, Cg: the coefficients that the last solution left active."""
         return self.coefficients.is_active()
-
-    def close(self) -> None:
-        """Give all device memory back."""
-        self._owned.close()

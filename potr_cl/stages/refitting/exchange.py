@@ -1,7 +1,7 @@
 """What travels between the devices that do the views of a re-fit: :class:`Exchange`.
 
 Devices of one process lend each other their memory. To another computer go the coefficients that may change, splat by
-splat in one row (:mod:`potr_cl.stages.refitting.packed_row`), and vectors without what is 0: once coefficients have
+splat in one row (:class:`PackedRow`), and vectors without what is 0: once coefficients have
 been given up, nine of ten are.
 """
 
@@ -17,11 +17,113 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.model.scene import FloatArray
+from potr_cl.opencl.kernel import Kernel
 from potr_cl.opencl.memory import Memory, Owner, Scratch, Staging
 from potr_cl.opencl.narrow import Narrowed, Narrowing
 from potr_cl.opencl.relay import Lent, Relay, done_so_far
 from potr_cl.stages.refitting.coefficients import Coefficients
-from potr_cl.stages.refitting.packed_row import GROUP, PackedRow, packing_kernel
+
+_SOURCE = "refit/packing.cl"
+#: Work-items of a work-group.
+GROUP = 64
+#: Splats whose coefficients a work-item counts one after the other.
+_RUN = 64
+_WHAT = "the coefficients' places"
+
+
+class PackedRow(Owner):
+    """Where the coefficients lie in a row whose flags are set.
+
+    Args:
+        coefficients: whose vectors are packed.
+        flags: (2, stride) uint32 on their device, as :attr:`Coefficients.active`.
+
+    Attributes:
+        flags: as given.
+        count: coefficients whose flags were set when :meth:`settle` was called last.
+    """
+
+    def __init__(self, coefficients: Coefficients, flags: cl.Buffer) -> None:
+        self._device, self._layout, self.flags = coefficients.device, coefficients.layout, flags
+        names = [
+            "mark_nonzero",
+            "count_active",
+            "place_active",
+            "pack_floats",
+            "unpack_floats",
+            "pack_sums",
+            "add_sums",
+        ]
+        self._kernels = {name: packing_kernel(coefficients, name) for name in names}
+        self._places, self._starts = Scratch(self._device, _WHAT), Scratch(self._device, _WHAT)
+        self.count = 0
+
+    def settle(self) -> None:
+        """Pack by the flags as they are on the device from now on."""
+        runs = -(-self._layout.splats // _RUN)
+        self._starts.reserve(8 * runs)
+        self._places.reserve(8 * self._layout.splats)
+        self._launch_runs("count_active", counts=self._starts.buffer)
+        counts = self._device.download(self._starts.buffer, (runs,), np.uint64)
+        ends = np.cumsum(counts, dtype=np.uint64)
+        self.count = int(ends[-1])
+        self._device.copy(self._starts.buffer, ends - counts)
+        self._launch_runs("place_active", starts=self._starts.buffer, places=self._places.buffer)
+
+    def set_flags(self, flags: NDArray[np.uint32]) -> None:
+        """Pack by these, (2, N), from now on."""
+        self._device.copy(self.flags, self.padded(flags))
+        self.settle()
+
+    def padded(self, flags: NDArray[np.uint32]) -> NDArray[np.uint32]:
+        """(2, stride), flags of N splats as they lie on the device."""
+        words = np.zeros((2, self._layout.stride), np.uint32)
+        words[:, : flags.shape[1]] = flags
+        return words
+
+    def mark_nonzero(self, x: cl.Buffer) -> None:
+        """Pack by what is not 0 in a vector from now on."""
+        kernel, splats = self._kernels["mark_nonzero"], self._layout.splats
+        kernel.bind(columns=x, stride=self._layout.stride, splats=splats, flags=self.flags)
+        kernel.launch((-(-splats // GROUP) * GROUP,), (GROUP,))
+        self.settle()
+
+    def _launch_runs(self, name: str, **buffers: cl.Buffer) -> None:
+        kernel, splats = self._kernels[name], self._layout.splats
+        kernel.bind(active=self.flags, stride=self._layout.stride, splats=splats, **buffers)
+        kernel.launch((-(-splats // (_RUN * GROUP)) * GROUP,), (GROUP,))
+
+    def move(self, how: str, columns: cl.Buffer, packed: cl.Buffer) -> None:
+        """Enqueue a kernel of cl/refit/packing.cl.
+
+        Args:
+            how: "pack_floats": a vector's coefficients to the row, (count,) float32. "unpack_floats": from the row to a
+                vector, in which all others become 0. "pack_sums": sums over views to the row, (count,) int64, after
+                which all sums are 0. "add_sums": the row is added to sums over views.
+            columns: the vector or the sums.
+            packed: the row.
+        """
+        kernel, splats = self._kernels[how], self._layout.splats
+        kernel.bind(
+            columns=columns,
+            active=self.flags,
+            stride=self._layout.stride,
+            splats=splats,
+            places=self._places.buffer,
+            packed=packed,
+        )
+        kernel.launch((-(-splats // GROUP) * GROUP,), (GROUP,))
+
+    def close(self) -> None:
+        """Give the device's memory back."""
+        self._places.close()
+        self._starts.close()
+
+
+def packing_kernel(coefficients: Coefficients, name: str) -> Kernel:
+    """A kernel of the program that packs a scene's coefficients, which is built once."""
+    return coefficients.device.kernel(_SOURCE, name, LANES=1, SH_COUNT=coefficients.layout.sh_count, RUN=_RUN)
+
 
 #: Bytes of lent sums that are added at a time.
 _AT_ONCE = 1 << 27
@@ -59,9 +161,6 @@ class Exchange(Owner):
 
     Attributes:
         lends: as given, until flags are taken: who is lent something lends its own.
-
-    Raises:
-        DeviceError: the kernels cannot be built.
     """
 
     def __init__(self, coefficients: Coefficients, lends: bool = False) -> None:
@@ -154,7 +253,7 @@ class Exchange(Owner):
         """
         row = row or self._row
         self._packed.reserve(max(4 * row.count, 1))
-        row.pack_floats(x, self._packed.buffer)
+        row.move("pack_floats", x, self._packed.buffer)
         if self.lends:
             return self._lent(self._packed.buffer, 4 * row.count)
         packed: FloatArray = (staging or self._staging).download(self._packed.buffer, (row.count,), np.float32)
@@ -168,7 +267,7 @@ class Exchange(Owner):
         """
         row = row or self._row
         self._take(packed, 4, row.count)
-        row.unpack_floats(x, self._arrived.buffer)
+        row.move("unpack_floats", x, self._arrived.buffer)
         self._looked_at(packed)
 
     # ------------------------------------------------------------------------------------------ sums
@@ -180,7 +279,7 @@ class Exchange(Owner):
         """
         count = self._row.count
         self._packed.reserve(max(8 * count, 1))
-        self._row.pack_sums(columns, self._packed.buffer)
+        self._row.move("pack_sums", columns, self._packed.buffer)
         if self.lends:
             return self._lent(self._packed.buffer, 8 * count)
         return self._narrowing.download(self._packed.buffer, (count,))
@@ -189,7 +288,7 @@ class Exchange(Owner):
         """Add to sums over views; those of another row than that of all active coefficients."""
         row = row or self._row
         self._take(packed, 8, row.count)
-        row.add_sums(columns, self._arrived.buffer)
+        row.move("add_sums", columns, self._arrived.buffer)
         self._looked_at(packed)
 
     def rows(self, sums: cl.Buffer, row: int, rows: int) -> Narrowed:
@@ -276,9 +375,6 @@ class DrawnRows(Owner):
         coefficients: whose vectors are packed, by their flags as they are now until :meth:`take_flags`.
         exchange: of the same.
         drawn: (N,) which splats the views of each part draw, by the part's number.
-
-    Raises:
-        DeviceMemoryError: the device has no room.
     """
 
     def __init__(self, coefficients: Coefficients, exchange: Exchange, drawn: Mapping[int, NDArray[np.bool_]]) -> None:
@@ -314,7 +410,3 @@ class DrawnRows(Owner):
     def add_sums(self, columns: cl.Buffer, part: int, packed: Narrowed) -> None:
         """Add the sums of one part's row to sums over views."""
         self._exchange.add_sums(columns, packed, self._rows[part])
-
-    def close(self) -> None:
-        """Give the device's memory back."""
-        self._owned.close()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,13 +19,12 @@ from potr_cl.model.camera import Camera
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.view_cache import ViewCache
 from potr_cl.raster.view_set import TABLE_ENTRY, ViewSet
-from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
+from potr_cl.stages.compaction.view_weights import pixel_weight
 from potr_cl.stages.refitting.coefficients import Coefficients, Vector
-from potr_cl.stages.refitting.view_kernels import Picks, Sweep, SweptSums, ViewKernels, gathered_scale
+from potr_cl.stages.refitting.view_kernels import Picks, RefitSweep, SweptSums, ViewKernels, gathered_scale
 from potr_cl.views import plan as plans
-from potr_cl.views.budget import free_memory, target_bytes, tiles_of
+from potr_cl.views.budget import ViewCache, free_memory, target_bytes, tiles_of
 from potr_cl.views.engine import Launch, Ready, ViewEngine
 from potr_cl.views.reached import Reach
 from potr_cl.views.subsets import ListedSplats, Subset, WholeScene
@@ -44,9 +44,6 @@ class ViewErrors(Owner):
 
     Attributes:
         latest: (tiles,) float32 on the device, where a sweep writes what it finds.
-
-    Raises:
-        DeviceError: the device has no room.
     """
 
     def __init__(
@@ -73,10 +70,6 @@ class ViewErrors(Owner):
             number: self._weights[number] * float(tiles[first:end].sum(dtype=np.float64))
             for number, (first, end) in zip(self._numbers, itertools.pairwise(self._ends), strict=True)
         }
-
-    def close(self) -> None:
-        """Give the device's memory back."""
-        self._memory.close()
 
 
 #: Bytes a splat and view of a sweep's own buffers: the colours' change and the sums.
@@ -132,14 +125,11 @@ class OwnViews(Owner):
             they are few.
         one: what is 1 in :attr:`sums`, and in those of the splats' own blocks.
         sums: (3 M, stride) int64 in the device's memory, what the views have added to coefficients.
-
-    Raises:
-        DeviceError: a view does not fit the device, or the kernels cannot be built.
     """
 
     def __init__(
         self,
-        sweep: Sweep,
+        sweep: RefitSweep,
         rasterizer: Rasterizer,
         coefficients: Coefficients,
         cameras: Sequence[Camera],
@@ -151,7 +141,7 @@ class OwnViews(Owner):
         self._device = device = coefficients.device
         layout = coefficients.layout
         self._coefficients, self._background, self._sweep = coefficients, background, sweep
-        weights = [_weight(camera) for camera in cameras]
+        weights = [pixel_weight(camera) for camera in cameras]
         self.one = gathered_scale(cameras, weights)
         self._fixed_points = sweep.fixed_point_scales(cameras)
         self.count = len(cameras)
@@ -164,13 +154,13 @@ class OwnViews(Owner):
         parts = [list(some) for _, some in itertools.groupby(order, lambda each: each % self.parts)]
         # To render a picture takes many times as long as to project a view, and it takes less room.
         pictures = sum(target_bytes(cameras[number]) for number in own_numbers)
-        self._cache = ViewCache(device, free_memory(device) if memory is None else memory, pictures)
-        self._memory = Memory(device)
-        self._owned: list[Owner] = [self._cache, self._memory]
-        try:
+        room = free_memory(device) if memory is None else memory
+        with ExitStack() as owned:
+            self._cache = owned.enter_context(ViewCache(device, room, pictures))
+            self._memory = owned.enter_context(Memory(device))
             plan = plans.in_launches(parts, rooms, self._cache, sweep.most_views, _CHANGE + _TOTALS)
-            self._engine: ViewEngine[_Attached] = ViewEngine(source, cameras, plan, _Attached, sweep.most_views)
-            self._owned.append(self._engine)
+            engine = ViewEngine(source, cameras, plan, _Attached, sweep.most_views)
+            self._engine: ViewEngine[_Attached] = owned.enter_context(engine)
             if memory is not None:  # pictures are kept in what streamed views leave
                 self._cache.room = max(self._cache.room - self._engine.passing, 0)
             rasterizer.rest()
@@ -199,16 +189,12 @@ class OwnViews(Owner):
             self.sums = self._memory.allocate(8 * layout.columns * layout.stride, "the sums over views")
             coefficients.zero(self.sums)
             sets = [each.numbers for each in launches]
-            self._errors = ViewErrors(device, cameras, weights, sets)
-            self._owned.append(self._errors)
+            self._errors = owned.enter_context(ViewErrors(device, cameras, weights, sets))
             ratios = [self.one * weights[each] / self._fixed_points[each] for some in sets for each in some]
             scales = self._memory.upload(np.array(ratios, np.float32), "the views' scales")
             self._kernels = ViewKernels(device, layout, rasterizer.parameters.means, scales)
-            self._targets = TargetPictures(device, cameras, self._cache, sets=sets)
-            self._owned.append(self._targets)
-        except BaseException:
-            self.close()
-            raise
+            self._targets = owned.enter_context(TargetPictures(device, cameras, self._cache, sets=sets))
+            self._owned = owned.pop_all()
 
     @property
     def room(self) -> float:
@@ -216,11 +202,7 @@ class OwnViews(Owner):
         return self._cache.room
 
     def prepare(self, targets: Targets) -> None:
-        """Have the pictures of this device's views that are kept there, before the first gradient asks for them.
-
-        Raises:
-            DeviceError: the device failed. What the targets raise.
-        """
+        """Have the pictures of this device's views that are kept there, before the first gradient asks for them."""
         self._targets.fill([each.launch.numbers for each in self._launches], targets)
 
     def add_up(self, look: Look) -> None:
@@ -266,10 +248,8 @@ class OwnViews(Owner):
         return self._errors.found()
 
     def close(self) -> None:
-        """Give all device memory back."""
         self._slots = []  # parts of buffers, which would keep these
-        for owner in reversed(self._owned):
-            owner.close()
+        super().close()
 
 
 class _Attached(Owner):
@@ -324,8 +304,3 @@ def _part(buffer: cl.Buffer, number: int, parts: int) -> cl.Buffer:
     """One of some equal parts of a buffer."""
     nbytes = buffer.size // parts
     return buffer if parts == 1 else buffer.get_sub_region(number * nbytes, nbytes)
-
-
-def _weight(camera: Camera) -> float:
-    """What a pixel of a view counts."""
-    return REFERENCE_PIXELS / (camera.width * camera.height)

@@ -25,12 +25,12 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import ColourGrid
+from potr_cl.stages.refitting.blocks import ROUNDS, Rounding, Steps
 from potr_cl.stages.refitting.coefficients import Vector
-from potr_cl.stages.refitting.colour_refit import ColourRefit, HelpFrom
-from potr_cl.stages.refitting.coming_scene import AnyScene
-from potr_cl.stages.refitting.refit_options import Descent, RefitOptions, Refitted
-from potr_cl.stages.refitting.rounding import ROUNDS, Rounding, Steps
+from potr_cl.stages.refitting.colour_refit import ColourRefit
+from potr_cl.stages.refitting.refit_options import AnyScene, Descent, RefitOptions, Refitted
 from potr_cl.stages.refitting.solver import Solved
+from potr_cl.views.shares import HelpFrom
 from potr_cl.views.targets import Targets
 
 #: Steps in which the constant coefficients are solved for once more, after the others have been rounded.
@@ -74,7 +74,7 @@ def refit_colours(
             solved for again. If it returns the solution itself, that stays as it is.
         help_from: workers that do some of the views; the targets are then pictures of a scene.
         colour_grid: in place of ``fix_ac``, where colours are rounded to steps of their splats, in rounds
-            (:mod:`potr_cl.stages.refitting.rounding`): it gets :meth:`ColourRefit.worth_of_constants`, in a thread of
+            (:mod:`potr_cl.stages.refitting.blocks`): it gets :meth:`ColourRefit.worth_of_constants`, in a thread of
             its own, and returns the steps.
 
     Raises:
@@ -91,13 +91,7 @@ def refit_colours(
             progress(_BEGINNING + done, _BEGINNING + steps + more)
 
     with ColourRefit(
-        device,
-        scene,
-        cameras,
-        background=background,
-        memory=options.memory,
-        help_from=help_from,
-        slices=options.slices,
+        device, scene, cameras, background=background, memory=options.memory, help_from=help_from, slices=options.slices
     ) as refit:
         way: _Rounding
         if colour_grid is not None:

@@ -1,12 +1,18 @@
-"""How a re-fit of the colours goes, :class:`RefitOptions`, and what has come of it, :class:`Refitted`."""
+"""How a re-fit of the colours goes, :class:`RefitOptions`, of what, :class:`ComingScene`, and what came of it."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
 
 from potr_cl.errors import UsageError
-from potr_cl.model.scene import FloatArray
-from potr_cl.stages.refitting.layout import Ridge
+from potr_cl.host.threads import in_background
+from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.stages.refitting.sliced_arrays import Ridge
 
 
 @dataclass(frozen=True)
@@ -55,7 +61,7 @@ class RefitOptions:
         prior: the same for every coefficient's distance to its start, so that what no view shows stays as it was.
         memory: bytes of device memory that prepared views and targets may take; None: two fifths
             of what is free, or a quarter where that is the host's memory.
-        slices: splats of a slice, with the vectors on the host (:mod:`potr_cl.stages.refitting.placement`); None: only
+        slices: splats of a slice, with the vectors on the host (:func:`residency_of`); None: only
             where they do not fit.
 
     Raises:
@@ -123,3 +129,50 @@ class Refitted:
     sh: FloatArray
     errors: tuple[float, float]
     steps: int
+
+
+class ComingScene:
+    """A scene that a thread of its own makes.
+
+    Its geometry takes the host long, and much of a re-fit can be made ready without it.
+
+    Args:
+        sh: (N, M, 3) the scene's colours.
+        make: returns the scene, with these colours.
+
+    Attributes:
+        sh: as given.
+    """
+
+    def __init__(self, sh: FloatArray, make: Callable[[], Scene]) -> None:
+        self.sh = sh
+        self._made: Future[Scene] = in_background(make)
+
+    def __len__(self) -> int:
+        return len(self.sh)
+
+    def result(self) -> Scene:
+        """The scene, once it is there.
+
+        Raises:
+            What making it raised.
+        """
+        return self._made.result()
+
+
+#: A scene that is there or will be.
+AnyScene: TypeAlias = Scene | ComingScene
+
+
+def arrived(scene: AnyScene) -> Scene:
+    """The scene itself, once it is there.
+
+    Raises:
+        What making it raised.
+    """
+    return scene.result() if isinstance(scene, ComingScene) else scene
+
+
+def colourless(scene: Scene) -> Scene:
+    """The same splats in black: a re-fit's rasterizer is never asked for colours."""
+    return replace(scene, sh=np.broadcast_to(np.float32(0), (len(scene), 1, 3)))

@@ -17,7 +17,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,33 +24,13 @@ from numpy.typing import NDArray
 from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.coefficients import Coefficients, Vector
 from potr_cl.stages.refitting.colour_map import ColourMap
-from potr_cl.stages.refitting.layout import Ridge
 from potr_cl.stages.refitting.refit_options import Descent, Selection
+from potr_cl.stages.refitting.sliced_arrays import Ridge
 from potr_cl.views.targets import Targets
 
 #: Steps end where the residual's square, as the preconditioner measures it, has shrunk by this: single precision has no
 #: more digits, and what is left of them leads astray.
 _CONVERGED = 1e-14
-
-
-class Vectors(Protocol):
-    """Arithmetic of vectors; :class:`potr_cl.stages.refitting.coefficients.Coefficients` is one."""
-
-    def vector(self, rank: int) -> Vector:
-        """A new vector; the lower the rank, the more often it is used."""
-        ...
-
-    def zero(self, x: Vector) -> None:
-        """x = 0."""
-        ...
-
-    def combine(self, a: float, y: Vector, b: float, x: Vector) -> None:
-        """y = a y + b x."""
-        ...
-
-    def dot(self, x: Vector, y: Vector) -> float:
-        """x · y."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -77,7 +56,7 @@ class ConjugateGradients:
         direction, product, preconditioned: the vectors; free for other use between solutions.
     """
 
-    def __init__(self, vectors: Vectors) -> None:
+    def __init__(self, vectors: Coefficients) -> None:
         self._vectors = vectors
         self.direction, self.product, self.preconditioned = (vectors.vector(rank) for rank in (0, 1, 4))
 
@@ -104,9 +83,6 @@ class ConjugateGradients:
 
         Returns:
             The number of steps done.
-
-        Raises:
-            DeviceError: the device failed.
         """
         vectors, direction, product, preconditioned = self._vectors, self.direction, self.product, self.preconditioned
         vectors.zero(direction)
@@ -185,9 +161,6 @@ class ColourSolver:
     Attributes:
         x: the coefficients: set them to the start before :meth:`solve`, which leaves the solution in them.
         blocks: the splats' own blocks, as they were at the last start.
-
-    Raises:
-        DeviceError: the device has no room, or the kernels cannot be built.
     """
 
     def __init__(self, coefficients: Coefficients, blocks: SplatBlocks) -> None:
@@ -221,9 +194,6 @@ class ColourSolver:
             check: measure the true error of the result, and go back if the start was better. If not, the error after
                 the solution is not a number.
             after_start: called when the blocks are those of the start.
-
-        Raises:
-            DeviceError: the device failed.
         """
         problem = _Problem(colour_map, targets, constant)
         vectors, gradients, ridge, whole = self._coefficients, self._gradients, descent.ridge, colour_map.total_weight
@@ -262,11 +232,7 @@ class ColourSolver:
         return Solved((first.error / whole, last.error / whole), steps + more, start)
 
     def error(self, colour_map: ColourMap, targets: Targets) -> float:
-        """Mean squared error at ``x``.
-
-        Raises:
-            DeviceError: the device failed.
-        """
+        """Mean squared error at ``x``."""
         self._coefficients.zero(self._residual)
         return colour_map.gradient(self.x, targets, self._residual) / colour_map.total_weight
 
@@ -275,9 +241,6 @@ class ColourSolver:
 
         Returns:
             What it did; the error after it is not a number.
-
-        Raises:
-            DeviceError: the device failed.
         """
         problem = _Problem(colour_map, targets, constant=False)
         self._coefficients.copy(self._start, self.x)
@@ -318,13 +281,7 @@ class ColourSolver:
         return System(product, partial(self.blocks.precondition, ridge=how.ridge))
 
     def _choose(
-        self,
-        problem: _Problem,
-        first: _State,
-        chosen_from: NDArray[np.uint32],
-        steps: int,
-        least: float,
-        ridge: Ridge,
+        self, problem: _Problem, first: _State, chosen_from: NDArray[np.uint32], steps: int, least: float, ridge: Ridge
     ) -> tuple[_State, int]:
         """Give up what costs little where x has come to, and start anew from what is left.
 

@@ -1,5 +1,5 @@
 """What kernels do with views in a re-fit: from coefficients to splats' colours (:class:`ViewKernels`), from these to
-the pixels' values and to sums for each splat (:class:`Sweep`), and from the sums to coefficients.
+the pixels' values and to sums for each splat (:class:`RefitSweep`), and from the sums to coefficients.
 
 The sums over a view's pixels are integers, so that the bits are the same on every run.
 """
@@ -17,23 +17,13 @@ import pyopencl as cl
 from potr_cl.model.camera import Camera
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.kernel import Kernel
-from potr_cl.raster.macros import sweep_limits
-from potr_cl.raster.rules import RasterRules
-from potr_cl.raster.view_set import TILE, ViewSet, camera_struct
-from potr_cl.stages.refitting.layout import Layout
+from potr_cl.raster.rules import INRIA
+from potr_cl.raster.sweep import TileSweep, fixed_point_scale, padded_area
+from potr_cl.raster.view_set import ViewSet
+from potr_cl.stages.refitting.sliced_arrays import Layout
 
 #: Pixel values beyond this are cut in the kernels (macro LARGEST_VALUE of cl/refit/refit.clh): no sum can overflow.
 LARGEST_VALUE = 64.0
-
-
-def fixed_point_scale(width: int, height: int) -> float:
-    """What sums over a view's pixels are multiplied by: the largest power of two with which 62 bits suffice.
-
-    Args:
-        width, height: of the view in pixels.
-    """
-    area = (width + TILE - 1) * (height + TILE - 1)
-    return float(2.0 ** np.floor(62 - np.log2(LARGEST_VALUE * area)))
 
 
 def gathered_scale(cameras: Sequence[Camera], weights: Sequence[float]) -> float:
@@ -45,63 +35,47 @@ def gathered_scale(cameras: Sequence[Camera], weights: Sequence[float]) -> float
         cameras: all views.
         weights: what a pixel of each counts.
     """
-    areas = [(camera.width + TILE - 1) * (camera.height + TILE - 1) for camera in cameras]
+    areas = [padded_area(camera.width, camera.height) for camera in cameras]
     bound = 3 * LARGEST_VALUE * math.fsum(weight * area for weight, area in zip(weights, areas, strict=True))
     return float(2.0 ** math.floor(62 - math.log2(bound)))
 
 
-#: Work-items of a tile's work-group on a GPU, and views of a launch there. A CPU does one view at a time, a work-item a
-#: tile.
-_TILE_GROUP, _MOST_VIEWS = 128, 32
 #: On CPUs, launches whose sums are gathered together: the coefficients' sums, which take much more than a view's, go
 #: through the memory once for so many views.
 _GATHERED = 4
 
 
-class Sweep:
-    """The kernels of one device.
+class RefitSweep:
+    """From the splats' colours to the pixels' values, and from those to sums for each splat, on one device.
 
     Args:
         device: to run on.
-        rules: of the rasterizer.
 
     Attributes:
         lanes: splats a work-item, in kernels that go over splats.
         most_views: that a launch can do.
         gathered: launches whose sums are gathered together, where each does one view.
-
-    Raises:
-        DeviceError: the kernels cannot be built.
     """
 
-    def __init__(self, device: Device, rules: RasterRules) -> None:
-        self._gpu = device.family == "gpu"
-        self.lanes = 1 if self._gpu else device.vector_width
-        self.most_views, self.gathered = (_MOST_VIEWS, 1) if self._gpu else (1, _GATHERED)
-        self._kernels = [
-            device.shared_kernel(
-                f"refit/refit_{device.family}.cl",
-                "refit_sweep",
-                ALPHA_CAP=float(rules.alpha_cap),
-                TRANSMITTANCE_THRESHOLD=rules.transmittance_threshold,
-                LARGEST_VALUE=LARGEST_VALUE,
-                WEIGHTS=weights,
-                **sweep_limits(device),
-            )
+    def __init__(self, device: Device) -> None:
+        self._sweeps = [
+            TileSweep(device, INRIA, "refit/refit", "refit_sweep", LARGEST_VALUE=LARGEST_VALUE, WEIGHTS=weights)
             for weights in (0, 1)
         ]
+        self.lanes, self.most_views = self._sweeps[0].lanes, self._sweeps[0].most_views
+        self.gathered = _GATHERED if self.most_views == 1 else 1
 
     def fixed_point_scales(self, cameras: Sequence[Camera]) -> list[float]:
-        """What the sums of each view are multiplied by, see :func:`fixed_point_scale`.
+        """What the sums of each view are multiplied by (:func:`potr_cl.raster.sweep.fixed_point_scale`).
 
         Args:
             cameras: all views; those that a launch does have one scale.
         """
-        if not self._gpu:
-            return [fixed_point_scale(camera.width, camera.height) for camera in cameras]
+        if self.most_views == 1:
+            return [fixed_point_scale(camera.width, camera.height, LARGEST_VALUE) for camera in cameras]
         # With it no view can overflow, whichever a launch does together.
-        scale = fixed_point_scale(max(c.width for c in cameras), max(c.height for c in cameras))
-        return [scale] * len(cameras)
+        width, height = max(c.width for c in cameras), max(c.height for c in cameras)
+        return [fixed_point_scale(width, height, LARGEST_VALUE)] * len(cameras)
 
     def run(
         self,
@@ -115,46 +89,27 @@ class Sweep:
         totals: cl.Buffer,
         weights: bool,
     ) -> None:
-        """Enqueue a sweep: from the splats' colours to the pixels' values, and from those to sums for each splat.
+        """Enqueue it.
 
         Args:
-            views: prepared.
-            shapes: (views, stride, 8) float32, theirs.
-            colours: (views, stride, 4) float32, R, G, B of each splat in each view.
-            background: R, G, B behind the splats.
+            views, shapes, colours, background: as of :meth:`TileSweep.run`.
             target: (pixels, 3) float32, view after view: subtracted from the pixels; None: nothing is.
             scale: the views' fixed point.
             errors: (tiles,) float32, becomes each tile's sum of squared pixel values.
             totals: (views, stride, 4) int64: weight times value, three channels, and the squared weights are added.
             weights: sum up the squared weights too.
-
-        Raises:
-            DeviceError: the device refused it.
         """
-        of_family: dict[str, Any] = {"views": views.table, "stride": views.stride}
-        if not self._gpu:
-            of_family = {"view": camera_struct(views.views[0].camera)}
-        kernel = self._kernels[weights].bind(
-            **of_family,
-            shapes=shapes,
-            colours=colours,
-            offsets=views.offsets,
-            intersections=views.intersections,
-            subtiles=views.subtiles,
-            red=background[0],
-            green=background[1],
-            blue=background[2],
+        self._sweeps[weights].run(
+            views,
+            shapes,
+            colours,
+            background,
             target=colours if target is None else target,
             has_target=target is not None,
             scale=scale,
             errors=errors,
             totals=totals,
         )
-        if self._gpu:
-            most = max(view.tiles for view in views.views)
-            kernel.launch((most * _TILE_GROUP, len(views.views)), (_TILE_GROUP, 1))
-        else:
-            kernel.launch((views.tiles,), (1,))
 
 
 #: Work-items of a work-group.
@@ -205,9 +160,6 @@ class ViewKernels:
         layout: of the coefficients.
         means: (3, stride) float32, the splats' centres on the device.
         scales: float32, by what each view's sums are multiplied on their way to the coefficients.
-
-    Raises:
-        DeviceError: the kernels cannot be built.
     """
 
     def __init__(self, device: Device, layout: Layout, means: cl.Buffer, scales: cl.Buffer) -> None:
@@ -259,11 +211,7 @@ class ViewKernels:
         kernel = self._device.shared_kernel("refit/drawn.cl", "mark_drawn")
         for number, view in enumerate(views.views):
             kernel.bind(
-                views=views.table,
-                number=number,
-                offsets=views.offsets,
-                intersections=views.intersections,
-                marks=drawn,
+                views=views.table, number=number, offsets=views.offsets, intersections=views.intersections, marks=drawn
             )
             kernel.launch((-(-view.tiles // _GROUP) * _GROUP,), (_GROUP,))
 

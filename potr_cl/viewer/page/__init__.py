@@ -5,12 +5,15 @@ from __future__ import annotations
 from importlib.resources import files
 from string import Template
 
+from potr_cl.formats.scenes.page import viewer_script
 from potr_cl.report.style import ACCENT, STAGE, TEST_VIEW, TRAINING_VIEW, WARNING
 from potr_cl.viewer.access import Asset
 
 _FOLDER = "/potr_cl"
 #: Where the page's own WebSocket connects to.
 CHANNEL = f"{_FOLDER}/channel"
+#: What draws scenes in the page: the viewer of pages that encode makes, where it is built.
+DRAWING = f"{_FOLDER}/viewer.js"
 
 
 def head() -> str:
@@ -37,7 +40,9 @@ def assets() -> dict[str, Asset]:
         test=TEST_VIEW,
     )
     script = folder.joinpath("page.js").read_bytes()
+    drawing = viewer_script()
     return {
+        **({DRAWING: Asset("text/javascript; charset=utf-8", drawing)} if drawing else {}),
         f"{_FOLDER}/page.css": Asset("text/css; charset=utf-8", style.encode()),
         f"{_FOLDER}/page.js": Asset("text/javascript; charset=utf-8", script),
     }

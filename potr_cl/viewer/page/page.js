@@ -8,7 +8,7 @@
   window.setTimeout = (work, wait, ...rest) => later(work, wait === 20 ? 15 : wait, ...rest);
 
   const state = { mode: "divider", divider: 0.5, pair: false, labels: null, figures: null, scenes: [], views: [],
-    at: null, ladder: null, error: "", heat: null };
+    at: null, ladder: null, error: "", heat: null, drawable: null, background: "#000" };
   let socket = null, key = null, dragging = false, sending = null, swapped = false;
   let asked = 0;  // how often a rung of the ladder was asked for on this connection
 
@@ -32,10 +32,13 @@
   grip.setAttribute("role", "slider");
   grip.setAttribute("aria-label", "divider between A and B");
   stage.append(...labels, line, grip);
+  const ground = made("canvas", "potr-ground");  // what this browser draws
+  ground.hidden = true;
 
   function divide(at) {
     state.divider = Math.min(Math.max(at, 0), 1);
     place();
+    redraw();
     if (sending === null) {
       sending = requestAnimationFrame(() => { sending = null; say({ divider: state.divider }); });
     }
@@ -62,14 +65,18 @@
   });
 
   function place() {
-    const divider = state.pair && state.mode === "divider";
+    const halved = way === "both" && !ground.hidden;
+    const divider = (state.pair && state.mode === "divider") || (halved && state.mode !== "side by side");
     const middle = state.pair && state.mode === "side by side";
     const at = middle ? 0.5 : state.divider;
     for (const element of [line, grip]) element.style.left = `${100 * at}%`;
     line.hidden = !(divider || middle);
     grip.hidden = !divider;
     grip.setAttribute("aria-valuenow", String(Math.round(100 * at)));
-    const [left, right] = state.labels || ["", ""];
+    let [left, right] = state.labels || ["", ""];
+    if (halved) [left, right] = [[left, WAYS.here], [right || left, WAYS.exact]].map(words => words.filter(Boolean).join(", "));
+    ground.style.clipPath = halved ? `inset(0 ${100 - 100 * at}% 0 0)` : "";
+    ground.classList.toggle("above", halved);
     labels[0].textContent = left;
     labels[1].textContent = right;
     labels[0].hidden = !left;
@@ -79,6 +86,80 @@
     labels[1].style.left = right ? `${Math.min(100 * at, 100 - 100 * 160 / width)}%` : "";
     labels[1].style.right = right ? "auto" : "";
     labels[1].style.marginLeft = "12px";
+  }
+
+  // Drawn here ------------------------------------------------------------------------------------------------------
+  // This browser draws scenes beneath viser's picture. The server's exact picture is that picture: it hides what is
+  // drawn here, until the server is told that nobody needs it.
+  const WAYS = { here: "your GPU", exact: "exact", both: "both" };
+  const gl = document.createElement("canvas").getContext("webgl2");
+  const about = gl && gl.getParameter(gl.getExtension("WEBGL_debug_renderer_info")?.UNMASKED_RENDERER_WEBGL ?? gl.RENDERER);
+  let way = /swiftshader|llvmpipe|software|basic render/i.test(about) ? "exact" : "here";
+  let view = null, drawing = null, awaited = null, frame = null, draws = false;
+  const there = {};  // the numbers of the scenes that can be drawn
+
+  // What viser's page tells its server of the camera.
+  const post = Worker.prototype.postMessage;
+  Worker.prototype.postMessage = function (data, ...rest) {
+    if (data?.message?.type === "ViewerCameraMessage") {
+      view = data.message;
+      redraw();
+    }
+    return post.call(this, data, ...rest);
+  };
+
+  function choose(chosen) {
+    way = chosen;
+    refresh(["drawn"]);
+    fetchScenes();
+    redraw();
+  }
+  function parts() {
+    const [left, right] = swapped ? "BA" : "AB", only = Object.keys(state.drawable);
+    if (only.length === 1) return [[only[0], 0, 1, 0, 1]];
+    return { divider: [[left, 0, 1, 0, state.divider], [right, 0, 1, state.divider, 1]], A: [[left, 0, 1, 0, 1]],
+      "side by side": [[left, 0, 0.5, 0, 0.5], [right, 0.5, 1, 0.5, 1]], B: [[right, 0, 1, 0, 1]] }[state.mode];
+  }
+  function redraw() {
+    frame ??= requestAnimationFrame(() => {
+      frame = null;
+      const shown = way !== "exact" && view && state.drawable && Object.keys(state.drawable).every(which => there[which])
+        && parts();
+      if (shown) drawing.draw(view, shown);
+      ground.hidden = !shown;
+      document.body.dataset.drawn = shown ? way : "";
+      place();
+      const now = Boolean(shown) && way === "here";
+      if (now !== draws) say({ draws: draws = now });
+    });
+  }
+  function fetchScenes() {
+    if (awaited || !state.drawable || way === "exact" || !gl) return;
+    const missing = Object.entries(state.drawable).find(([which, number]) => there[which] !== number);
+    if (!missing) return;
+    awaited = { which: missing[0], number: missing[1], parts: [], left: 0 };
+    say({ scene: missing[1] });
+  }
+  async function arrived({ which, number, parts }) {
+    try {
+      if (!globalThis.potr) await new Promise((done, failed) => {
+        const script = made("script");
+        Object.assign(script, { src: "/potr_cl/viewer.js", onload: done, onerror: () => failed(new Error("it did not load")) });
+        document.head.append(script);
+      });
+      drawing ??= await potr.drawing(ground, state.background, () => giveUp("the GPU is gone"));
+      await drawing.put(which, new Uint8Array(await new Blob(parts).arrayBuffer()));
+      there[which] = number;
+    } catch (error) {
+      giveUp(error.message);
+    }
+    awaited = null;
+    fetchScenes();
+    redraw();
+  }
+  function giveUp(why) {
+    inform(`this browser cannot draw the scene: ${why}`, true);
+    choose("exact");
   }
 
   // In the panel ------------------------------------------------------------------------------------------------------
@@ -114,6 +195,18 @@
         box.append(ends);
       }
       if (state.figures.note) box.append(made("div", "potr-note", state.figures.note));
+    },
+    drawn(box) {
+      if (!state.drawable || !gl) return;
+      const row = made("div", "potr-ways", "drawn by ");
+      row.title = "key X: your GPU, or the exact picture; both: one beside the other under the divider";
+      for (const [name, words] of Object.entries(WAYS)) {
+        const button = made("button", "", words);
+        button.setAttribute("aria-pressed", String(name === way));
+        button.addEventListener("click", () => choose(name));
+        row.append(button);
+      }
+      box.append(row);
     },
     curve(box) {
       if (state.ladder && state.ladder.rungs.some(rung => rung.psnr !== null)) box.append(curve(state.ladder));
@@ -203,15 +296,27 @@
   }
 
   const PARTS = { error: ["error"], scenes: ["scenes"], note: ["scenes"], figures: ["figures"], heat: ["figures"],
-    ladder: ["curve"], views: ["views"], viewsNote: ["views"], at: ["views"] };
+    ladder: ["curve"], drawable: ["drawn"], views: ["views"], viewsNote: ["views"], at: ["views"] };
 
   // The channel -------------------------------------------------------------------------------------------------------
   function connect() {
     const scheme = location.protocol === "https:" ? "wss" : "ws";
     asked = 0;
+    draws = false;
+    awaited = null;
     socket = new WebSocket(`${scheme}://${location.host}/potr_cl/channel?key=${encodeURIComponent(key)}`);
+    socket.binaryType = "arraybuffer";
     socket.addEventListener("message", event => {
+      if (event.data instanceof ArrayBuffer) {
+        awaited.parts.push(event.data);
+        if (!(awaited.left -= event.data.byteLength)) arrived(awaited);
+        return;
+      }
       const message = JSON.parse(event.data);
+      if (message.scene?.error) {
+        awaited = null;
+        giveUp(message.scene.error);
+      } else if (message.scene) awaited.left = message.scene.bytes;
       if (message.state) {
         if (dragging) delete message.state.divider;
         // Told before the last key was known there: the key counts.
@@ -220,6 +325,8 @@
           name => JSON.stringify(message.state[name]) !== JSON.stringify(state[name]));
         Object.assign(state, message.state);
         place();
+        fetchScenes();
+        redraw();
         document.title = [...state.scenes.map(scene => scene.name), "potr_cl"].join(" – ");
         refresh([...new Set(changed.flatMap(name => PARTS[name] || []))]);
         if (window.parent !== window) window.parent.postMessage("potr_cl viewer", "*");
@@ -231,7 +338,8 @@
   function settle() {
     const canvas = document.querySelector("canvas");
     if (canvas && stage.parentElement !== canvas.parentElement) {
-      canvas.parentElement.append(stage);
+      canvas.parentElement.classList.add("potr-field");
+      canvas.parentElement.append(ground, stage);
       place();
     }
     const holder = document.querySelector("[data-potr-key]");
@@ -257,10 +365,11 @@
   const typing = target => target.closest && target.closest(
     "input:not([type=checkbox], [type=range], [type=radio]), textarea, select, [contenteditable]");
   const modes = { 1: "divider", 2: "side by side", 3: "A", 4: "B", 5: "difference", 6: "heat map" };
-  const flick = on => { if (on !== swapped) { swapped = on; say({ swap: on }); } };
+  const flick = on => { if (on !== swapped) { swapped = on; say({ swap: on }); redraw(); } };
   addEventListener("keydown", event => {
     if (event.ctrlKey || event.metaKey || event.altKey || typing(event.target)) return;
     if (event.key === "f" || event.key === "F") flick(true);
+    else if ((event.key === "x" || event.key === "X") && !event.repeat) choose(way === "exact" ? "here" : "exact");
     else if ((event.key === "c" || event.key === "C") && !event.repeat) say({ cameras: true });
     else if (modes[event.key] && !event.repeat) say({ mode: modes[event.key] });
   });

@@ -1,0 +1,174 @@
+"""Who decides which splats go (:func:`prune_scene`): the host, or a GPU itself, which also lists the tiles to measure.
+
+To fetch the effects of all splats and to send back a decision would take longer than to measure them. The rules are
+those of :mod:`potr_cl.stages.pruning.schedule`, in float32, with one difference: splats of the same score go together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.host.threads import in_background
+from potr_cl.model.order import ascending
+from potr_cl.opencl.kernel import Kernel
+from potr_cl.opencl.memory import Memory, Owner
+from potr_cl.opencl.structs import bytes_before, struct_dtype
+from potr_cl.raster.sweep import totals_limits
+from potr_cl.stages.pruning.removal import RemovalSweep
+from potr_cl.stages.pruning.schedule import Course, Indices, Iteration, Pruned, PruningOptions, prune
+
+_SOURCE = "prune/choose_gpu.cl"
+#: A score has so many digits, each of so many values; a work-group has a work-item for each value.
+_DIGIT, _DIGITS = 256, 4
+
+_REMOVED, _STATE = struct_dtype(_SOURCE, "Removed"), struct_dtype(_SOURCE, "State")
+
+
+def prune_scene(
+    removal: RemovalSweep,
+    options: PruningOptions,
+    progress: Callable[[int, int], None] | None = None,
+    after_iteration: Callable[[int], None] | None = None,
+    spared: NDArray[np.bool_] | None = None,
+) -> Pruned:
+    """Run the schedule: on the device if it can decide for itself, else on the host.
+
+    Args:
+        removal: measures and removes.
+        options: thresholds and iterations.
+        progress: called with the iterations done and the number of splats left.
+        after_iteration: called with the iteration.
+        spared: (N,) splats that stay, whatever their effect; None: none.
+    """
+    if removal.steering is None or options.count is not None or not np.isfinite(options.delta_mse_max):
+        return prune(removal, removal.splats, options, progress, after_iteration, spared)
+    with _Controller(removal.steering, options, spared) as controller:
+        return controller.run(progress, after_iteration)
+
+
+class _Controller(Owner):
+    """The schedule with its state in the device's memory."""
+
+    def __init__(self, removal: RemovalSweep, options: PruningOptions, spared: NDArray[np.bool_] | None) -> None:
+        self._removal, self._options = removal, options
+        self._device = device = removal.device
+        self._splats = removal.splats
+        self._memory = memory = Memory(device)
+        with device.all_or_nothing():
+            self._smoothed = memory.allocate(4 * self._splats, "the smoothed effects")
+            self._keys = memory.allocate(4 * self._splats, "the splats' scores")
+            self._removed = memory.allocate(_REMOVED.itemsize * self._splats, "the removed splats")
+            device.fill(self._removed, np.uint32(0))
+            if spared is None:
+                self._spared = memory.allocate(self._splats, "the splats that stay")
+                device.fill(self._spared, np.uint8(0))
+            else:
+                self._spared = memory.upload(spared.view(np.uint8), "the splats that stay")
+            self._state = memory.allocate(_STATE.itemsize, "the pruning's state")
+            macros = totals_limits(device)
+            self._rank, self._refine, self._mark = (
+                device.kernel(_SOURCE, name, **macros) for name in ("rank", "refine", "mark")
+            )
+
+    def run(self, progress: Callable[[int, int], None] | None, after_iteration: Callable[[int], None] | None) -> Pruned:
+        removal, options = self._removal, self._options
+        left, done, weight = self._splats, 0, 0.0
+        for iteration in range(options.iterations):
+            removal.measure_on_device()
+            weight = options.decay * weight + 1
+            gone = self._choose(iteration, weight)
+            done = iteration + 1
+            if gone == 0:
+                break  # no candidate is left, and measuring again would find the same
+            removal.remove_marked()
+            left -= gone
+            if progress is not None:
+                progress(done, max(left, 1))
+            if after_iteration is not None:
+                after_iteration(iteration)
+        return self._pruned(done)
+
+    def _choose(self, iteration: int, weight: float) -> int:
+        """Mark the splats that go in an iteration, and return their number."""
+        removal, options = self._removal, self._options
+        remaining = options.iterations - iteration
+        effect_unit, importance_unit = removal.units
+        everywhere = {"splats": self._splats, "totals": removal.totals, "keys": self._keys, "state": self._state}
+        self._device.fill(self._state, np.uint32(0), _STATE.itemsize)
+        self._rank.bind(
+            **everywhere,
+            alive=removal.marks,
+            spared=self._spared,
+            effect_unit=effect_unit,
+            weight=weight,
+            limit=options.delta_mse_max,
+            a=options.a,
+            smoothed=self._smoothed,
+        )
+        self._launch(self._rank)
+        if remaining > 1:
+            for digit in range(1, _DIGITS):
+                self._refine.bind(**everywhere, digit=digit, remaining=remaining)
+                self._launch(self._refine)
+        self._mark.bind(
+            **everywhere,
+            alive=removal.marks,
+            effect_unit=effect_unit,
+            importance_unit=importance_unit,
+            iteration=iteration,
+            remaining=remaining,
+            removed=self._removed,
+        )
+        self._launch(self._mark)
+        gone = np.empty(1, np.uint32)
+        self._device.copy(gone, self._state, of=bytes_before(_STATE, "gone"))
+        return int(gone[0])
+
+    def _launch(self, kernel: Kernel) -> None:
+        groups = -(-self._splats // _DIGIT)
+        kernel.launch((groups * _DIGIT,), (_DIGIT,))
+
+    def _pruned(self, done: int) -> Pruned:
+        device, n = self._device, self._splats
+        alive = self._removal.alive.copy()
+        smoothed = device.download(self._smoothed, (n,), np.float32)
+        removed = device.download(self._removed, (n,), _REMOVED)
+        iteration = removed["iteration"].astype(np.int32)
+        iteration[alive] = -1
+        if not alive.any():  # an empty scene is no scene
+            final = np.flatnonzero(iteration == iteration.max())
+            last = final[ascending(removed["key"][final])][-1]
+            alive[last], iteration[last] = True, -1
+        left = np.flatnonzero(alive)
+        # Others go on with what is left meanwhile.
+        course = in_background(self._course, done, iteration, removed, left, smoothed)
+        return Pruned(len(left), iteration, done, course.result)
+
+    def _course(
+        self, done: int, iteration: NDArray[np.int32], removed: np.ndarray, left: Indices, smoothed: NDArray[np.float32]
+    ) -> Course:
+        """In which order splats went, and those that are left would go; what is known of each iteration.
+
+        In place, one iteration after the other: what all of a large scene's splats need at once is as large as the
+        scene.
+        """
+        # Small integers are put in order by counting; those that are left come last.
+        small = np.uint16 if done < 1 << 16 else np.uint32
+        order = np.argsort(np.where(iteration < 0, done, iteration).astype(small), kind="stable")
+        ends = np.cumsum(np.bincount(iteration[iteration >= 0], minlength=done)[:done])
+        history = []
+        gone = 0
+        for end in ends.tolist():
+            if gone == end:
+                continue
+            own = order[gone:end]
+            own[:] = own[ascending(removed["key"][own])]
+            gone = end
+            importance, effect = (removed[name][own].astype(np.float64) for name in ("importance", "effect"))
+            weight, harm = (float(np.add.reduceat(values, [0])[0]) for values in (importance, effect))
+            history.append(Iteration(self._splats - gone, weight, harm, float(effect.max())))
+        order[gone:] = left[ascending(smoothed[left])]
+        return Course(order, tuple(history))
