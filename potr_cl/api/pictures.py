@@ -34,6 +34,7 @@ from potr_cl.api.views import Viewpoints, describe_views, warn_of_frame
 from potr_cl.errors import DataError, DeviceError
 from potr_cl.formats.images import Colour, to_8_bits, write_png
 from potr_cl.host.atomic_write import make_folder, replacing
+from potr_cl.host.inputs import is_device_of_windows
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
@@ -362,7 +363,7 @@ def file_name(view: str, windows: bool = os.name == "nt") -> str:
     name = view.replace("/", "_")
     if windows:
         name = re.sub(r'[\\<>:"|?*]', "_", name)
-        if re.fullmatch(r"(con|prn|aux|nul|(com|lpt)[0-9¹²³]) *(\..*)?", name, re.IGNORECASE):
+        if is_device_of_windows(name):
             name = f"_{name}"
     return name
 

@@ -7,12 +7,17 @@ import errno
 import os
 import secrets
 import stat
+import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
 from potr_cl.errors import UnwritableError, UsageError, WriteError
 from potr_cl.host.leftovers import removed_at_end
+
+#: Seconds to wait before a renaming is tried again: on Windows nobody renames a file that another program has open, as
+#: virus scanners and indexers have new ones for a moment.
+_PAUSES = (0.05, 0.2, 0.5, 1.0, 3.0) if os.name == "nt" else ()
 
 
 @contextlib.contextmanager
@@ -50,7 +55,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
                 yield file
             if mode is not None:
                 temporary.chmod(mode)
-            temporary.replace(target)
+            _rename(temporary, target)
         except OSError as error:
             if error.filename not in (None, os.fspath(temporary)):
                 raise  # about another file, which the block has to do with
@@ -58,6 +63,15 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
             if not target.parent.is_dir():
                 why = f"the folder '{target.parent}' is gone"
             raise WriteError(f"cannot write '{path}': {why}", os.fspath(path)) from error
+
+
+def _rename(temporary: Path, target: Path) -> None:
+    for pause in _PAUSES:
+        with contextlib.suppress(PermissionError):
+            temporary.replace(target)
+            return
+        time.sleep(pause)
+    temporary.replace(target)
 
 
 def write_pieces(path: str | os.PathLike[str], pieces: Iterable[bytes | memoryview]) -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import stat
 from collections.abc import Iterator
 from io import IOBase
@@ -39,6 +40,11 @@ def unchanged(path: str | os.PathLike[str], file: IOBase) -> Iterator[None]:
         refuse_changed(path, before, state_of(descriptor))
     finally:
         os.close(descriptor)
+
+
+def is_device_of_windows(name: str) -> bool:
+    """Whether a file's name stands for a device on Windows, in any folder and whatever suffix it has."""
+    return re.fullmatch(r"(con|prn|aux|nul|(com|lpt)[0-9¹²³]) *(\..*)?", name, re.IGNORECASE) is not None
 
 
 def state_of(descriptor: int) -> State:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 _SAID = {
     "SIGINT": b"potr-cl: interrupted; no file is left half written\n",
+    "SIGBREAK": b"potr-cl: interrupted; no file is left half written\n",  # Ctrl-Break on Windows
     "SIGTERM": b"potr-cl: terminated; no file is left half written\n",
     "SIGHUP": b"potr-cl: the terminal was closed; no file is left half written\n",
 }

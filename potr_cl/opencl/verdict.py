@@ -30,6 +30,8 @@ _PASSED = "passed"
 _PATIENCE = 1200.0
 #: Environment variable that has every device taken untried and whatever its verdict, as in the trial's own process.
 TRUST_VARIABLE = "POTR_CL_TRUST_DEVICES"
+#: What a program of Windows ends with that Ctrl-C ends.
+_WINDOWS_CTRL_C = 0xC000013A
 _MODULE = "potr_cl.pipeline.trial"
 
 
@@ -85,7 +87,13 @@ def _trial(info: DeviceInfo, *how: str) -> tuple[bool, str | None, str]:
         return True, f"its self-check did not end within {_PATIENCE / 60:.0f} minutes", ""
     except OSError:
         return False, None, ""  # where no process can be started
-    if run.returncode in (0, -signal.SIGINT, -signal.SIGTERM, -9):  # -9: killed, perhaps as memory was short
+    if run.returncode in (
+        0,
+        -signal.SIGINT,
+        -signal.SIGTERM,
+        -9,
+        _WINDOWS_CTRL_C,
+    ):  # -9: killed, perhaps as memory was short
         return run.returncode == 0, None, run.stdout.decode("utf-8", "replace")
     if run.returncode < 0 or run.returncode >= 1 << 30:  # a signal, or an exception of Windows
         return True, "its driver crashes while an encode runs", ""

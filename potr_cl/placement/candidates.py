@@ -32,7 +32,7 @@ _BEST = 0.95
 
 
 @dataclass(frozen=True)
-class ColourMemory:
+class ViewMemory:
     """What the colours of some points remember of where they were trained from, and places to compare with.
 
     Training moves the coefficients of a splat along the basis functions of its views' directions, so the squared
@@ -52,7 +52,7 @@ class ColourMemory:
     best: F32
 
     @staticmethod
-    def of(device: Device, space: Space, points: F64, sh: F32, places: F64) -> ColourMemory | None:
+    def of(device: Device, space: Space, points: F64, sh: F32, places: F64) -> ViewMemory | None:
         """What there is to remember; None: nothing.
 
         Args:
@@ -67,8 +67,8 @@ class ColourMemory:
         colours = unit_coefficients(sh[:, 1:]).astype(np.float32)
         if np.count_nonzero(colours.any(axis=(1, 2))) < _INFORMATIVE:
             return None
-        memory = ColourMemory(device, space, points, colours, np.empty((0, len(points)), np.float32))
-        return ColourMemory(device, space, points, colours, memory._energies(places))
+        memory = ViewMemory(device, space, points, colours, np.empty((0, len(points)), np.float32))
+        return ViewMemory(device, space, points, colours, memory._energies(places))
 
     def of_places(self, places: F64, shown: F32) -> F64:
         """How well places are remembered, (P,): as a part of how well the same points remember the best ones.
@@ -135,7 +135,7 @@ _BIN_DIRECTIONS = on_sphere(low_discrepancy(BINS, 2)).astype(np.float32)
 
 
 @dataclass(frozen=True)
-class Targets:
+class SurfacePoints:
     """Points on surfaces, which views are judged by: most of them are spread over splats, some over area.
 
     Attributes:
@@ -154,14 +154,14 @@ class Targets:
         return max(len(self.targets) // _ASKED, 1)
 
     @staticmethod
-    def of(scene: Scene, space: Space, count: int) -> Targets:
+    def of(scene: Scene, space: Space, count: int) -> SurfacePoints:
         """About so many of a scene."""
         over_area = round(_OVER_AREA * count)
         by_area = np.linspace(0, len(space.rows) - 1, over_area).astype(np.int64)
         by_splat = space.firsts[np.linspace(0, len(space.firsts) - 1, count - over_area).astype(np.int64)]
         chosen = np.union1d(by_area, by_splat)
         points = space.points[chosen]
-        return Targets(points, space.sizes_near(points), space.rows[chosen])
+        return SurfacePoints(points, space.sizes_near(points), space.rows[chosen])
 
 
 @dataclass(frozen=True)
@@ -192,12 +192,12 @@ class Candidates:
 def candidates_of(
     device: Device,
     space: Space,
-    targets: Targets,
+    targets: SurfacePoints,
     count: int,
     focal: float,
     half_view: float,
     pixels: float,
-    memory: ColourMemory | None,
+    memory: ViewMemory | None,
     first: int = 0,
 ) -> Candidates:
     """Views from about ``count`` places.
@@ -253,7 +253,7 @@ def _enclosed(space: Space, places: F64) -> NDArray[np.bool_]:
 
 
 def _places(
-    space: Space, targets: Targets, count: int, resolved_from: float, half_view: float, first: int
+    space: Space, targets: SurfacePoints, count: int, resolved_from: float, half_view: float, first: int
 ) -> tuple[F64, NDArray[np.int64], F64]:
     """(P, 3) where to stand, (P,) the target that each place belongs to, and (P,) half the field of view there."""
     spread = low_discrepancy(first + count, 4)[first:]
@@ -297,7 +297,7 @@ def _aims(places: F64, seeds: F64, starts: NDArray[np.int64], towards: F32, wort
     return aims
 
 
-def _dense(place: NDArray[np.int64], target: NDArray[np.int64], worth: F32, places: int, targets: Targets) -> F32:
+def _dense(place: NDArray[np.int64], target: NDArray[np.int64], worth: F32, places: int, targets: SurfacePoints) -> F32:
     """(P, K) how well places show the targets that are asked."""
     found = np.zeros((places, len(targets.targets[:: targets.asked])), np.float32)
     asked = np.flatnonzero(target % targets.asked == 0)
@@ -306,8 +306,8 @@ def _dense(place: NDArray[np.int64], target: NDArray[np.int64], worth: F32, plac
 
 
 def resolution(
-    device: Device, scene: Scene, space: Space, targets: Targets, focal: float
-) -> tuple[float, ColourMemory | None]:
+    device: Device, scene: Scene, space: Space, targets: SurfacePoints, focal: float
+) -> tuple[float, ViewMemory | None]:
     """How many pixels the larger standard deviation of a splat of median size should have; and what colours remember.
 
     Where colours remember from how far photographs were taken, as many as these showed, if they were of a usual size;
@@ -328,7 +328,7 @@ def resolution(
     if not len(every):
         return USUAL, None
     compared = every[:: max(len(every) // _COMPARED, 1)]
-    memory = ColourMemory.of(device, space, targets.targets[asked], scene.sh[targets.rows[asked]], compared)
+    memory = ViewMemory.of(device, space, targets.targets[asked], scene.sh[targets.rows[asked]], compared)
     if memory is None or scene.sh_degree < 3:  # too smooth to tell distances
         return USUAL, memory
     place, target, worth = shown_from(

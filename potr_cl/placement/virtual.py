@@ -15,7 +15,7 @@ from potr_cl.model.sampling import F64
 from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import FIELD, PREFIX, Plan, plan
 from potr_cl.opencl.device import Device
-from potr_cl.placement.candidates import AIMS, BINS, Candidates, ColourMemory, Targets, candidates_of, resolution
+from potr_cl.placement.candidates import AIMS, BINS, Candidates, SurfacePoints, ViewMemory, candidates_of, resolution
 from potr_cl.placement.space import Space
 from potr_cl.placement.upright import guess_up, level_rotation, levelled
 
@@ -149,10 +149,10 @@ class Ground:
     device: Device
     planned: Plan
     space: Space
-    targets: Targets
+    targets: SurfacePoints
     half_view: float
     pixels: float
-    memory: ColourMemory | None
+    memory: ViewMemory | None
 
     @staticmethod
     def of(
@@ -165,7 +165,7 @@ class Ground:
         half_view = math.tan(math.radians(field / 2))
         space = Space.of(scene)
         wanted = min(_TARGETS * plan(len(scene)).training, max(len(scene) // 10, _LEAST_TARGETS), _MOST_TARGETS)
-        targets = Targets.of(scene, space, wanted)
+        targets = SurfacePoints.of(scene, space, wanted)
         pixels, memory = resolution(opened, scene, space, targets, planned.size / 2 / half_view)
         return Ground(scene, opened, planned, space, targets, half_view, pixels, memory)
 

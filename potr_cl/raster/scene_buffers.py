@@ -74,13 +74,16 @@ class SceneBuffers(Owner):
         Raises:
             DeviceError: the scene does not fit the device.
         """
-        with self.device.all_or_nothing():
+        try:
             self.means = self._columns(3, 0, "the centres")
             self.scales = self._columns(3, 0, "the scales")
             self.quaternions = self._columns(4, 0, "the rotations")
             # The padding has an opacity of 0: it is not drawn.
             self.log2_opacities = self._columns(1, -np.inf, "the opacities")
             self.sh = self._columns(3 * self.sh_count, 0, "the SH coefficients")
+        except BaseException:
+            self.close()
+            raise
 
     def __len__(self) -> int:
         return self.splats

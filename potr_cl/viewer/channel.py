@@ -18,14 +18,17 @@ import contextlib
 import json
 from collections.abc import Callable
 from concurrent.futures import Executor
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
 
 from potr_cl.errors import PotrError
 from potr_cl.plain_text import plain
 from potr_cl.viewer.inbox import Inbox, said_by_page
-from potr_cl.viewer.session import Exhibit, Which
+from potr_cl.viewer.session import Which
 from potr_cl.viewer.uploads import Upload
+
+if TYPE_CHECKING:
+    from potr_cl.viewer.tab import TabHandle
 
 #: Bytes after which the page is told how much has come.
 _TOLD_EVERY = 4 << 20
@@ -37,43 +40,6 @@ _SILENCE = 60.0
 _MOST_UPLOADS = 2
 
 
-class Tab(Protocol):
-    """What a channel's messages are for."""
-
-    def divide(self, at: float) -> None:
-        """The divider was drawn to a part of the width."""
-
-    def swap(self, swapped: bool) -> None:
-        """The flicker key was pressed, or let go."""
-
-    def fly(self, view: int) -> None:
-        """A view of the list was clicked."""
-
-    def draw(self, draws: bool) -> None:
-        """The page draws the scenes by itself, or no longer."""
-
-    def file(self, number: int) -> bytes:
-        """A scene for the page to draw, a .potr file. Raises PotrError, OSError or MemoryError: there is none."""
-
-    def climb(self, rung: int) -> None:
-        """A rung of the ladder was clicked."""
-
-    def acknowledge(self, asked: int) -> None:
-        """How often a rung has been asked for by now."""
-
-    def choose_mode(self, mode: str) -> None:
-        """A key chose how to compare."""
-
-    def toggle_cameras(self) -> None:
-        """A key shows or hides the cameras."""
-
-    def dropped(self, which: Which, exhibit: Exhibit) -> None:
-        """A scene was dropped on the page."""
-
-    def connected(self, send: Callable[[dict[str, Any]], None]) -> None:
-        """The channel is there; ``send`` may be called by any thread."""
-
-
 class Channel:
     """Takes the page's connections.
 
@@ -83,7 +49,7 @@ class Channel:
         antialiased: as of :func:`potr_cl.load_scene`.
     """
 
-    def __init__(self, find: Callable[[str], Tab | None], readers: Executor, antialiased: bool | None) -> None:
+    def __init__(self, find: Callable[[str], TabHandle | None], readers: Executor, antialiased: bool | None) -> None:
         self._find = find
         self._readers = readers
         self._antialiased = antialiased
@@ -125,7 +91,7 @@ class Channel:
                 task.cancel()
 
     async def _receive(
-        self, inbox: Inbox, tab: Tab, announced: dict[str, Any], put: Callable[[dict[str, Any]], None]
+        self, inbox: Inbox, tab: TabHandle, announced: dict[str, Any], put: Callable[[dict[str, Any]], None]
     ) -> None:
         which: Which = "A" if announced.get("as") == "A" else "B"
         if self._uploads >= _MOST_UPLOADS:
@@ -163,7 +129,7 @@ class Channel:
             self._uploads -= 1
 
 
-async def _give(connection: Any, tab: Tab, number: int) -> None:
+async def _give(connection: Any, tab: TabHandle, number: int) -> None:
     """Send a scene for the page to draw."""
     try:
         data = await asyncio.to_thread(tab.file, number)
@@ -195,7 +161,7 @@ class _Mail:
         return taken
 
 
-def _obey(tab: Tab, content: dict[str, Any]) -> None:
+def _obey(tab: TabHandle, content: dict[str, Any]) -> None:
     if "divider" in content:
         tab.divide(min(max(float(content["divider"]), 0.0), 1.0))
     acts: tuple[tuple[str, Callable[[Any], None]], ...] = (

@@ -29,11 +29,6 @@ class Pace:
         """Whether pictures of full size come fast enough."""
         return self._step == 0
 
-    @property
-    def is_slow(self) -> bool:
-        """Whether a picture of full size takes so long that one of a quarter of its pixels should come first."""
-        return self._step > 4
-
     def size(self, width: int, height: int) -> tuple[int, int]:
         """Width and height of the next picture, which has the full picture's shape as well as whole pixels can."""
         part = max(_STEPS[self._step], min(1.0, _LEAST / min(width, height)))

@@ -171,13 +171,9 @@ class Painter:
             bare = visitor.look is not None and visitor.look.a is None and visitor.look.b is None
             if visitor.stale_look or not visitor.is_still or (bare and visitor.is_pictured):
                 visitor.stale_look = visitor.stale_picture = False
-                pace = self._pace(visitor)
-                draft = visitor.is_pictured and not moving and visitor.drafted is not gaze and pace.is_slow
-                if draft:
-                    visitor.drafted = gaze
-                self._render(visitor, moving, draft)
+                self._render(visitor, moving)
                 # A still picture of where the camera was is none of where it is.
-                visitor.is_still = not (moving or draft) and visitor.gaze is gaze
+                visitor.is_still = not moving and visitor.gaze is gaze
             visitor.stale_picture = False
             self._compose(visitor)
             visitor.tell("")
@@ -191,7 +187,7 @@ class Painter:
         if moving and visitor.look is not None and visitor.is_pictured:
             self._pace(visitor).took(visitor.painted - began)
 
-    def _render(self, visitor: Visitor, moving: bool, draft: bool) -> None:
+    def _render(self, visitor: Visitor, moving: bool) -> None:
         gaze, is_pair = visitor.gaze, self._session.is_pair
         assert gaze is not None
         pace = self._pace(visitor)
@@ -200,9 +196,7 @@ class Painter:
             width = max(width // 2, 1)
         if moving:
             width, height = pace.size(width, height)
-        elif draft:
-            width, height = (width + 1) // 2, (height + 1) // 2
-        figures = is_pair and not draft and (not moving or (pace.is_full and visitor.is_pictured))
+        figures = is_pair and (not moving or (pace.is_full and visitor.is_pictured))
         scenes = ("A", "B") if figures else visitor.needs(is_pair)
         visitor.look = self._session.look(camera_of(gaze, width, height), scenes, figures)
 

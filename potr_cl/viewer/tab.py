@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from html import escape
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,38 +15,18 @@ from potr_cl.model.camera import Camera, camera_centres
 from potr_cl.viewer.comparison import FACTORS, MODES
 from potr_cl.viewer.flight import fade, fly, land, put
 from potr_cl.viewer.frusta import add_frusta
-from potr_cl.viewer.losses import Losses
-from potr_cl.viewer.painter import Painter, decibels
+from potr_cl.viewer.painter import decibels
 from potr_cl.viewer.pose import Gaze, gaze_on, rotation_of
 from potr_cl.viewer.session import Exhibit, Which
 from potr_cl.viewer.visitor import Shown, Visitor
+
+if TYPE_CHECKING:
+    from potr_cl.viewer.server import Viewer
 
 #: Qualities of the pictures that are sent while the camera moves, and when it stands.
 _QUICK, _GOOD = 75, 95
 #: Frusta nearer than so many times their own size are not drawn.
 _NEAR = 4.0
-
-
-class House(Protocol):
-    """What a tab asks the server for."""
-
-    painter: Painter
-    losses: Losses
-
-    def is_pair(self) -> bool:
-        """Whether there are two scenes to compare."""
-
-    def put(self, which: Which, exhibit: Exhibit) -> None:
-        """Show a scene to all tabs."""
-
-    def file(self, number: int) -> bytes:
-        """A scene for the page to draw."""
-
-    def climb(self, rung: int) -> None:
-        """Show a rung of the ladder to all tabs."""
-
-    def state(self) -> dict[str, Any]:
-        """What all tabs are told."""
 
 
 class TabHandle:
@@ -58,7 +38,7 @@ class TabHandle:
         cameras: of the scene, if there are any.
     """
 
-    def __init__(self, client: Any, house: House, cameras: list[Camera]) -> None:
+    def __init__(self, client: Any, house: Viewer, cameras: list[Camera]) -> None:
         self.key = secrets.token_urlsafe(16)
         self._client = client
         self._house = house
@@ -122,10 +102,12 @@ class TabHandle:
     # ------------------------------------------------------------------------------- what the user does
 
     def divide(self, at: float) -> None:
+        """The divider was drawn to a part of the width."""
         self.visitor.divider = at
         self._house.painter.wake(self.visitor)
 
     def swap(self, swapped: bool) -> None:
+        """The flicker key was pressed, or let go."""
         self.visitor.swapped = swapped
         self._house.painter.wake(self.visitor, look=self.visitor.mode in ("A", "B"))
         self.restate(everything=False)
@@ -146,16 +128,19 @@ class TabHandle:
         self.restate(everything=False)
 
     def draw(self, draws: bool) -> None:
+        """The page draws the scenes by itself, or no longer."""
         self.visitor.draws, self.visitor.is_still = draws, False
         self._house.painter.wake(self.visitor, look=True)
 
     def file(self, number: int) -> bytes:
+        """As :meth:`potr_cl.viewer.server.Viewer.file`."""
         return self._house.file(number)
 
     def climb(self, rung: int) -> None:
         self._house.climb(rung)
 
     def acknowledge(self, asked: int) -> None:
+        """How often a rung has been asked for by now."""
         self._asked = asked
         self.restate()
 
@@ -163,6 +148,7 @@ class TabHandle:
         self._house.put(which, exhibit)
 
     def connected(self, send: Callable[[dict[str, Any]], None]) -> None:
+        """The channel is there; any thread may send by it."""
         self._send = send
         self.restate()
         self._house.painter.wake(self.visitor)

@@ -76,7 +76,6 @@ class Visitor:
     paces: dict[str, Pace] = field(default_factory=dict)
     painted: float = 0.0
     photograph: tuple[int, U8] | None = None
-    drafted: Gaze | None = None
 
     def size(self) -> tuple[int, int]:
         """Width and height of a picture of full size."""

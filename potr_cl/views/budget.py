@@ -2,7 +2,7 @@
 
 A :class:`Budget` is asked for each group, in the plan's order, how many bytes it may take (:meth:`Budget.room`), and is
 told what it has taken (:meth:`Budget.took`). A group with less room than it takes is streamed: made again whenever it
-is looked at. Views of which only a part fits (:class:`Shared`) keep their lists first, in a
+is looked at. Views of which only a part fits (:class:`ClusterBudget`) keep their lists first, in a
 :class:`ViewCache`.
 """
 
@@ -179,7 +179,7 @@ class Budget(Protocol):
         return 0
 
 
-class Shared(Budget):
+class ClusterBudget(Budget):
     """One room for clusters of views, whose own scenes count too; each gets its part of what is left.
 
     Args:
@@ -208,7 +208,7 @@ class Shared(Budget):
         self._left = max(self._left - nbytes, 0)
 
 
-class Together(Budget):
+class CacheBudget(Budget):
     """One cache for all groups: lists of as many as possible first, then what others want, then geometry.
 
     Args:
@@ -225,7 +225,7 @@ class Together(Budget):
         """The cache knows."""
 
 
-class Named(Budget):
+class NamedBudget(Budget):
     """A room for single views whose splats are named by their numbers; pictures of streamed ones may have the rest.
 
     Args:
@@ -263,7 +263,7 @@ class Named(Budget):
         return sum(self._targets[number] for number in group.numbers)
 
 
-class Foretold(Budget):
+class KnownBudget(Budget):
     """A room for single views that are known to take so much (:attr:`ViewGroup.nbytes`), widest first.
 
     Args:

@@ -25,10 +25,10 @@ from potr_cl.views.budget import (
     GEOMETRY,
     LEAST_SETS,
     Budget,
-    Foretold,
-    Named,
-    Shared,
-    Together,
+    CacheBudget,
+    ClusterBudget,
+    KnownBudget,
+    NamedBudget,
     ViewCache,
     drawn_bytes,
     target_bytes,
@@ -83,13 +83,13 @@ class ViewPlan:
 
 def none() -> ViewPlan:
     """No view: others look at all."""
-    return ViewPlan((), Foretold(0))
+    return ViewPlan((), KnownBudget(0))
 
 
 def whole(numbers: Sequence[int], splats: int, memory: int) -> ViewPlan:
     """All views with all splats."""
     group = ViewGroup(tuple(numbers), splats)
-    return ViewPlan([group], Shared(memory, [group]), in_sets=True)
+    return ViewPlan([group], ClusterBudget(memory, [group]), in_sets=True)
 
 
 def in_launches(
@@ -114,7 +114,7 @@ def in_launches(
             groups.append(ViewGroup(left[:most], stride, most=most))
             left = left[most:]
     cache.largest = max((len(group.numbers) * group.count for group in groups), default=0)
-    return ViewPlan(groups, Together(cache), in_sets=True)
+    return ViewPlan(groups, CacheBudget(cache), in_sets=True)
 
 
 def by_view(
@@ -132,7 +132,7 @@ def by_view(
     counts, meant = visibility.totals, set(numbers)
     order = [number for number in visibility.order().tolist() if number in meant]
     groups = [ViewGroup((number,), int(counts[number]), visibility.seen[number]) for number in order if counts[number]]
-    budget = Named(memory, groups, cameras, totals)
+    budget = NamedBudget(memory, groups, cameras, totals)
 
     def together(others: Sequence[ViewGroup]) -> list[ViewGroup]:
         return neighbours(others, visibility.groups.counts, cameras, budget.streamed)
@@ -179,7 +179,7 @@ def by_cluster(clusters: Sequence[ViewGroup], memory: int, splat: int) -> ViewPl
         memory: bytes of the device's that they may take, copies included.
         splat: bytes of a splat in a scene.
     """
-    budget = Shared(memory, clusters, splat)
+    budget = ClusterBudget(memory, clusters, splat)
     return ViewPlan(clusters, budget, in_sets=True, copies_rest=budget.scenes_rest)
 
 
@@ -201,7 +201,7 @@ def as_drawn(
         found += _drawn(source, cameras, cluster)
         if progress is not None:
             progress(len(found), sum(len(each.numbers) for each in clusters))
-    budget = Foretold(memory)
+    budget = KnownBudget(memory)
 
     def together(others: Sequence[ViewGroup]) -> list[ViewGroup]:
         return [group for each in clusters for group in _few_splats(each, others, budget.streamed)]

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from potr_cl.errors import PotrError, UsageError
+from potr_cl.errors import PotrError, UsageError, WriteError
+from potr_cl.host import atomic_write
 from potr_cl.host.atomic_write import check_place, replacing
 
 
@@ -140,3 +141,24 @@ def test_a_name_as_long_as_the_file_system_allows(tmp_path: Path) -> None:
     with replacing(target) as file:
         file.write(b"x")
     assert target.read_bytes() == b"x"
+
+
+def test_a_file_that_somebody_looks_at_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On Windows a virus scanner or an indexer has a new file open for a moment."""
+    replace, refusals = Path.replace, [PermissionError(13, "Access is denied")] * 2
+
+    def refused_at_first(path: Path, target: Path) -> Path:
+        if refusals:
+            raise refusals.pop()
+        return replace(path, target)
+
+    monkeypatch.setattr(Path, "replace", refused_at_first)
+    monkeypatch.setattr(atomic_write, "_PAUSES", (0.0, 0.0))
+    with replacing(tmp_path / "out.bin") as file:
+        file.write(b"whole")
+    assert (tmp_path / "out.bin").read_bytes() == b"whole"
+    refusals += [PermissionError(13, "Access is denied")] * 3
+    with pytest.raises(WriteError, match=r"out\.bin': Access is denied"), replacing(tmp_path / "out.bin") as file:
+        file.write(b"another")
+    assert (tmp_path / "out.bin").read_bytes() == b"whole"
+    assert os.listdir(tmp_path) == ["out.bin"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -80,6 +81,15 @@ def test_how_a_trial_ends(child, source, decided, said):
     info = choose_device()
     assert verdict.tried(info) == said
     assert verdict.kept(info) == (decided, said)
+
+
+def test_ctrl_c_on_windows_is_no_crash(child, monkeypatch):
+    ended = subprocess.CompletedProcess([], 0xC000013A, b"", b"")
+    monkeypatch.setattr(verdict.subprocess, "run", lambda *_, **__: ended)
+    assert verdict.tried(choose_device()) is None
+    assert verdict.kept(choose_device()) == (False, None)
+    monkeypatch.setattr(ended, "returncode", 0xC0000005)
+    assert verdict.tried(choose_device()) == "its driver crashes while an encode runs"
 
 
 def test_what_a_trial_measures_is_told(child):

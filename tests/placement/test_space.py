@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.spherical_harmonics import energy, unit_coefficients
-from potr_cl.placement.candidates import Memory
+from potr_cl.placement.candidates import ViewMemory
 from potr_cl.placement.rays import resolved_by, shown_from
 from potr_cl.placement.space import Space, _distances
 from tests.cases.surfaces import box, flat_splats, sphere
@@ -180,7 +180,7 @@ def test_energies_are_those_of_numpy(device, degree):
     scene = random_scene(150, degree)
     space = Space.of(scene)
     places = np.random.default_rng(0).normal(size=(9, 3)) * 5
-    memory = Memory.of(device, space, scene.means.astype(np.float64), scene.sh, places)
+    memory = ViewMemory.of(device, space, scene.means.astype(np.float64), scene.sh, places)
     assert memory is not None
     colours = unit_coefficients(scene.sh[:, 1:])
     wanted = [energy(scene.means.astype(np.float64) - place, colours) for place in places]
@@ -193,4 +193,4 @@ def test_energies_are_those_of_numpy(device, degree):
 @pytest.mark.parametrize("degree", [0, 1])
 def test_smooth_colours_remember_nothing(device, degree):
     scene = random_scene(150, degree)
-    assert Memory.of(device, Space.of(scene), scene.means.astype(np.float64), scene.sh, np.ones((3, 3))) is None
+    assert ViewMemory.of(device, Space.of(scene), scene.means.astype(np.float64), scene.sh, np.ones((3, 3))) is None

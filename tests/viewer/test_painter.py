@@ -17,11 +17,10 @@ from potr_cl.formats.images import to_8_bits
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
 from potr_cl.viewer.losses import Losses
-from potr_cl.viewer.pace import Pace
 from potr_cl.viewer.painter import Painter
 from potr_cl.viewer.pose import camera_of, gaze_on
 from potr_cl.viewer.session import Exhibit, Session
-from potr_cl.viewer.visitor import PAUSE, Shown, Visitor
+from potr_cl.viewer.visitor import Shown, Visitor
 from tests.devices import KERNELS, open_device
 
 WIDTH, HEIGHT = 120, 90
@@ -114,20 +113,6 @@ def test_while_the_camera_moves_there_are_fewer_pixels(painter, gazes):
     until(moving)
     assert moving()[0].picture.shape < (4 * HEIGHT, 4 * WIDTH, 3)
     assert browser.still().picture.shape == (4 * HEIGHT, 4 * WIDTH, 3)
-
-
-def test_on_a_slow_device_a_coarse_picture_comes_first(painter, gazes):
-    browser = Browser()
-    browser.visitor.paces["two"] = pace = Pace()
-    for _ in range(8):
-        pace.took(10.0)
-    painter.enter(browser.visitor)
-    browser.look(painter, gazes[0])
-    browser.visitor.moved -= 2 * PAUSE
-    assert browser.still().picture.shape == (HEIGHT, WIDTH, 3)
-    sizes = [shown.picture.shape[:2] for shown in browser.shown]
-    assert (HEIGHT // 2, WIDTH // 2) in sizes[:-1]
-    assert sizes.count((HEIGHT // 2, WIDTH // 2)) == 1
 
 
 def test_beside_each_other_each_has_half_the_width(painter, gazes):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from potr_cl.views.budget import Foretold, Named, Shared, target_bytes
+from potr_cl.views.budget import ClusterBudget, KnownBudget, NamedBudget, target_bytes
 from potr_cl.views.plan import neighbours
 from potr_cl.views.visibility import ViewGroup
 from tests.reference.scenes import ring_of_cameras
@@ -22,7 +22,7 @@ def singles(count=1000):
 
 def test_pictures_of_all_views_have_room_before_any_view_stays():
     groups = singles()
-    budget = Named(12 * PICTURE + 50_000, groups, CAMERAS, totals=0)
+    budget = NamedBudget(12 * PICTURE + 50_000, groups, CAMERAS, totals=0)
     assert budget.room(groups[0]) < PICTURE
     budget.took(groups[0], 0)
     streamed = groups[1:]
@@ -35,7 +35,7 @@ def test_pictures_of_all_views_have_room_before_any_view_stays():
 
 def test_where_all_views_fit_nothing_is_set_aside():
     groups = singles()
-    budget = Named(1 << 30, groups, CAMERAS, totals=1 << 20)
+    budget = NamedBudget(1 << 30, groups, CAMERAS, totals=1 << 20)
     for group in groups:
         room = budget.room(group)
         budget.took(group, 100_000)
@@ -45,7 +45,7 @@ def test_where_all_views_fit_nothing_is_set_aside():
 
 def test_views_that_are_known_to_take_too_much_are_not_tried():
     wide, narrow = (ViewGroup((number,), 10, nbytes=nbytes) for number, nbytes in ((0, 900), (1, 500)))
-    budget = Foretold(4000)
+    budget = KnownBudget(4000)
     assert budget.room(wide) < 0  # to make it takes more than that
     few = [ViewGroup((number,), 1, nbytes=900) for number in range(4)]
     kept = []
@@ -59,14 +59,14 @@ def test_views_that_are_known_to_take_too_much_are_not_tried():
 
 def test_clusters_share_what_is_left_by_their_work():
     groups = [ViewGroup((0, 1, 2), 100), ViewGroup((3,), 100)]
-    budget = Shared(80_000, groups, splat=100)
+    budget = ClusterBudget(80_000, groups, splat=100)
     assert not budget.scenes_rest
     first = budget.room(groups[0])
     budget.took(groups[0], int(first))
     last = budget.room(groups[1])
     assert first > 2.5 * last > 0
     assert first + last < 80_000 - 200 * 100
-    assert Shared(30_000, groups, splat=100).scenes_rest
+    assert ClusterBudget(30_000, groups, splat=100).scenes_rest
 
 
 def test_neighbours_are_streamed_together_as_far_as_they_may():

@@ -11,6 +11,7 @@ from tools.stress import offline
 _LARGEST = (
     "refit/blocks.cl",
     "refit/rounding.cl",
+    "refit/gather.cl",
     "refit/refit_gpu.cl",
     "prune/removal_gpu.cl",
     "fit/derivatives_gpu.cl",

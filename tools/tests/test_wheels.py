@@ -14,8 +14,7 @@ from platform import machine
 
 import pytest
 
-from potr_cl.codec.native.declarations import _DECLARATIONS
-from potr_cl.codec.native.library import Functions
+from potr_cl.codec.native.declarations import _DECLARATIONS, declared
 from tools.make import wheels
 from tools.make.wheels import PLATFORMS, wheel_for
 
@@ -96,4 +95,4 @@ def test_the_library_is_for_the_platform(name: str, tmp_path: Path) -> None:
     assert max(needed, default=(0,)) <= (2, 17)
     assert name != "macos-arm64" or is_signed(library)
     if name == f"{sys.platform}-{machine()}":
-        Functions(str(tmp_path / PLATFORMS[name].library))
+        declared(str(tmp_path / PLATFORMS[name].library))

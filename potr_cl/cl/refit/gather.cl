@@ -86,6 +86,11 @@ inline void store_sums(vlong sums, Place place, const int there[LANES], global l
 #define STORE_SUMS(sums, place, column) VSTORE(sums, place, column)
 #endif
 
+/* A work-item has one view, and nothing to keep of the results between views: it adds some at a time, so that all fits
+   the registers of any GPU. */
+#define ONE_VIEW (PICKED && LANES == 1)
+#define AT_A_TIME 12
+
 /* The totals of some of a set's views, times the view's scale, onto the coefficients: result += basis x (Y, Co, Cg) of
    the free channels' sums, view by view. What views have lies `apart`. With WEIGHTS also blocks += the sum of
    w^2 x basis x basis, for `block_stride` splats from number `first_block` on. Both are columns of integers; the scales
@@ -120,18 +125,22 @@ kernel void gather(
 #else
     const size_t splat = index;
 #endif
+#if !ONE_VIEW
     vlong results[3 * SH_COUNT];
     int any_view = 0;
+#endif
     for (uint number = first_view; number < first_view + view_count; ++number) {
         const size_t place = number * apart / LANES + index;
         vfloat sums[4];
         const int any_sum = take_totals(totals + (size_t)TOTALS * LANES * place, scales[first_scale + number], sums);
         if (!any_sum)
             continue;
+#if !ONE_VIEW
         if (!any_view)
             for (int i = 0; i < 3 * SH_COUNT; ++i)
                 results[i] = LOAD_SUMS(splat, result + i * stride);
         any_view = 1;
+#endif
         VREAL basis[SH_COUNT];
         basis_towards(means, stride, splat, &views[number].view, basis);
         const vint kept = free_channels(free, place);
@@ -139,9 +148,20 @@ kernel void gather(
         const vfloat g = (kept & 2) != 0 ? sums[1] : (vfloat)(0.0f);
         const vfloat b = (kept & 4) != 0 ? sums[2] : (vfloat)(0.0f);
         const vfloat channels[3] = {r + g + b, r - b, g - r - b};
+#if ONE_VIEW
+        for (int first = 0; first < 3 * SH_COUNT; first += AT_A_TIME) {
+            long some[AT_A_TIME];
+            for (int i = 0; i < AT_A_TIME && first + i < 3 * SH_COUNT; ++i)
+                some[i] = result[splat + (first + i) * stride];
+            for (int i = 0; i < AT_A_TIME && first + i < 3 * SH_COUNT; ++i)
+                result[splat + (first + i) * stride] =
+                    some[i] + to_fixed_lanes(basis[(first + i) / 3] * channels[(first + i) % 3]);
+        }
+#else
         for (int m = 0; m < SH_COUNT; ++m)
             for (int c = 0; c < 3; ++c)
                 results[3 * m + c] += to_fixed_lanes(basis[m] * channels[c]);
+#endif
 #if WEIGHTS && PICKED && LANES > 1
         const vfloat weight = sums[3];
         for (int i = 0; i < SH_COUNT; ++i)
@@ -169,9 +189,11 @@ kernel void gather(
             }
 #endif
     }
+#if !ONE_VIEW
     if (any_view)
         for (int i = 0; i < 3 * SH_COUNT; ++i)
             STORE_SUMS(results[i], splat, result + i * stride);
+#endif
 }
 
 #if LANES == 1

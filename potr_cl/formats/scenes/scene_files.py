@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from potr_cl.codec import octree
 from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.errors import DataError, PotrError, UsageError
-from potr_cl.host.inputs import check_claim, refuse_lfs_pointer, unchanged
+from potr_cl.host.inputs import check_claim, is_device_of_windows, refuse_lfs_pointer, unchanged
 from potr_cl.model.scene import LOW_PASS, CleanReport, FloatArray, Scene
 
 #: Where somebody wants to know what was mended in files that are read.
@@ -94,16 +94,18 @@ def file_in_folder(path: str | os.PathLike[str], name: str) -> Path | None:
     return given / name if os.path.isfile(given / name) else None
 
 
-def related(file: Path, name: object) -> Path:
+def related(file: Path, name: object, windows: bool = os.name == "nt") -> Path:
     """A file that ``file`` names, beside it or in a folder below.
 
     Raises:
-        DataError: the name is none, or leads out of the folder; or there is a Git-LFS pointer in the file's place.
+        DataError: the name is none, or leads out of the folder, or to a device of Windows; or there is a Git-LFS
+            pointer in the file's place.
     """
     parts = PurePosixPath(name).parts if isinstance(name, str) else ()
     if not parts or not all(part.isprintable() for part in parts) or {"..", "/", "//"} & set(parts):
         raise DataError(f"'{file}' is damaged: it names a file {shown(name)}")
-    if PureWindowsPath(*parts).drive or any("\\" in part for part in parts):
+    elsewhere = windows and any(":" in part or is_device_of_windows(part) for part in parts)
+    if elsewhere or PureWindowsPath(*parts).drive or any("\\" in part for part in parts):
         raise DataError(f"'{file}' is damaged: it names a file {shown(name)}")
     found = file.parent.joinpath(*parts)
     refuse_lfs_pointer(found)

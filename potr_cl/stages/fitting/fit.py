@@ -29,62 +29,10 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.stages.fitting.adam import UNROUNDED, Adam, Factors, Limits, Rates
 from potr_cl.stages.fitting.fitted import Fitted, decibels
-from potr_cl.stages.fitting.together import Batch, Descent, Ground, Together, room_for_pictures, together
+from potr_cl.stages.fitting.together import Batch, DeviceFit, Ground, SharedFit, room_for_pictures, together
 from potr_cl.stages.held_out import share_out
 from potr_cl.views.shares import HelpFrom
 from potr_cl.views.targets import TargetPictures, Targets
-
-#: Work-items that sum up a picture's squared differences, and those of a group.
-_ITEMS, _GROUP = 1 << 14, 64
-
-
-class Judges(Owner):
-    """Views that are held out of a fit.
-
-    Args:
-        device: to compute on.
-        rasterizer: of the scene, which may change between two calls.
-        cameras: all views.
-        pictures: what they should show.
-        held_out: the numbers of those that judge.
-    """
-
-    def __init__(
-        self,
-        device: Device,
-        rasterizer: Rasterizer,
-        cameras: Sequence[Camera],
-        pictures: TargetPictures,
-        held_out: Sequence[int],
-    ) -> None:
-        self._device, self._rasterizer, self._cameras, self._pictures = device, rasterizer, cameras, pictures
-        self._held_out = list(held_out)
-        self._kernel = device.shared_kernel("fit/squared_error.cl", "squared_error")
-        self._memory = Memory(device)
-        self._sums = self._memory.allocate(4 * _ITEMS * max(len(self), 1), "the judges' sums")
-
-    def __len__(self) -> int:
-        return len(self._held_out)
-
-    def error(self) -> float:
-        """The mean squared error of the scene as it is now, all views the same."""
-        for place, number in enumerate(self._held_out):
-            image, _ = self._rasterizer.render_device(self._cameras[number])
-            self._kernel.bind(
-                picture=image,
-                target=self._pictures.of([number]),
-                count=self._values(number),
-                sums=self._sums,
-                first_sum=_ITEMS * place,
-            )
-            self._kernel.launch((_ITEMS,), (_GROUP,))
-        sums = self._device.download(self._sums, (len(self), _ITEMS), np.float32).sum(axis=1, dtype=np.float64)
-        return float(np.mean(sums / [self._values(number) for number in self._held_out]))
-
-    def _values(self, number: int) -> int:
-        camera = self._cameras[number]
-        return 3 * camera.width * camera.height
-
 
 logger = logging.getLogger("potr_cl")
 
@@ -202,7 +150,7 @@ def fit_scene(
     ground = Ground(scene, cameras, background, rates, _limits(scene), factors)
     with (
         _pictures_of(device, cameras, targets, options.memory) as pictures,
-        Descent(device, ground, pictures) as descent,
+        DeviceFit(device, ground, pictures) as descent,
     ):
         if options.memory is None and options.steps * options.batch >= len(fit_to):
             pictures.fill([(number,) for number in (*held_out, *fit_to)])
@@ -259,7 +207,7 @@ def _pictures_of(
 
 def _run(
     options: FitOptions,
-    steps: Together,
+    steps: SharedFit,
     adam: Adam,
     judges: Judges,
     fit_to: Sequence[int],
@@ -316,6 +264,58 @@ def _unit(error: float) -> float:
     if not 0 < error < math.inf:
         return 1.0
     return min(max(2.0 ** math.floor(math.log2(_USUAL_DIFFERENCE / math.sqrt(error))), 1.0), _LARGEST_UNIT)
+
+
+#: Work-items that sum up a picture's squared differences, and those of a group.
+_ITEMS, _GROUP = 1 << 14, 64
+
+
+class Judges(Owner):
+    """Views that are held out of a fit.
+
+    Args:
+        device: to compute on.
+        rasterizer: of the scene, which may change between two calls.
+        cameras: all views.
+        pictures: what they should show.
+        held_out: the numbers of those that judge.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        rasterizer: Rasterizer,
+        cameras: Sequence[Camera],
+        pictures: TargetPictures,
+        held_out: Sequence[int],
+    ) -> None:
+        self._device, self._rasterizer, self._cameras, self._pictures = device, rasterizer, cameras, pictures
+        self._held_out = list(held_out)
+        self._kernel = device.shared_kernel("fit/squared_error.cl", "squared_error")
+        self._memory = Memory(device)
+        self._sums = self._memory.allocate(4 * _ITEMS * max(len(self), 1), "the judges' sums")
+
+    def __len__(self) -> int:
+        return len(self._held_out)
+
+    def error(self) -> float:
+        """The mean squared error of the scene as it is now, all views the same."""
+        for place, number in enumerate(self._held_out):
+            image, _ = self._rasterizer.render_device(self._cameras[number])
+            self._kernel.bind(
+                picture=image,
+                target=self._pictures.of([number]),
+                count=self._values(number),
+                sums=self._sums,
+                first_sum=_ITEMS * place,
+            )
+            self._kernel.launch((_ITEMS,), (_GROUP,))
+        sums = self._device.download(self._sums, (len(self), _ITEMS), np.float32).sum(axis=1, dtype=np.float64)
+        return float(np.mean(sums / [self._values(number) for number in self._held_out]))
+
+    def _values(self, number: int) -> int:
+        camera = self._cameras[number]
+        return 3 * camera.width * camera.height
 
 
 def batches(numbers: Sequence[int], size: int, seed: int) -> Iterator[list[int]]:

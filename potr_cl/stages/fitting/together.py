@@ -1,4 +1,4 @@
-"""The steps of a fit, by one device or by several together: :class:`Descent`, :class:`Together`.
+"""The steps of a fit, by one device or by several together: :class:`DeviceFit`, :class:`SharedFit`.
 
 Every device has all parameters and takes every step. What a step costs are the views' sums, so the views of a batch are
 dealt out, and each device tells the others its views' sums. These are integers that do not depend on who found them,
@@ -79,7 +79,7 @@ def room_for_pictures(device: Device, memory: int | None) -> Room:
     return Room((device.info.memory - device.allocated) * _SHARE if memory is None else memory)
 
 
-class Descent(Owner):
+class DeviceFit(Owner):
     """A fit on one device.
 
     Args:
@@ -133,7 +133,7 @@ class Descent(Owner):
 
 
 class FitPart(Part):
-    """A :class:`Descent` that follows another one.
+    """A :class:`DeviceFit` that follows another one.
 
     Args:
         device: to compute on.
@@ -148,7 +148,7 @@ class FitPart(Part):
             targets = owned.enter_context(targets_of(device, scene, ground.cameras, ground.background))
             room = room_for_pictures(device, memory)
             pictures = owned.enter_context(TargetPictures(device, ground.cameras, room, targets))
-            self._descent = owned.enter_context(Descent(device, ground, pictures))
+            self._descent = owned.enter_context(DeviceFit(device, ground, pictures))
             self._owned = owned.pop_all()
 
     def sums(self, taken: int, before: tuple[Batch, Sums] | None, batch: Batch, places: Sequence[int]) -> Sums | None:
@@ -173,7 +173,7 @@ class FitPart(Part):
         self._descent.taken = taken
 
 
-class Together:
+class SharedFit:
     """A fit that others help with, as long as this is faster.
 
     Args:
@@ -182,7 +182,7 @@ class Together:
         takes_part: whether the first device does views too.
     """
 
-    def __init__(self, descent: Descent, helping: Helping, takes_part: bool) -> None:
+    def __init__(self, descent: DeviceFit, helping: Helping, takes_part: bool) -> None:
         self._descent, self._helping, self._takes_part = descent, helping, takes_part
         self._before: tuple[Batch, Sums] | None = None
         self._steps = 0
@@ -237,8 +237,8 @@ class Together:
 
 @contextmanager
 def together(
-    descent: Descent, ground: Ground, help_from: HelpFrom | None, memory: int | None, batch: int
-) -> Iterator[Together]:
+    descent: DeviceFit, ground: Ground, help_from: HelpFrom | None, memory: int | None, batch: int
+) -> Iterator[SharedFit]:
     """A fit by all who are there.
 
     Args:
@@ -264,4 +264,4 @@ def together(
 
         if pool is not None:
             helping.open(opened)
-        yield Together(descent, helping, pool is not None and pool.takes_part)
+        yield SharedFit(descent, helping, pool is not None and pool.takes_part)
