@@ -34,6 +34,7 @@ RECIPES = {
     "Add a kernel": ["tests/opencl/test_kernel.py"],
     "Try a variant of a kernel": [],
     "Add a format": ["tests/formats/test_registry.py"],
+    "Add an output": [],
     "Add a device quirk": ["tests/opencl/test_quirks.py"],
 }
 

@@ -25,7 +25,7 @@ from PIL import Image
 import potr_cl
 from potr_cl.formats.scenes import page as pages
 from potr_cl.model.camera import Camera
-from potr_cl.outputs.page import Page
+from potr_cl.outputs.potr import Page
 from potr_cl.pipeline.options import EncodeOptions
 from tests.cases.web import GOLDEN, WEB, judged
 from tests.reference.scenes import random_scene

@@ -197,28 +197,6 @@ def _check_coder(options: EncodeOptions) -> None:
             )
 
 
-def stage_options(
-    kind: type[Stage],
-    q: float,
-    background: ColourSource,
-    memory: float | None,
-    choices: Mapping[str, Any],
-    sf_sh: float | None = None,
-) -> EncodeOptions:
-    """Options of an encode in which one stage alone looks at views, checked.
-
-    Raises:
-        UsageError: one is unknown or out of range.
-    """
-    alone = {stage.name: {"on": isinstance(stage, kind)} for stage in EncodeOptions().stages if stage.needs_views}
-    options = EncodeOptions(q=q).changed(**alone)
-    options = encode_options(options, None, choices, background=background, memory=memory, stages=[kind])
-    if sf_sh is not None:
-        options = options.with_parameters(sf_sh=sf_sh)
-        _ = options.parameters
-    return options
-
-
 def output_choice(path: str | os.PathLike[str] | None, to: str | None, **choices: Any) -> Output | None:
     """The kind of file that a name or a suffix asks for; None if nothing does.
 

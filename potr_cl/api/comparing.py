@@ -38,23 +38,22 @@ from potr_cl.quality.compare import (
     comparing,
     comparison_of,
     comparison_report,
-    find_ground_truth,
     format_comparison,
     format_sizes,
     mean_view,
-    missing_photographs,
     size_report,
 )
 from potr_cl.quality.figures import ViewFigures
 from potr_cl.quality.judging import Judging, Looks
 from potr_cl.quality.metrics import Lpips
+from potr_cl.quality.photographs import find_ground_truth, missing_photographs
 from potr_cl.raster.rules import RULES, RasterRules
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.report.labels import U8, comparison_picture, shrunk
 from potr_cl.workers.host import ClusterSource, DevicesSource, Workers, open_workers
 
 if TYPE_CHECKING:
-    from potr_cl.outputs.coded_scene import CodedScene
+    from potr_cl.outputs.output import CodedScene
     from potr_cl.viewer.server import Viewer
 
 #: Pixels that a notebook's picture is wide at most: it is kept in the notebook.

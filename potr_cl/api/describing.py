@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from potr_cl.api.inputs import SceneSource, bytes_of_source, encoded_bytes, name_of, scene_of
+from potr_cl.api.inputs import SceneSource, bytes_of_source, encoded_bytes, holds_potr, name_of, scene_of
 from potr_cl.codec.decoder import PotrFile, open_file
-from potr_cl.errors import UsageError
 from potr_cl.formats import load_scene, registry
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes.page import POTR
-from potr_cl.formats.scenes.scene_files import noting_mends
+from potr_cl.formats.scenes.scene_files import noting_mends, without_level
 from potr_cl.formats.streams import plain
 from potr_cl.model.scene import CleanReport, Scene
 from potr_cl.report.file import file_report, format_report
@@ -96,14 +95,9 @@ def _as_it_would_be_read(scene: Scene) -> tuple[Scene, list[CleanReport]]:
 
 
 def _format_of(path: Path) -> SceneFormat:
-    """The format that reads a scene; .potr where no suffix of a file says another one, as content tells these.
+    """The format that reads a scene; .potr files are known by their content, whatever they are called.
 
     Raises:
-        UsageError: a folder, of no format; or the checkpoint of a training.
+        UsageError: there is none.
     """
-    try:
-        return registry.format_of(path)
-    except UsageError:
-        if path.is_dir() or registry.is_checkpoint(path):
-            raise
-        return POTR
+    return POTR if holds_potr(path) or not os.path.lexists(without_level(path)) else registry.format_of(path)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, TypedDict, TypeVar
 
 import numpy as np
 
-from potr_cl.api.choices import CompactChoices, PruneChoices, stage_options
+from potr_cl.api.choices import CompactChoices, PruneChoices, encode_options
 from potr_cl.api.files import result_writer, save
 from potr_cl.api.inputs import (
     CamerasSource,
@@ -49,7 +49,7 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.run import Run, Stopwatch
 from potr_cl.pipeline.target import as_bytes
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
-from potr_cl.quality.ground_truth import GroundTruth
+from potr_cl.quality.photographs import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.compact import Compact as Compact
 from potr_cl.stages.fitting.fit import FitOptions as FitOptions
@@ -416,8 +416,16 @@ def _split(choices: Any) -> tuple[EditChoices, dict[str, Any]]:
 def _stage_options(
     kind: type[Stage], q: float, how: EditChoices, own: dict[str, Any], sf_sh: float | None = None
 ) -> EncodeOptions:
-    options = stage_options(kind, q, how.get("background", "black"), how.get("memory"), own, sf_sh)
-    return options.changed(cameras_anyway=how.get("cameras_anyway", False))
+    """Options of an encode in which this stage alone looks at views, checked."""
+    alone = {stage.name: {"on": isinstance(stage, kind)} for stage in EncodeOptions().stages if stage.needs_views}
+    options = encode_options(
+        EncodeOptions(q=q).changed(**alone), None, own, background=how.get("background"), memory=how.get("memory"),
+        cameras_anyway=how.get("cameras_anyway"), stages=[kind],
+    )  # fmt: skip
+    if sf_sh is not None:
+        options = options.with_parameters(sf_sh=sf_sh)
+        _ = options.parameters
+    return options
 
 
 def refit(

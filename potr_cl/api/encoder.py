@@ -21,7 +21,7 @@ from potr_cl.api.views import log_placed
 from potr_cl.errors import DeviceError, PotrError, UsageError
 from potr_cl.formats.ladder import DESCRIPTION, Ladder, Rung
 from potr_cl.formats.registry import stem_of_scene
-from potr_cl.host.atomic_write import replacing
+from potr_cl.host.atomic_write import make_folder, replacing
 from potr_cl.host.mapped import bounded
 from potr_cl.host.threads import in_background
 from potr_cl.levels.encoding import encode_levels
@@ -36,9 +36,8 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.run import Stopwatch, added_up
 from potr_cl.pipeline.search import encode_to_target
 from potr_cl.pipeline.target import Target
-from potr_cl.quality.by_photographs import judge_by_photographs
-from potr_cl.quality.evaluator import EvaluationViews, Evaluator
-from potr_cl.quality.ground_truth import GroundTruth
+from potr_cl.quality.evaluator import EvaluationViews, Evaluator, judge_by_photographs
+from potr_cl.quality.photographs import GroundTruth
 from potr_cl.raster.resident import ResidentScene
 from potr_cl.report.html import PicturePair, html_report, views_to_show
 from potr_cl.report.summary import decibels, encode_report, photographs_report, quality_report, search_report
@@ -83,15 +82,22 @@ class _Job:
     def pool(self) -> Pool | None:
         return None if self.workers is None else self.workers.pool
 
-    def encoding(self, progress: Progress | None) -> Callable[[], Encoded]:
-        """What encodes it."""
+    def encoded(self, progress: Progress | None) -> Encoded:
         run: Callable[..., Encoded] = run_stages
         if self.options.wanted_levels != 1:
             run = partial(encode_levels, judge=self.judging is not None)
-        return partial(
-            run, self.scene, self.cameras, self.options, progress, self.device, kept=self.kept, in_frame=True,
+        return run(
+            self.scene, self.cameras, self.options, progress, self.device, kept=self.kept, in_frame=True,
             tell=_log.info, pool=self.pool,
         )  # fmt: skip
+
+    def searched(self, target: Target, progress: Progress | None) -> tuple[Encoded, dict[str, Any]]:
+        """The encode that meets a target, and the report of the search."""
+        found = encode_to_target(
+            self.scene, self.cameras, target, self.options, progress, self.device, _log.info, in_frame=True,
+            pool=self.pool,
+        )  # fmt: skip
+        return replace(found.encoded, options=found.options), search_report(target, found)
 
 
 class Encoder:
@@ -252,12 +258,9 @@ class Encoder:
             before = Traffic() if job.pool is None else replace(job.pool.traffic)
             search: dict[str, Any] | None = None
             if self._target is None:
-                encoded = job.encoding(progress)()
+                encoded = job.encoded(progress)
             else:
-                found = encode_to_target(
-                    job.scene, job.cameras, self._target, job.options, progress, job.device, _log.info, pool=job.pool
-                )
-                encoded, search = replace(found.encoded, options=found.options), search_report(self._target, found)
+                encoded, search = job.searched(self._target, progress)
             watch = Stopwatch(progress)
             quality: dict[str, Any] | str = "not judged, as asked"
             if self._judge and job.judging is None:
@@ -374,10 +377,7 @@ class Encoder:
         for file in (*files, description):
             if file.is_dir():
                 raise UsageError(f"cannot write '{file}': it is a directory; write the ladder elsewhere")
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UsageError(f"cannot make the folder '{folder}': {error.strerror}") from None
+        make_folder(folder)
         rungs = []
         # A folder that takes no file is reported before the work.
         with replacing(description) as target, self._prepared(source, progress) as job:
@@ -390,7 +390,7 @@ class Encoder:
         return ladder
 
     def _rung(self, job: _Job, file: Path, progress: Progress | None) -> Rung:
-        encoded = job.encoding(progress)()
+        encoded = job.encoded(progress)
         psnr = ssim = None
         said = ""
         with proved(encoded, self._trust, None if job.judging is None else encoded.device) as written:

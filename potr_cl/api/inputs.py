@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from potr_cl.formats.images import Colour
     from potr_cl.opencl.device import Device
     from potr_cl.opencl.discovery import DeviceInfo
-    from potr_cl.outputs.coded_scene import CodedScene
+    from potr_cl.outputs.output import CodedScene
     from potr_cl.pipeline.encoded import Encoded
     from potr_cl.raster.rules import RasterRules
     from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
@@ -153,7 +153,7 @@ def coded_scene(source: SceneSource, trust: bool = False) -> CodedScene | None:
     """
     if not _is_potr(source):
         return None
-    from potr_cl.outputs.coded_scene import CodedScene
+    from potr_cl.outputs.output import CodedScene
     from potr_cl.outputs.potr import Potr
 
     data = encoded_bytes(source)
@@ -170,7 +170,7 @@ def coded_scene(source: SceneSource, trust: bool = False) -> CodedScene | None:
 def _is_potr(source: SceneSource) -> bool:
     if encoded_bytes(source) is not None:
         return True
-    return isinstance(source, (str, os.PathLike)) and _holds_potr(Path(source))
+    return isinstance(source, (str, os.PathLike)) and holds_potr(Path(source))
 
 
 def on_device(
@@ -359,7 +359,7 @@ def chosen_views(
     return tests or list(cameras)
 
 
-def _holds_potr(path: Path) -> bool:
+def holds_potr(path: Path) -> bool:
     """Whether a path is that of a .potr file, whatever it is called; whoever reads it will say what else is wrong."""
     try:
         if not path.is_file():  # a pipe can be read only once

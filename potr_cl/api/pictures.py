@@ -31,15 +31,15 @@ from potr_cl.api.inputs import (
     scene_of,
 )
 from potr_cl.api.views import Viewpoints, describe_views, warn_of_frame
-from potr_cl.errors import DataError, DeviceError, UsageError
+from potr_cl.errors import DataError, DeviceError
 from potr_cl.formats.images import Colour, to_8_bits, write_png
-from potr_cl.host.atomic_write import replacing
+from potr_cl.host.atomic_write import make_folder, replacing
 from potr_cl.host.inputs import is_device_of_windows
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
-from potr_cl.quality.pictures import Renderer
+from potr_cl.quality.metrics_device import Renderer
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import RasterRules
 from potr_cl.report.labels import U8, contact_sheet
@@ -366,18 +366,6 @@ def file_name(view: str, windows: bool = os.name == "nt") -> str:
         if is_device_of_windows(name):
             name = f"_{name}"
     return name
-
-
-def make_folder(folder: Path) -> None:
-    """Make a folder unless it is there.
-
-    Raises:
-        UsageError: it cannot be made.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"cannot make the folder '{folder}': {error.strerror}") from None
 
 
 def written_pictures(rasterizer: Renderer, cameras: Sequence[Camera], paths: Sequence[Path]) -> Iterator[Path]:

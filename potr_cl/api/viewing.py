@@ -27,7 +27,7 @@ from potr_cl.errors import UsageError
 from potr_cl.formats.ladder import Ladder, ladder_at, read_ladder
 from potr_cl.model.camera import within_photographs
 from potr_cl.opencl.device import Device
-from potr_cl.quality.ground_truth import GroundTruth
+from potr_cl.quality.photographs import GroundTruth
 from potr_cl.raster.rules import RasterRules
 
 if TYPE_CHECKING:

@@ -19,11 +19,11 @@ from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import describe
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import DEVICE_VARIABLE as DEVICE_VARIABLE
-from potr_cl.placement.viewpoints import AXES as AXES
+from potr_cl.placement.upright import AXES as AXES
 from potr_cl.placement.viewpoints import SIZE as SIZE
 from potr_cl.placement.viewpoints import VIEWS as VIEWS
 from potr_cl.placement.viewpoints import look_around, turntable
-from potr_cl.placement.virtual import judging_views, place_cameras
+from potr_cl.placement.virtual import place_cameras
 from potr_cl.quality.evidence import evidence_of
 from potr_cl.raster.rules import RULES as RULES
 from potr_cl.stages.stage import Progress
@@ -99,8 +99,10 @@ class Viewpoints:
         return look_around(scene, VIEWS if self.count is None else self.count, size, self.direction, device)
 
     def judging(self, scene: Scene, device: Device | None = None) -> list[Camera]:
-        """The views to judge by: those that an encode without cameras is judged by, where nothing else is asked for."""
-        return self.placed(scene, device) if self.asked_for else judging_views(scene, device=device)
+        """The views to judge by: those of an encode without cameras, so many and so large, unless others are wanted."""
+        if self.turntable is not None:
+            return self.placed(scene, device)
+        return look_around(scene, self.count, self.size, self.direction, device)
 
     def refuse_with_cameras(self) -> None:
         """Say that cameras are given and that views are to be placed contradict each other.

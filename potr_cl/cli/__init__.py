@@ -27,7 +27,7 @@ COMMANDS = {
     "fit": "edit",
     "decode": "files",
     "info": "files",
-    "convert": "convert",
+    "convert": "files",
     "render": "pictures",
     "compare": "pictures",
     "view": "view",
@@ -99,7 +99,7 @@ def command_parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:
         "--print-completion",
         action=PrintCompletion,
         choices=SHELLS,
-        help="print a script for completion in this shell (needs the extra completion)",
+        help='print a script for completion in this shell; needs pip install "potr_cl[completion]"',
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     # To decode takes less time than to import what other commands need.

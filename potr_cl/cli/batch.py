@@ -20,6 +20,7 @@ from potr_cl.cli.terminal import duration, megabytes, note, say_done, say_line
 from potr_cl.errors import PotrError, UsageError
 from potr_cl.formats import registry
 from potr_cl.formats.registry import bytes_of_scene
+from potr_cl.host.atomic_write import make_folder
 from potr_cl.plain_text import plain
 
 
@@ -104,7 +105,7 @@ def for_each_scene(works: Sequence[argparse.Namespace], work: Work, tells_json: 
     if not works:
         return
     if works[0].folder is not None:
-        _make_folder(works[0].folder)
+        make_folder(works[0].folder)
     if len(works) == 1:
         work(works[0])
         return
@@ -219,13 +220,6 @@ def _names(sources: Sequence[Path]) -> list[str]:
             # A name that all scenes have says nothing.
             names[k] = "_".join([*tail, *([names[k]] if len(often) > 1 or not tail else [])])
     return names
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"cannot make the folder '{folder}': {error.strerror}") from None
 
 
 def _alone(args: argparse.Namespace, source: Path, target: Path, suffix: str | None) -> argparse.Namespace:

@@ -20,7 +20,7 @@ from potr_cl.api.editing import (
 )
 from potr_cl.cli.batch import add_to_option
 from potr_cl.cli.guard import ReadPhotographs, StandardInput, StandardOutput, read_file
-from potr_cl.cli.options import Commands, add_device_options, add_memory_option
+from potr_cl.cli.options import Commands, add_cameras_options, add_device_options, add_memory_option, given_cameras
 from potr_cl.cli.outputs import WrittenNumbers, scene_output
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
@@ -34,7 +34,6 @@ from potr_cl.cli.scenes import (
 )
 from potr_cl.cli.stage_flags import add_stage_flags, stage_choices
 from potr_cl.cli.terminal import say_done
-from potr_cl.cli.views import add_cameras_options, given_cameras
 from potr_cl.formats.registry import suffixes_read, suffixes_written
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,15 @@ from potr_cl.api.choices import DEFAULT, PRESETS, PURPOSE, encode_options, encod
 from potr_cl.api.encoder import Encoder, ladder_files
 from potr_cl.cli.batch import Row, add_batch_options, for_each_scene, jobs
 from potr_cl.cli.guard import CamerasBeside, StandardInput, StandardOutput, WrittenFolder, check_files, read_file
-from potr_cl.cli.options import SEVERAL, Commands, add_cluster_option, add_device_options, add_memory_option
+from potr_cl.cli.options import (
+    SEVERAL,
+    Commands,
+    add_cameras_options,
+    add_cluster_option,
+    add_device_options,
+    add_memory_option,
+    given_cameras,
+)
 from potr_cl.cli.outputs import WrittenEncoded, WrittenPage, place, writing
 from potr_cl.cli.parser import number_or_auto, whole_number
 from potr_cl.cli.progress import Progress
@@ -25,10 +34,9 @@ from potr_cl.cli.scenes import (
 )
 from potr_cl.cli.stage_flags import add_stage_flags, stage_choices
 from potr_cl.cli.terminal import note, say_document, say_done, say_line
-from potr_cl.cli.views import add_cameras_options, given_cameras
 from potr_cl.errors import UsageError
 from potr_cl.formats.ladder import Ladder, qualities
-from potr_cl.formats.registry import extensions, suffixes_read
+from potr_cl.formats.registry import cameras_beside, extensions, suffixes_read
 from potr_cl.outputs.output import Output
 from potr_cl.outputs.registry import OUTPUTS, encoded_suffix, output_of, output_of_suffix, suffixes_encoded
 from potr_cl.report.summary import decibels
@@ -124,11 +132,18 @@ def _ladder(args: argparse.Namespace) -> None:
     if args.json:
         say_document(ladder.document())
     else:
-        say_done(_table(ladder))
+        say_done(f"{_table(ladder)}\nlook at them: {_view_command(args)}")
+
+
+def _view_command(args: argparse.Namespace) -> str:
+    """What shows a ladder, with the cameras that it was encoded with."""
+    scene = "SCENE" if isinstance(args.scene, StandardInput) else str(args.scene)
+    cameras = cameras_beside(args.scene) if isinstance(args.cameras, CamerasBeside) else args.cameras
+    given = [] if cameras is None else ["--cameras", str(cameras)]
+    return shlex.join(["potr-cl", "view", scene, str(args.output), *given])
 
 
 def _table(ladder: Ladder) -> str:
-    """What a user may choose from."""
     rows = [f"{'q':>8}{'bytes':>14}{'splats':>12}{'PSNR':>12}{'SSIM':>9}"]
     for rung in ladder.rungs:
         judged = rung.ssim is not None
@@ -136,7 +151,7 @@ def _table(ladder: Ladder) -> str:
         rows.append(f"{rung.q:>8g}{rung.bytes:>14,}{rung.splats:>12,}{psnr:>12}{ssim:>9}")
     if ladder.judged_by:
         rows.append(f"judged by {ladder.judged_by}")
-    return "\n".join([*rows, f"look at them: potr-cl view SCENE {ladder.path.parent}"])
+    return "\n".join(rows)
 
 
 def add_encode(commands: Commands) -> None:

@@ -208,7 +208,7 @@ class PrintCompletion(argparse.Action):
             import shtab
         except ImportError as error:
             raise UsageError(f"--print-completion needs the library shtab: {install_command('completion')}") from error
-        from potr_cl.cli.views import cameras_to_read  # on use: every command imports this module
+        from potr_cl.cli.options import cameras_to_read  # on use: every command imports this module
 
         for action in _all_actions(parser):
             if action.type in (ReadPhotographs, WrittenFolder):

@@ -18,13 +18,13 @@ from potr_cl.cli.options import (
     add_cluster_option,
     add_rendering_options,
     add_view_options,
+    read_cameras,
 )
 from potr_cl.cli.outputs import WrittenPicture
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
 from potr_cl.cli.scenes import ANTIALIASED, add_antialiased_option, add_trust_option
 from potr_cl.cli.terminal import note, say, say_document, say_done
-from potr_cl.cli.views import read_cameras
 from potr_cl.formats.registry import suffixes_read
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.camera import Camera
@@ -145,7 +145,9 @@ def add_compare(commands: Commands) -> None:
     p.add_argument(
         "--truth", type=ReadPhotographs, metavar="DIR", help="photographs, named after the views: judge A and B by them"
     )
-    p.add_argument("--lpips", action="store_true", help="also compute LPIPS; needs the extra lpips and its weights")
+    p.add_argument(
+        "--lpips", action="store_true", help='also compute LPIPS; needs pip install "potr_cl[lpips]" and its weights'
+    )
     add_view_options(p, "test views if there are any, else all")
     p.add_argument(
         "-o",

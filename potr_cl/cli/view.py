@@ -38,7 +38,7 @@ def add_view(commands: Commands) -> None:
         "view",
         help="a page in the browser that shows a scene, or two beside each other",
         description="Show a scene in the browser, or two beside each other: divider, difference, heat map, PSNR and "
-        "SSIM of what is seen, the cameras, and the views sorted by loss. Needs the extra view.",
+        'SSIM of what is seen, the cameras, and the views sorted by loss. Needs pip install "potr_cl[view]".',
     )
     p.add_argument(
         "a",

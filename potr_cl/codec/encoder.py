@@ -240,4 +240,4 @@ class _Progress:
 
     def tell(self, part: float) -> None:
         if self._tell is not None:
-            self._tell("write file", part)
+            self._tell("entropy coding", part)

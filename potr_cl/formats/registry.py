@@ -16,7 +16,9 @@ from pathlib import Path
 
 from potr_cl.errors import DataError, PotrError, UsageError
 from potr_cl.formats.cameras import cameras_json, colmap, transforms
+from potr_cl.formats.cameras.view_files import read_json
 from potr_cl.formats.declaration import CameraFormat, SceneFormat
+from potr_cl.formats.ladder import ladder_at
 from potr_cl.formats.scenes import compressed_ply, gltf, ksplat, page, ply, sog, sog_levels, splat, spz
 from potr_cl.formats.scenes.scene_files import without_level
 
@@ -75,28 +77,54 @@ def format_of(path: Path) -> SceneFormat:
     for entry in having_it:
         if entry.recognises is None:
             return entry
+    raise UsageError(_instead_of(path))
+
+
+def _instead_of(path: Path) -> str:
+    """What a path is that is no scene, and what to give instead."""
+    extension = path.suffix.lower()
     if extension in _CHECKPOINTS:
-        raise UsageError(f"'{path}' is a checkpoint of a training, not a scene: {_CHECKPOINTS[extension]}")
+        return f"'{path}' is a checkpoint of a training, not a scene: {_CHECKPOINTS[extension]}"
+    if ladder_at(path) is not None:
+        return (
+            f"'{path}' is a ladder, one scene at several qualities: give one of its files, or see all of them with "
+            f"potr-cl view SCENE '{path}'"
+        )
+    inside = _scenes_in(path) if os.path.isdir(path) else []
+    if inside:
+        last = max(inside, key=_iteration)
+        beside = [each for each in inside if each.parent == last.parent]
+        if len(beside) == 1:
+            return f"'{path}' is a folder: give the scene in it, '{last}'"
+        return f"'{last.parent}' holds {len(beside)} scenes: give one of them, such as '{last}', or all, *.ply"
+    if _holds_cameras(path):
+        return (
+            f"'{path}' holds cameras, not a scene: give the scene's file, and these as --cameras to encode, render, "
+            "compare or view"
+        )
     names = listed([name for entry in SCENE_FORMATS for name in entry.names])
     if os.path.isdir(path):
-        inside = _scene_in(path)
-        found = f"; give the file in it: '{inside}'" if inside is not None else ""
-        raise UsageError(f"the folder '{path}' has no scene that can be read as a folder: it has no {names}{found}")
-    raise UsageError(f"'{path}': unknown kind of scene, expected a {suffixes_read()} file, or a folder with {names}")
+        return f"the folder '{path}' has no scene: there is no .ply in it, and no {names}"
+    return f"'{path}': unknown kind of scene, expected a {suffixes_read()} file, or a folder with {names}"
 
 
-def is_checkpoint(path: Path) -> bool:
-    """Whether a file's name is that of a training's checkpoint, which only the program that trained can read."""
-    return path.suffix.lower() in _CHECKPOINTS
+def _holds_cameras(path: Path) -> bool:
+    if os.path.isdir(path):
+        return any(entry.is_in(path / sub) for entry in CAMERA_FORMATS for sub in ("", *entry.subfolders))
+    suffix = path.suffix.lower()
+    with suppress(PotrError, OSError):
+        content = read_json(path) if suffix == ".json" else None
+        return any(suffix in entry.suffixes and entry.recognises(path, content) for entry in CAMERA_FORMATS)
+    return False
 
 
-def _scene_in(folder: Path) -> Path | None:
-    """The scene that a program which trains has left in its folder: of the last iteration, where there are several."""
+def _scenes_in(folder: Path) -> list[Path]:
+    """The scenes in a folder, also where programs that train leave them."""
     found: list[Path] = []
     for place in _PLACES_OF_TRAININGS:
         with suppress(OSError):
             found += itertools.islice(folder.glob(f"{place}.ply"), _MOST_FILES)
-    return max(found, key=_iteration, default=None)
+    return found
 
 
 def _iteration(file: Path) -> tuple[int, str]:
@@ -196,13 +224,18 @@ def written_format(path: Path) -> SceneFormat:
         (len(suffix), entry) for entry in SCENE_FORMATS for suffix in entry.suffixes if suffixes.endswith(suffix)
     ]
     fitting += [(len(path.name), entry) for entry in SCENE_FORMATS if path.name.lower() in entry.names]
-    expected = f"scenes are written as {suffixes_written()}"
+    expected = f"give it one of {suffixes_written()}"
     if not fitting:
-        raise UsageError(f"'{path}': {expected}")
+        raise UsageError(f"'{path}' {unwritten(path)}: {expected}")
     _, entry = max(fitting, key=lambda found: found[0])
     if entry.save is None:
         raise UsageError(f"'{path}': {entry.not_written}; {expected}")
     return entry
+
+
+def unwritten(path: Path) -> str:
+    """For messages: what is wrong with the name of a file to be written, whose format is unknown."""
+    return f"ends in '{path.suffix}', which cannot be written" if path.suffix else "has no suffix to tell the format"
 
 
 def suffixes_read() -> str:

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from potr_cl.errors import UnwritableError, WriteError
+from potr_cl.errors import UnwritableError, UsageError, WriteError
 from potr_cl.host.leftovers import removed_at_end
 
 #: Seconds to wait before a renaming is tried again: on Windows nobody renames a file that another program has open, as
@@ -119,3 +119,15 @@ def _mode_of_existing(target: Path, path: str | os.PathLike[str]) -> int | None:
     if not stat.S_ISREG(mode):
         raise UnwritableError(f"cannot write '{path}': it is not a regular file", os.fspath(path))
     return stat.S_IMODE(mode)
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder unless it is there.
+
+    Raises:
+        UsageError: it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"cannot make the folder '{folder}': {error.strerror}") from None

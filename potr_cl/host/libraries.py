@@ -8,7 +8,6 @@ one leaves its own filters behind for good. So all of this package use one block
 
 from __future__ import annotations
 
-import re
 import threading
 import warnings
 from collections.abc import Callable, Iterator
@@ -68,28 +67,19 @@ def whatever_warns(work: Callable[[], T]) -> T:
         return work()
 
 
-#: The package, as pip knows it.
-_PACKAGE = "potr-cl"
-
-
 def install_command(extra: str) -> str:
     """What a user types to get what an extra of this package brings.
 
-    The package may have been installed from a clone, from a wheel or from an index, and only an index would know
-    "potr-cl[view]" by that name. So the command names the libraries themselves, as the package's metadata has them.
+    Where the package is installed, pip takes the extra's libraries from its metadata: no index need know the package.
 
     Args:
         extra: its name in pyproject.toml.
     """
     # Imported where something is missing: it takes longer than most of this package's own modules.
-    from importlib.metadata import PackageNotFoundError, requires
+    from importlib.metadata import PackageNotFoundError, version
 
     try:
-        needed = requires(_PACKAGE) or []
+        version("potr-cl")
     except PackageNotFoundError:  # a clone that is run without being installed
-        needed = []
-    of_extra = re.compile(rf"""\bextra\s*==\s*["']{re.escape(extra)}["']""")
-    names = [name.strip() for name, _, marker in (each.partition(";") for each in needed) if of_extra.search(marker)]
-    if not names:
         return f'pip install ".[{extra}]" in a clone of the repository'
-    return "pip install " + " ".join(f'"{name}"' for name in names)
+    return f'pip install "potr_cl[{extra}]"'

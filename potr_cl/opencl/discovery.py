@@ -15,6 +15,7 @@ from typing import Literal
 import pyopencl as cl
 
 from potr_cl.errors import DeviceError
+from potr_cl.host.libraries import install_command
 from potr_cl.opencl import compiler, limits, loader, quirks, verdict
 
 Family = Literal["cpu", "gpu"]
@@ -175,7 +176,7 @@ def _cpu_runtime_advice() -> str:
     """How to get a CPU runtime that works on this machine."""
     pocl = "a newer PoCL from your system's packages (Debian, Ubuntu: pocl-opencl-icd)"
     if sys.platform in ("linux", "win32") and machine().lower() in ("x86_64", "amd64"):
-        return f"`pip install intel-opencl-rt intel-cmplr-lib-rt` (for AMD's CPUs too) or {pocl}"
+        return f"{install_command('intel-cpu')} (for AMD's CPUs too), or {pocl}"
     return pocl
 
 

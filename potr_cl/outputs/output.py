@@ -12,7 +12,7 @@ import os
 import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO, ClassVar, Protocol
@@ -20,16 +20,18 @@ from typing import Any, BinaryIO, ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.codec.blocks import AnyGeometry
 from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.encoder import Coded
 from potr_cl.codec.quantize import HyperParameters
+from potr_cl.codec.steps.rule import factors
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.host.mapped import bounded
 from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
-from potr_cl.outputs.colour_grid import ColourGrid
+from potr_cl.raster.resident import SceneHandle
 from potr_cl.raster.scene_buffers import Drawable
 
 
@@ -313,3 +315,54 @@ class Output(ABC):
 
     def __str__(self) -> str:
         return self.suffix
+
+
+@dataclass(frozen=True)
+class ColourGrid:
+    """Coefficients of Y, Co and Cg that are whole multiples of the splats' steps.
+
+    Attributes:
+        constant: (N,) float32, steps of the constant coefficients, in the order of the scene.
+        others: (N,) float32, of all other coefficients.
+        order: (N,) int64, the number in the scene of each splat of the file, in which neighbours follow each other.
+    """
+
+    constant: NDArray[np.float32]
+    others: NDArray[np.float32]
+    order: NDArray[np.int64]
+
+    @staticmethod
+    def of(geometry: AnyGeometry) -> ColourGrid:
+        """That of a .potr file."""
+        dc, ac = geometry.colour_classes()
+        steps = np.empty((2, len(geometry.order)), np.float32)
+        steps[0, geometry.order] = 1 / factors(geometry.parameters.sf_dc, dc)
+        steps[1, geometry.order] = 1 / factors(geometry.parameters.sf_sh, ac)
+        return ColourGrid(steps[0], steps[1], geometry.order)
+
+
+@dataclass(frozen=True)
+class CodedScene(SceneHandle):
+    """Each device decodes it for itself, to the same bits: a file is many times smaller than what it decodes to.
+
+    Attributes:
+        output: the kind of file.
+        data: its bytes.
+        trust: as of :meth:`potr_cl.outputs.output.Output.read`.
+    """
+
+    output: Output
+    data: bytes
+    trust: bool = False
+
+    @property
+    def nbytes(self) -> int:
+        return len(self.data)
+
+    def on(self, device: Device) -> AbstractContextManager[Drawable]:
+        """See :meth:`potr_cl.raster.resident.SceneHandle.on`.
+
+        Raises:
+            DataError: nobody can read it.
+        """
+        return self.output.seen(self.data, device, self.trust)

@@ -1,11 +1,15 @@
-"""The package's own files as an output: the usual one, with steps that q sets, and entropy coders."""
+"""The package's own files as an output, with steps that q sets, and entropy coders; alone, and in a web page."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, fields
-from typing import ClassVar
+from dataclasses import dataclass, fields, replace
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from potr_cl.codec.blocks import AnyGeometry, GeometryOfBlocks, quantise
 from potr_cl.codec.decoder import PotrFile, decode, open_file
@@ -17,14 +21,14 @@ from potr_cl.codec.quantize import HyperParameters
 from potr_cl.codec.sections import ORDER, SH, Property
 from potr_cl.errors import DeviceError
 from potr_cl.formats.declaration import SceneFormat
+from potr_cl.formats.scenes import page
 from potr_cl.formats.scenes.page import POTR
 from potr_cl.host.mapped import bounded
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
 from potr_cl.ondevice.decode import decode_to_device
 from potr_cl.opencl.device import Device
-from potr_cl.outputs.colour_grid import ColourGrid
-from potr_cl.outputs.output import LevelErrors, Output, Request, Rounded
+from potr_cl.outputs.output import ColourGrid, LevelErrors, Output, Request, Rounded
 from potr_cl.raster.resident import large_for
 from potr_cl.raster.scene_buffers import Drawable
 
@@ -121,3 +125,70 @@ class Potr(Output):
 def _decoded_bytes(file: PotrFile) -> int:
     """Of the scene that a file holds."""
     return 4 * file.header.splats * (11 + 3 * SH_COEFFICIENTS[file.header.sh_degree])
+
+
+@dataclass(frozen=True)
+class Page(Potr):
+    """A page (.html).
+
+    Attributes:
+        title, author: shown on it.
+
+    Raises:
+        UsageError: this installation has no viewer to put into it.
+    """
+
+    title: str | None = None
+    author: str | None = None
+    format: ClassVar[SceneFormat] = page.FORMAT
+    bytes_a_splat: ClassVar[float] = 4 / 3
+    levels: ClassVar[int | str | None] = None
+
+    def __post_init__(self) -> None:
+        page.check_viewer()
+
+    def losses(self, scene: Scene) -> list[str]:
+        """What three.js does not do."""
+        return ["how antialiased scenes are to be drawn: its viewer draws them as classic ones"] * scene.antialiased
+
+    def file(self, scene: Scene, rounded: Rounded | None, request: Request) -> Coded:
+        """The .potr file, within the page."""
+        coded = super().file(scene, rounded, request)
+        view = _view(scene.means, request)
+        return replace(
+            coded, pieces=page.page_around(b"".join(coded.pieces), len(coded.order), self.title, self.author, view)
+        )
+
+    def read(self, data: bytes, trust: bool = False) -> Scene:
+        """The scene in a page. Raises DataError if there is none, or it is damaged."""
+        return super().read(page.scene_in(data), trust)
+
+    @contextmanager
+    def seen(self, data: bytes, device: Device, trust: bool = False, memory: int | None = None) -> Iterator[Drawable]:
+        """See :meth:`potr_cl.outputs.potr.Potr.seen`."""
+        with super().seen(page.scene_in(data), device, trust, memory) as scene:
+            yield scene
+
+    def properties(self, data: bytes) -> dict[str, int]:
+        """Bytes by attribute; those of the viewer, and what the scene takes more because a page is text."""
+        return {**super().properties(page.scene_in(data)), **page.sizes(data)}
+
+
+def _view(means: NDArray[np.float32], request: Request) -> dict[str, Any] | None:
+    """Where the page's visitor begins: at the first view, upright as views are on average."""
+    if not request.views:
+        return None
+    camera = request.views[0]
+    rotations = np.array([view.rotation for view in request.views])
+    position, forward = -camera.rotation.T @ camera.translation, camera.rotation[2]
+    up = -rotations[:, 1].mean(axis=0)
+    if np.linalg.norm(up) < 0.1:
+        up = -camera.rotation[1]
+    away = float(np.median(means.astype(np.float64), axis=0) @ forward - position @ forward)
+    target = position + forward * (away if away > 0 else 1.0)
+    return {
+        "position": position.tolist(),
+        "target": target.tolist(),
+        "up": (up / np.linalg.norm(up)).tolist(),
+        "fov": math.degrees(2 * math.atan(camera.height / (2 * camera.fy))),
+    }

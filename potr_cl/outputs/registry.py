@@ -7,15 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from potr_cl.errors import UsageError
-from potr_cl.formats.registry import listed, stem_of_scene, suffix_of_name, written_format
-from potr_cl.outputs.compressed_ply import CompressedPly
-from potr_cl.outputs.gltf import Gltf
+from potr_cl.formats.registry import listed, stem_of_scene, suffix_of_name, unwritten, written_format
 from potr_cl.outputs.output import Output
-from potr_cl.outputs.page import Page
-from potr_cl.outputs.ply import Ply
-from potr_cl.outputs.potr import Potr
+from potr_cl.outputs.ply import CompressedPly, Ply
+from potr_cl.outputs.potr import Page, Potr
 from potr_cl.outputs.sog import Sog
-from potr_cl.outputs.spz import Spz
+from potr_cl.outputs.spz import Gltf, Spz
 from potr_cl.outputs.streamed_sog import StreamedSog
 
 #: In the order in which people are told of them; the first is the usual one.
@@ -48,7 +45,7 @@ def output_of(path: Path, **choices: Any) -> Output:
     kind = next((kind for kind in OUTPUTS if suffix in kind.suffixes()), None)
     kind = next((folder for folder in FOLDERS if path.name in folder.suffixes()), kind)
     if kind is None:
-        raise UsageError(f"'{path}': encode writes {suffixes_encoded()} files{_instead(path)}")
+        raise UsageError(_instead(path))
     given = {name: value for name, value in choices.items() if value is not None}
     for name in given:
         if name not in kind.__dataclass_fields__:
@@ -83,13 +80,9 @@ def suffixes_encoded() -> str:
 
 
 def _instead(path: Path) -> str:
-    """What to do where a format is written, but not by encode, or not under this name."""
-    suffix = suffix_of_name(path)
-    for kind in OUTPUTS:
-        if suffix in kind.format.suffixes:
-            return f": give it a name that ends in {kind.suffixes()[0]}"
+    """What to do where encode does not write files of a name."""
     with contextlib.suppress(UsageError):
         written_format(path)
         name = path.with_name(f"{stem_of_scene(path)}.potr")
-        return f": encode to '{name}', then 'potr-cl decode {name} -o {path}'"
-    return f": give it a name that ends in {OUTPUTS[0].suffixes()[0]}"
+        return f"encode does not write '{path}': encode to '{name}', then 'potr-cl decode {name} -o {path}'"
+    return f"'{path}' {unwritten(path)}: give it one of {suffixes_encoded()}"

@@ -14,7 +14,7 @@ from potr_cl.codec.quantisers import QUANTISERS, Balanced, Paper
 from potr_cl.codec.quantize import ZERO_SCALE, HyperParameters, canonical_rotations
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes import spz, spz_values
+from potr_cl.formats.scenes import gltf, gltf_file, spz, spz_values
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.outputs.feedback import rounded_in_turn
@@ -267,3 +267,30 @@ def _merged(values: NDArray[Any], groups: NDArray[Any], centres: NDArray[Any]) -
         members = np.flatnonzero(groups == group)
         table[members] = members[np.abs(values[members] - centres[members]).argmin()]
     return table
+
+
+@dataclass(frozen=True)
+class Gltf(Spz):
+    """A .glb file.
+
+    Attributes:
+        version: 2 or 3 of SPZ; CesiumJS does not read 4.
+    """
+
+    format: ClassVar[SceneFormat] = gltf.FORMAT
+
+    def __post_init__(self) -> None:
+        if self.version not in (2, 3):
+            raise UsageError(f".glb files hold SPZ of version 2 or 3, not {self.version}")
+
+    @classmethod
+    def suffixes(cls) -> tuple[str, ...]:
+        """One file only."""
+        return (".glb",)
+
+    def file(self, scene: Scene, rounded: Rounded | None, request: Request) -> Coded:
+        """The SPZ, within glTF."""
+        rounded, sh = self.prepared(scene, rounded, request)
+        assert isinstance(rounded, RoundedScene)
+        coded = super().file(replace(scene, sh=sh), rounded, request)
+        return replace(coded, pieces=gltf_file.binary(replace(scene, means=rounded.scene.means), coded.pieces))

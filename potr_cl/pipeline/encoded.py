@@ -17,7 +17,7 @@ from potr_cl.errors import DataError, PotrError, UsageError
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.outputs.coded_scene import CodedScene
+from potr_cl.outputs.output import CodedScene
 from potr_cl.outputs.registry import OUTPUTS
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.scene_buffers import Drawable

@@ -31,7 +31,7 @@ from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
-from potr_cl.outputs.coded_scene import CodedScene
+from potr_cl.outputs.output import CodedScene
 from potr_cl.pipeline.encode import cameras_or_virtual, tell_left_out, tell_losses
 from potr_cl.pipeline.encoded import Encoded
 from potr_cl.pipeline.fallback import with_fallback
@@ -85,16 +85,16 @@ def encode_to_target(
     device: Device | None = None,
     tell: Callable[[str], None] | None = None,
     antialiased: bool | None = None,
+    in_frame: bool = False,
     pool: Pool | None = None,
 ) -> Found:
     """Encode a scene so that it meets a target, as well (or as small) as that allows.
 
     Args:
-        scene, cameras, progress, device, antialiased: as :func:`potr_cl.pipeline.encode.encode` takes them.
+        scene, cameras, progress, device, antialiased, in_frame, pool: as of :func:`potr_cl.pipeline.encode.encode`.
         target: what to reach.
         options: its q is not looked at; single parameters that are given stay as they are.
         tell: told a line for every step, and for every round of a fit.
-        pool: as :func:`potr_cl.pipeline.encode.encode` takes it.
 
     Raises:
         UnreachableError: no q meets the target.
@@ -107,7 +107,7 @@ def encode_to_target(
     scene = scene.rendered(antialiased)
     tell_losses(scene, options)
     watch = Stopwatch(progress, tell)
-    cameras = cameras_or_virtual(scene, cameras, options, watch, device=device)
+    cameras = cameras_or_virtual(scene, cameras, options, watch, in_frame, device)
     if target.min_psnr is not None and not cameras:
         raise UsageError("a PSNR can be reached with cameras only: without them there is no view to judge by")
 

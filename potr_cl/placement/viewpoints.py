@@ -1,13 +1,10 @@
 """Views for people to look at a scene from, where no cameras are given: :func:`look_around` and :func:`turntable`.
 
-Both stand where :mod:`potr_cl.placement.virtual` finds that somebody could stand; here a few of such views are held
-level, or replaced by a circle around what they look at. Which way is up no scene file says:
-:func:`guess_up`.
+Both stand where :mod:`potr_cl.placement.virtual` finds that somebody could stand.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -18,7 +15,8 @@ from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera, camera_centres, focus
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.placement.virtual import judging_views, place_cameras
+from potr_cl.placement.upright import level_rotation
+from potr_cl.placement.virtual import Ground, judging_views
 
 F64 = NDArray[np.float64]
 
@@ -26,25 +24,8 @@ F64 = NDArray[np.float64]
 VIEWS, SIZE = 8, 800
 #: The most that may be asked for.
 MOST_VIEWS, LARGEST = 4000, 16384
-#: The directions that may be called up, by the names that people type.
-AXES: dict[str, tuple[float, float, float]] = {
-    "x": (1.0, 0.0, 0.0),
-    "y": (0.0, 1.0, 0.0),
-    "z": (0.0, 0.0, 1.0),
-    "-x": (-1.0, 0.0, 0.0),
-    "-y": (0.0, -1.0, 0.0),
-    "-z": (0.0, 0.0, -1.0),
-}
-#: How often each is up in the files of the usual tools: COLMAP's cameras have y downwards, Blender and nerfstudio z
-#: upwards, glTF and game engines y upwards.
-_HABIT = {"-y": 0.3, "z": 0.3, "y": 0.1}
-#: What flat ground counts against where the views are, and when its own direction is taken instead of an axis: by how
-#: much more of all surface must face it than any direction across it, and the cosines of 10 and 35 degrees to the axis.
-_GROUND, _PLAIN, _ALIGNED, _TILTED = 1.5, 0.05, 0.985, 0.82
-#: Views that tell where a scene was looked at from.
-_STANDPOINTS = 32
-#: Splats that are looked at to find surfaces, and the opacity from which they count.
-_SAMPLE, _OPAQUE = 20000, 0.1
+#: Views that tell where the turntable may run, and the opacity from which a splat should be in its pictures.
+_STANDPOINTS, _OPAQUE = 32, 0.1
 #: Half the field of view of the turntable's pictures; how high it runs above what it turns around; the part of the
 #: opaque splats that its pictures should hold; how much farther away it may stand for that.
 _HALF_VIEW, _LOWEST, _HIGHEST = math.radians(25), math.radians(10), math.radians(35)
@@ -52,28 +33,29 @@ _HELD, _FARTHER, _WIDEST = 0.9, 1.3, 0.9
 
 
 def look_around(
-    scene: Scene, count: int = VIEWS, size: int = SIZE, up: Sequence[float] | None = None, device: Device | None = None
+    scene: Scene,
+    count: int | None = VIEWS,
+    size: int | None = SIZE,
+    up: Sequence[float] | None = None,
+    device: Device | None = None,
 ) -> list[Camera]:
-    """Virtual views from wherever somebody could stand, held level: those by which encodes without cameras are judged.
+    """Virtual views from wherever somebody could stand: those by which encodes without cameras are judged.
 
     Args:
         scene: clean, at least one splat.
-        count: of the views.
-        size: of their square images, in pixels.
-        up: (3,) the direction in the scene that is up in the pictures; None: :func:`guess_up`.
+        count: of the views; None: as many as such encodes are judged by.
+        size: of their square images, in pixels; None: as such encodes have them.
+        up: (3,) the direction in the scene that is up in the pictures; None: a guess.
         device: finds what is seen from where; by default the one that should be fastest.
 
     Returns:
-        Cameras "virtual_000" and so on, all of them test views: nothing is trained with them.
+        Cameras "virtual_test_000" and so on, all of them test views: nothing is trained with them.
 
     Raises:
         UsageError: ``count``, ``size`` or ``up`` is out of range.
     """
-    _check(count, size)
-    wanted = None if up is None else _direction(up)
-    standpoints = judging_views(scene, max(count, _STANDPOINTS), size, device)
-    top = guess_up(scene, standpoints) if wanted is None else wanted
-    return [dataclasses.replace(levelled(camera, top), split="test") for camera in standpoints[:count]]
+    _check(VIEWS if count is None else count, SIZE if size is None else size)
+    return judging_views(scene, count, size, device, None if up is None else _direction(up))
 
 
 def turntable(
@@ -87,7 +69,7 @@ def turntable(
         scene: clean, at least one splat.
         count: of the views.
         size: of their square images, in pixels.
-        up: (3,) the axis of the circle; None: :func:`guess_up`.
+        up: (3,) the axis of the circle; None: a guess.
         device: as of :func:`look_around`.
 
     Returns:
@@ -98,8 +80,8 @@ def turntable(
     """
     _check(count, size)
     wanted = None if up is None else _direction(up)
-    standpoints = place_cameras(scene, _STANDPOINTS, size, device=device)
-    top = guess_up(scene, standpoints) if wanted is None else wanted
+    ground = Ground.of(scene, _STANDPOINTS, device=device)
+    standpoints, top = ground.training(), ground.up if wanted is None else wanted
     middle = focus(standpoints)
     away = camera_centres(standpoints) - middle
     distance = np.linalg.norm(away, axis=1)
@@ -121,7 +103,7 @@ def turntable(
     for number in range(count):
         turn = 2 * math.pi * number / count
         outward = math.cos(elevation) * (math.cos(turn) * first + math.sin(turn) * second) + math.sin(elevation) * top
-        rotation = _level_rotation(-outward, top)
+        rotation = level_rotation(-outward, top)
         focal = size / 2 / half
         camera = Camera(
             f"turntable_{number:03d}", size, size, focal, focal, size / 2, size / 2,
@@ -129,75 +111,6 @@ def turntable(
         )  # fmt: skip
         cameras.append(camera)
     return cameras
-
-
-def guess_up(scene: Scene, standpoints: Sequence[Camera]) -> F64:
-    """Which direction of a scene is most likely up: (3,) of length 1.
-
-    Three things speak for a direction: that the scene was looked at from there rather than from below, that much of its
-    surface faces it (ground, tables, roofs), and that the usual tools call it up. It is one of the six axes, unless a
-    large plane shows that the scene stands askew.
-
-    Args:
-        scene: clean, at least one splat.
-        standpoints: cameras that stand where the scene was looked at from.
-    """
-    away = camera_centres(standpoints) - focus(standpoints)
-    above = (away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-300)).mean(axis=0)
-    surface = _surface_directions(scene)
-
-    def score(name: str) -> float:
-        axis = np.array(AXES[name])
-        return float(above @ axis + _GROUND * (axis @ surface @ axis - 1 / 3)) + _HABIT.get(name, 0.0)
-
-    best = np.array(AXES[max(AXES, key=score)])
-    parts, directions = np.linalg.eigh(surface)
-    ground: F64 = directions[:, 2] * (1 if directions[:, 2] @ best >= 0 else -1)
-    askew = parts[2] - parts[1] >= _PLAIN and _TILTED <= float(ground @ best) < _ALIGNED
-    return ground if askew else best
-
-
-def levelled(camera: Camera, up: F64) -> Camera:
-    """The same view turned around its line of sight, so that ``up``, (3,), is up in its picture."""
-    rotation = _level_rotation(camera.rotation[2], up)
-    return dataclasses.replace(camera, rotation=rotation, translation=-rotation @ camera.centre)
-
-
-def _level_rotation(forward: F64, up: F64) -> F64:
-    right = np.cross(forward, up)
-    if np.linalg.norm(right) < 1e-3:  # looks straight up or down: any roll will do
-        right = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
-    right = right / np.linalg.norm(right)
-    rotation: F64 = np.stack([right, np.cross(forward, right), forward])
-    return rotation
-
-
-def _surface_directions(scene: Scene) -> F64:
-    """(3, 3) of trace 1: how much of the surface near the middle faces each direction, either way round."""
-    solid = np.flatnonzero(scene.opacities > _OPAQUE)
-    if len(solid) == 0:
-        return np.eye(3) / 3
-    rows = solid[np.unique(np.linspace(0, len(solid) - 1, _SAMPLE).astype(np.int64))]
-    means = scene.means[rows].astype(np.float64)
-    distance = np.linalg.norm(means - np.median(means, axis=0), axis=1)
-    scales = np.exp(np.clip(scene.log_scales[rows].astype(np.float64), -60, 60))
-    order = np.argsort(scales, axis=1)
-    q = scene.quaternions[rows].astype(np.float64)
-    q /= np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-30)
-    thin = np.eye(3)[order[:, 0]]
-    across = 2 * np.cross(q[:, 1:], thin)
-    normals = thin + q[:, :1] * across + np.cross(q[:, 1:], across)
-    smallest, middle, largest = np.take_along_axis(scales, order, axis=1).T
-    area = middle * largest * scene.opacities[rows]
-    # A backdrop is one splat's doing, and a ball faces nowhere.
-    weight = np.minimum(area, np.quantile(area, 0.99)) * (1 - smallest / middle)
-    weight = np.where(distance <= 3 * np.median(distance), weight, 0.0)
-    if not weight.sum() > 0:
-        return np.eye(3) / 3
-    weight /= weight.max()
-    together = (normals * weight[:, None]).T @ normals
-    directions: F64 = together / np.trace(together)
-    return directions
 
 
 def _direction(up: Sequence[float]) -> F64:

@@ -6,17 +6,18 @@ import heapq
 import math
 from collections import deque
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from potr_cl.model.camera import Camera, resized
-from potr_cl.model.matter import frame_of
 from potr_cl.model.sampling import F64
 from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import FIELD, PREFIX, Plan, plan
 from potr_cl.opencl.device import Device
 from potr_cl.placement.candidates import AIMS, BINS, Candidates, SurfacePoints, ViewMemory, candidates_of, resolution
 from potr_cl.placement.space import Space
+from potr_cl.placement.upright import guess_up, level_rotation, levelled
 
 #: A target that so many views show well is worth half of what it is at first.
 _ENOUGH = 4.0
@@ -80,11 +81,12 @@ def drawn(candidates: Candidates, count: int) -> list[int]:
     return found
 
 
-#: Targets for each view that is placed, and at least; places to stand for each view, and for each that judges; splats
-#: that say which way the scene lies.
-_TARGETS, _LEAST_TARGETS, _PLACES, _JUDGED, _FRAME = 32, 2000, 6, 16, 100_000
+#: Targets for each view that is placed, and at least; places to stand for each view, and for each that judges.
+_TARGETS, _LEAST_TARGETS, _PLACES, _JUDGED = 32, 2000, 6, 16
 #: So many at most, for the memory that all pairs of them take.
 _MOST_TARGETS, _MOST_PLACES, _MOST_JUDGED = 20_000, 6000, 1024
+#: Views that tell where a scene was looked at from, and so which way is up in it.
+_STANDPOINTS = 32
 #: Where in the sequence of places those begin that judge: far behind those that are tried to place views.
 _OTHERS = 1 << 16
 
@@ -103,22 +105,23 @@ def place_cameras(
         device: finds what is seen from where; by default the one that should be fastest.
 
     Returns:
-        Cameras "virtual_000" and so on: the training views in the order in which they were picked, then the test views.
+        Cameras: the training views "virtual_000" and so on in the order in which they were picked, then the test views
+        "virtual_test_000" and so on, which are called so wherever they are looked from. All are level.
 
     Raises:
         UsageError: ``count`` or ``size`` below 1, or above what can be placed and rendered.
         DeviceError: the device has no room, or failed.
     """
-    ground = _Ground.of(scene, count, size, field, device)
-    planned = ground.planned
-    tried = max(min(_PLACES * planned.training, _MOST_PLACES), 2 * planned.training)
-    candidates = ground.candidates(tried, 0)
-    picked = [ground.camera(candidates, view, "train") for view in pick(candidates, planned.training)]
-    return _named([*picked, *ground.judges(planned.test)])
+    ground = Ground.of(scene, count, size, field, device)
+    return [*ground.training(), *ground.judges(ground.planned.test)]
 
 
 def judging_views(
-    scene: Scene, count: int | None = None, size: int | None = None, device: Device | None = None
+    scene: Scene,
+    count: int | None = None,
+    size: int | None = None,
+    device: Device | None = None,
+    up: F64 | None = None,
 ) -> list[Camera]:
     """The test views that :func:`place_cameras` places, or another number of them: near and far, wherever somebody
     could stand, drawn without regard to what the training views show. Fewer are the first of more.
@@ -127,16 +130,22 @@ def judging_views(
         scene, device: as :func:`place_cameras` takes them.
         count: of the views; None: as many as :func:`place_cameras` places.
         size: of their square images, in pixels; where they stand does not depend on it. None: the usual one.
+        up: (3,) of length 1, what is up in their pictures; None: :func:`potr_cl.placement.upright.guess_up`.
     """
-    ground = _Ground.of(scene, None, None, FIELD, device)
-    judges = _named(ground.judges(ground.planned.test if count is None else count))
+    ground = Ground.of(scene, None, None, FIELD, device)
+    judges = ground.judges(ground.planned.test if count is None else count, up)
     return judges if size is None else [resized(camera, size, size) for camera in judges]
 
 
 @dataclass(frozen=True)
-class _Ground:
-    """What is known of a scene before views are placed in it."""
+class Ground:
+    """What is known of a scene before views are placed in it.
 
+    Attributes:
+        planned: how many views, and how large.
+    """
+
+    scene: Scene
     device: Device
     planned: Plan
     space: Space
@@ -144,10 +153,13 @@ class _Ground:
     half_view: float
     pixels: float
     memory: ViewMemory | None
-    up: F64
 
     @staticmethod
-    def of(scene: Scene, count: int | None, size: int | None, field: float, device: Device | None) -> _Ground:
+    def of(
+        scene: Scene, count: int | None = None, size: int | None = None, field: float = FIELD,
+        device: Device | None = None,
+    ) -> Ground:  # fmt: skip
+        """Arguments as of :func:`place_cameras`."""
         opened = device or Device()
         planned = plan(len(scene), count, size, opened.info.kind == "cpu")
         half_view = math.tan(math.radians(field / 2))
@@ -155,33 +167,51 @@ class _Ground:
         wanted = min(_TARGETS * plan(len(scene)).training, max(len(scene) // 10, _LEAST_TARGETS), _MOST_TARGETS)
         targets = SurfacePoints.of(scene, space, wanted)
         pixels, memory = resolution(opened, scene, space, targets, planned.size / 2 / half_view)
-        frame = frame_of(scene.subset(np.arange(0, len(scene), max(len(scene) // _FRAME, 1))))
-        return _Ground(opened, planned, space, targets, half_view, pixels, memory, frame.up)
+        return Ground(scene, opened, planned, space, targets, half_view, pixels, memory)
 
-    def candidates(self, places: int, first: int) -> Candidates:
+    @cached_property
+    def up(self) -> F64:
+        """(3,) what is probably up."""
+        return guess_up(self.scene, self._usual)
+
+    def training(self) -> list[Camera]:
+        """The training views that are planned."""
+        count = self.planned.training
+        candidates = self._candidates(max(min(_PLACES * count, _MOST_PLACES), 2 * count), 0)
+        views = [self._camera(candidates, view, "train") for view in pick(candidates, count)]
+        return [replace(levelled(view, self.up), name=f"{PREFIX}{number:03d}") for number, view in enumerate(views)]
+
+    def judges(self, count: int, up: F64 | None = None) -> list[Camera]:
+        """So many test views; see :func:`judging_views`."""
+        if not count:
+            return []
+        up = self.up if up is None else up
+        return [
+            replace(levelled(view, up), name=f"{PREFIX}test_{number:03d}")
+            for number, view in enumerate(self._standpoints(count))
+        ]
+
+    def _candidates(self, places: int, first: int) -> Candidates:
         focal = self.planned.size / 2 / self.half_view
         return candidates_of(
             self.device, self.space, self.targets, places, focal, self.half_view, self.pixels, self.memory, first
         )
 
-    def judges(self, count: int) -> list[Camera]:
-        if not count:
-            return []
-        tried = max(min(_JUDGED * max(count, 8), _MOST_JUDGED), 3 * count)
-        judges = self.candidates(tried, _OTHERS)
-        return [self.camera(judges, view, "test") for view in drawn(judges, count)]
+    @cached_property
+    def _usual(self) -> list[Camera]:
+        return self._judging(_STANDPOINTS)
 
-    def camera(self, candidates: Candidates, view: int, split: str) -> Camera:
+    def _standpoints(self, count: int) -> list[Camera]:
+        return self._usual[:count] if count <= _STANDPOINTS else self._judging(count)
+
+    def _judging(self, count: int) -> list[Camera]:
+        judges = self._candidates(max(min(_JUDGED * count, _MOST_JUDGED), 3 * count), _OTHERS)
+        return [self._camera(judges, view, "test") for view in drawn(judges, count)]
+
+    def _camera(self, candidates: Candidates, view: int, split: str) -> Camera:
+        """One that is not held level yet."""
         forward, size = candidates.forward[view], self.planned.size
-        right = np.cross(forward, self.up)
-        if np.linalg.norm(right) < 1e-3:  # looks straight up or down: any roll will do
-            right = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
-        right /= np.linalg.norm(right)
-        rotation = np.stack([right, np.cross(forward, right), forward])
+        rotation = level_rotation(forward, np.eye(3)[2])
         focal = size / 2 / candidates.tangent[view]
         translation = -rotation @ candidates.centres[view]
         return Camera(PREFIX, size, size, focal, focal, size / 2, size / 2, rotation, translation, split)
-
-
-def _named(cameras: list[Camera]) -> list[Camera]:
-    return [replace(camera, name=f"{PREFIX}{number:03d}") for number, camera in enumerate(cameras)]

@@ -1,4 +1,4 @@
-"""What is told of a comparison of two scenes (:class:`Comparison`), for programs and for people; and its photographs.
+"""What is told of a comparison of two scenes (:class:`Comparison`), for programs and for people.
 
 A is the reference scene (uncompressed), B the candidate. With photographs, both are also judged against those.
 :mod:`potr_cl.quality.judging` finds the figures.
@@ -7,7 +7,7 @@ A is the reference scene (uncompressed), B the candidate. With photographs, both
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,9 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
-from potr_cl.formats.cameras.view_files import IMAGE_SUFFIXES, stem
-from potr_cl.formats.images import image_size, to_8_bits
-from potr_cl.model.camera import Camera
+from potr_cl.formats.images import to_8_bits
 from potr_cl.model.scene import FloatArray
 from potr_cl.quality.figures import Figures, ViewFigures
 
@@ -63,67 +61,6 @@ class Comparison:
             f"Comparison({views}, PSNR {mean.psnr:.2f} dB, SSIM {mean.ssim:.4f}, "
             f"worst {worst.figures['b_against_a'].psnr:.2f} dB in '{worst.name}')"
         )
-
-
-def find_ground_truth(folder: Path, cameras: Sequence[Camera]) -> dict[str, Path]:
-    """The photograph of each view that has one: the image in ``folder`` that is named after it.
-
-    Raises:
-        UsageError: there is no such folder, no view has a photograph, one has several, or one is not of the camera's
-            size.
-        DataError: a photograph is damaged.
-    """
-    found: dict[str, Path] = {}
-    listings: dict[Path, dict[str, list[Path]]] = {}
-    for camera in cameras:
-        wanted = folder / camera.name
-        if wanted.parent not in listings:
-            if wanted.parent != folder and not wanted.parent.is_dir():
-                continue
-            listings[wanted.parent] = _images_by_name(wanted.parent)
-        images = listings[wanted.parent].get(stem(wanted.name), [])
-        exact = [image for image in images if image.name == wanted.name]
-        images = exact or images
-        if not images:
-            continue
-        if len(images) > 1:
-            names = ", ".join(image.name for image in images)
-            raise UsageError(f"several photographs of view '{camera.name}' in '{wanted.parent}': {names}; keep one")
-        width, height = image_size(images[0])
-        if (width, height) != camera.photograph_size:
-            size = " x ".join(map(str, camera.photograph_size))
-            raise UsageError(
-                f"'{images[0]}' is {width} x {height} pixels, view '{camera.name}' of the cameras is {size}: give "
-                "photographs and cameras of the same size"
-            )
-        found[camera.name] = images[0]
-    if cameras and not found:
-        raise UsageError(
-            f"the folder '{folder}' has no photograph of any of the {len(cameras)} views: photographs are named after "
-            f"their views, as '{cameras[0].name}'"
-        )
-    return found
-
-
-def missing_photographs(found: Mapping[str, Path], cameras: Sequence[Camera]) -> str | None:
-    """One line that says which views have no photograph; None if each has one."""
-    missing = [camera.name for camera in cameras if camera.name not in found]
-    if not missing:
-        return None
-    which = f"view '{missing[0]}' has" if len(missing) == 1 else f"{len(missing)} views, such as '{missing[0]}', have"
-    return f"{which} no photograph and {'is' if len(missing) == 1 else 'are'} left out"
-
-
-def _images_by_name(folder: Path) -> dict[str, list[Path]]:
-    try:
-        files = sorted(folder.iterdir())
-    except OSError as error:
-        raise UsageError(f"cannot read the folder of photographs '{folder}': {error.strerror}") from None
-    images: dict[str, list[Path]] = {}
-    for file in files:
-        if file.suffix.lower() in IMAGE_SUFFIXES:
-            images.setdefault(stem(file.name), []).append(file)
-    return images
 
 
 def comparing(views: int) -> str:

@@ -17,9 +17,8 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 from potr_cl.quality.metrics import Lpips
-from potr_cl.quality.metrics_device import Similarity, in_batches
+from potr_cl.quality.metrics_device import Picture, Similarity, in_batches, place_pictures
 from potr_cl.quality.photographs import read_photograph
-from potr_cl.quality.pictures import Picture, place_pictures
 from potr_cl.views.targets import TargetPictures
 
 #: Photographs read before they are needed.
@@ -32,7 +31,7 @@ class Against:
     Args:
         device: that they lie on.
         background: behind photographs with alpha.
-        ground_truth: photographs by view name, see :func:`potr_cl.quality.compare.find_ground_truth`; cameras with a
+        ground_truth: photographs by view name (:func:`potr_cl.quality.photographs.find_ground_truth`); cameras with a
             lens must then look within them (:func:`potr_cl.model.camera.within_photographs`).
         lpips: the metric, where it is installed.
     """

@@ -23,9 +23,9 @@ from potr_cl.model.splat_groups import SplatGroups
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
 from potr_cl.quality.figures import Against, ViewFigures
-from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.quality.metrics import Lpips, psnr
 from potr_cl.quality.metrics_device import in_batches
+from potr_cl.quality.photographs import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.resident import DeviceScene, HostScene, ResidentScene, SceneHandle, scene_on
 from potr_cl.raster.rules import INRIA, RasterRules

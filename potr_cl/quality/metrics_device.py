@@ -8,18 +8,147 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 import pyopencl as cl
 
 from potr_cl.model.camera import Camera
+from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory
 from potr_cl.quality.metrics import C1, C2, WINDOW
-from potr_cl.quality.pictures import Picture
-from potr_cl.quality.similarity_cpu import CpuSimilarityLauncher
-from potr_cl.quality.similarity_gpu import GpuSimilarityLauncher
+
+
+class Renderer(Protocol):
+    """What renders a scene: a :class:`~potr_cl.raster.rasterizer.Rasterizer`, or a
+    :class:`~potr_cl.views.pictures.SeenRasterizer`, whose attributes and methods these are.
+    """
+
+    @property
+    def device(self) -> Device: ...
+
+    @property
+    def background(self) -> tuple[float, float, float]: ...
+
+    def render_into(self, cameras: Sequence[Camera], target: cl.Buffer, start: int = 0) -> None: ...
+
+    def render(self, camera: Camera) -> tuple[FloatArray, FloatArray]: ...
+
+    def strips(self, camera: Camera) -> Iterator[FloatArray]: ...
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture on a device.
+
+    Attributes:
+        buffer: (pixels, 3) float32, colours of pictures one behind the other.
+        first: the pixel that this one begins with.
+        width, height: of it, in pixels.
+    """
+
+    buffer: cl.Buffer
+    first: int
+    width: int
+    height: int
+
+    def download(self, device: Device) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+        """(H, W, 3) float32."""
+        image = np.empty((self.height, self.width, 3), np.float32)
+        with device.errors("failed while computing"):
+            cl.enqueue_copy(device.queue, image, self.buffer, src_offset=12 * self.first, is_blocking=True)
+        return image
+
+
+def place_pictures(buffer: cl.Buffer, cameras: Sequence[Camera]) -> list[Picture]:
+    """The views' pictures one behind the other in a buffer."""
+    pictures, first = [], 0
+    for camera in cameras:
+        pictures.append(Picture(buffer, first, camera.width, camera.height))
+        first += camera.width * camera.height
+    return pictures
+
+
+@contextmanager
+def rendered(rasterizer: Renderer, cameras: Sequence[Camera]) -> Iterator[list[Picture]]:
+    """Pictures of a scene from some views, on the device until the end.
+
+    Raises:
+        DeviceError: they do not fit the device, or it failed.
+    """
+    device = rasterizer.device
+    with Memory(device) as memory:
+        buffer = memory.allocate(sum(12 * camera.width * camera.height for camera in cameras), "the pictures")
+        with device.errors("failed while rendering"):
+            rasterizer.render_into(cameras, buffer)
+        yield place_pictures(buffer, cameras)
+
+
+#: Pixels along a side of a tile: GROUP in cl/quality/similarity_gpu.cl.
+_TILE = 16
+
+
+class GpuSimilarityLauncher:
+    """See :class:`potr_cl.quality.metrics_device.SimilarityLauncher`."""
+
+    most_views = 32
+
+    def __init__(self, device: Device, macros: dict[str, float | int]) -> None:
+        self._kernel = device.shared_kernel("quality/similarity_gpu.cl", "similarity", **macros)
+
+    def parts(self, picture: Picture) -> tuple[int, int]:
+        return -(-picture.width // _TILE), -(-picture.height // _TILE)
+
+    def enqueue(self, image: Picture, reference: Picture, sums: cl.Buffer, first_sum: int) -> None:
+        columns, rows = self.parts(image)
+        self._kernel.bind(
+            images=image.buffer,
+            first_image=image.first,
+            references=reference.buffer,
+            first_reference=reference.first,
+            width=image.width,
+            height=image.height,
+            sums=sums,
+            first_sum=first_sum,
+        )
+        self._kernel.launch((columns * _TILE, rows * _TILE), (_TILE, _TILE))
+
+
+#: Values (of three a pixel) and rows that a work-item does.
+_VALUES, _ROWS = 96, 32
+#: Fewest values that the kernel takes at a time.
+_LEAST_LANES = 8
+
+
+class CpuSimilarityLauncher:
+    """See :class:`potr_cl.quality.metrics_device.SimilarityLauncher`."""
+
+    most_views = 1
+
+    def __init__(self, device: Device, macros: dict[str, float | int]) -> None:
+        lanes = max(device.vector_width, _LEAST_LANES)
+        sizes = {"LANES": lanes, "BLOCK": _VALUES, "ROWS": _ROWS}
+        self._kernel = device.shared_kernel("quality/similarity_cpu.cl", "similarity", **sizes, **macros)
+
+    def parts(self, picture: Picture) -> tuple[int, int]:
+        return -(-3 * picture.width // _VALUES), -(-picture.height // _ROWS)
+
+    def enqueue(self, image: Picture, reference: Picture, sums: cl.Buffer, first_sum: int) -> None:
+        self._kernel.bind(
+            images=image.buffer,
+            first_image=image.first,
+            references=reference.buffer,
+            first_reference=reference.first,
+            width=image.width,
+            height=image.height,
+            sums=sums,
+            first_sum=first_sum,
+        )
+        self._kernel.launch(self.parts(image), (1, 1))
+
 
 #: Bytes that the pictures of views that are rendered together may take.
 _MOST_BYTES = 1 << 28

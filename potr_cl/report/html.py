@@ -12,7 +12,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
-from string import Template
 from typing import Any
 
 import numpy as np
@@ -22,10 +21,16 @@ from potr_cl.formats.images import to_8_bits
 from potr_cl.model.scene import FloatArray
 from potr_cl.plain_text import plain
 from potr_cl.quality.compare import difference_map
-from potr_cl.report.colours import ACCENT, SERIES, STAGE
 from potr_cl.report.labels import BEFORE_AND_AFTER, difference_label, view_label
+from potr_cl.report.style import ACCENT, PAGE, SERIES, STAGE
 from potr_cl.report.summary import decibels
 
+#: What the pictures show.
+_PICTURES = (
+    "<p>Drag the line in a picture: uncompressed is to its left, compressed to its right. Beside it is where they "
+    "differ: black not at all, then red, yellow and white. Most differences are too small to be seen, so they are "
+    "multiplied by the number below the picture.</p>\n"
+)
 #: Pixels along a side of a WebP picture.
 _WIDEST_WEBP = 16383
 
@@ -51,12 +56,14 @@ class PicturePair:
 
 
 def views_to_show(quality: dict[str, Any], chosen: str | None) -> list[tuple[str, dict[str, Any]]]:
-    """The worst, the median and a chosen view of a report's quality, with titles; the first view if none is chosen."""
+    """A chosen view, the median and the worst of a report's quality, with titles; also the first if none is chosen."""
     views = quality["views"]
     by_psnr = sorted(views, key=lambda view: math.inf if view["psnr"] is None else view["psnr"])
-    wanted = {"worst view": by_psnr[0], "typical view": by_psnr[(len(views) - 1) // 2]}
     named = [view for view in views if view["name"] == chosen]
-    wanted["chosen view" if named else "first view"] = (named or views)[0]
+    wanted = {"chosen view": named[0]} if named else {}
+    wanted |= {"typical view": by_psnr[(len(views) - 1) // 2], "worst view": by_psnr[0]}
+    if not named:
+        wanted["first view"] = views[0]
     shown: dict[str, tuple[str, dict[str, Any]]] = {}
     for title, view in wanted.items():
         if view["name"] in shown:
@@ -75,8 +82,8 @@ def html_report(report: dict[str, Any], pictures: Sequence[PicturePair]) -> str:
     source = report["source"]
     sections = [
         _headline(report),
+        _section("Pictures", _PICTURES + "".join(map(_pair, pictures))) if pictures else "",
         _section("Where the bytes are", _sizes(report)),
-        _section("Pictures", "".join(map(_pair, pictures))) if pictures else "",
         _section("Quality by view", _quality(report["quality"])),
         _section("Photographs", _photographs(report["photographs"])) if report.get("photographs") else "",
         _section("Pruning", _pruning(report)) if report["pruning"] is not None else "",
@@ -158,7 +165,8 @@ def _pair(pair: PicturePair) -> str:
         "oninput=\"this.parentNode.style.setProperty('--at', this.value + '%')\"></div>\n"
         f"<figcaption>{before} | {after}</figcaption></figure>\n"
         f'<figure><img {size} src="{_data_uri(heat)}" alt="{name}, difference">\n'
-        f"<figcaption>{_text(difference_label(factor))}</figcaption></figure>{_photograph(pair, name, size)}</div>"
+        f"<figcaption>{_text(difference_label(factor))}: white is {round(255 / factor)} of 255 or more</figcaption>"
+        f"</figure>{_photograph(pair, name, size)}</div>"
     )
 
 
@@ -329,78 +337,3 @@ def _circumstances(report: dict[str, Any]) -> str:
         facts = {"device": device["name"], "platform": f"{device['platform']}, {device['version']}"} | facts
     rows = [[_text(name), _text(value)] for name, value in facts.items()]
     return command + f'<div class="columns">{_table(["stage", "time"], times)}{_table(["", ""], rows)}</div>'
-
-
-#: Takes ``title`` and ``body``, which are HTML already, and the colours ``accent`` and ``stage``.
-PAGE = Template("""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta http-equiv="Content-Security-Policy" content="default-src 'none'; img-src data:; style-src 'unsafe-inline'; \
-script-src 'unsafe-inline'">
-<title>$title</title>
-<style>
-:root { color-scheme: light dark; --line: #8884; --soft: #8882; }
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 0 auto; padding: 1rem; }
-h1 { font-size: 1.2rem; overflow-wrap: anywhere; }
-h2 { font-size: 1.15rem; margin: 2.2rem 0 .6rem; border-bottom: 1px solid var(--line); }
-h3 { font-size: 1rem; margin: 1.4rem 0 .4rem; overflow-wrap: anywhere; }
-.cards { display: flex; flex-wrap: wrap; gap: .8rem; }
-.cards div { background: var(--soft); border-radius: .5rem; padding: .6rem 1rem; }
-.cards b { display: block; font-size: 1.5rem; }
-.bar { width: 100%; height: 2.2rem; border-radius: .3rem; }
-.wide { overflow-x: auto; }
-table { border-collapse: collapse; margin: .6rem 0; }
-th, td { text-align: left; padding: .15rem 1.2rem .15rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
-td { font-variant-numeric: tabular-nums; }
-td i { display: inline-block; width: .8em; height: .8em; border-radius: .2em; margin-right: .5em; }
-td:has(.meter) { min-width: 12rem; }
-.meter { display: inline-block; height: .6em; background: $accent; border-radius: .2em; }
-.pair, .columns, .charts { display: grid; gap: 1rem;
-  grid-template-columns: repeat(auto-fit, minmax(min(100%, 22rem), 1fr)); }
-.columns, .charts { align-items: start; }
-figure { margin: 0; }
-figcaption { opacity: .75; }
-img { display: block; max-width: 100%; height: auto; }
-.slider { position: relative; --at: 50%; background: $stage; width: fit-content; max-width: 100%; }
-.slider .after { position: absolute; inset: 0; clip-path: inset(0 0 0 var(--at)); }
-.slider input { position: absolute; inset: 0; width: 100%; height: 100%; margin: 0; opacity: 0; cursor: ew-resize; }
-.slider::after { content: ""; position: absolute; top: 0; bottom: 0; left: var(--at); width: 2px; background: #fff;
-  box-shadow: 0 0 3px #000; pointer-events: none; }
-.slider:focus-within { outline: 2px solid $accent; }
-.charts svg { width: 100%; }
-svg text { font-size: 11px; fill: currentColor; }
-svg .title { font-size: 13px; font-weight: 600; }
-svg .grid { stroke: var(--line); }
-svg .line { fill: none; stroke-width: 2; }
-/* A phone: less room between, nothing wider than the page but what scrolls by itself. */
-@media (max-width: 40rem) {
-  body { padding: .6rem; }
-  .cards { display: grid; grid-template-columns: 1fr 1fr; gap: .5rem; }
-  .cards div { padding: .5rem .7rem; min-width: 0; }
-  .cards b { font-size: 1.15rem; overflow-wrap: anywhere; }
-  th, td { padding-right: .7rem; }
-  td:first-child { overflow-wrap: anywhere; }
-  td:not(:first-child) { white-space: nowrap; }
-  td:has(.meter) { min-width: 4rem; }
-}
-/* Paper: dark on white, bars in their colours, nothing cut in two, and a slider is two halves that say so. */
-@page { margin: 15mm; }
-@media print {
-  :root { color-scheme: light; }
-  body { max-width: none; padding: 0; font-size: 10pt; background: #fff; color: #000;
-    -webkit-print-color-adjust: exact; print-color-adjust: exact; }
-  h2, h3 { break-after: avoid; }
-  figure, tr, svg, .cards { break-inside: avoid; }
-  .wide { overflow: visible; }
-  .pair { grid-template-columns: 1fr 1fr; }
-  .slider input { display: none; }
-}
-</style>
-</head>
-<body>
-$body
-</body>
-</html>
-""")

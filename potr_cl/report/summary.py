@@ -17,7 +17,7 @@ from potr_cl.plain_text import plain_document
 from potr_cl.quality.compare import Comparison, mean_view
 from potr_cl.quality.evaluator import EvaluationViews
 from potr_cl.quality.figures import Figures
-from potr_cl.quality.ground_truth import PhotographFigures
+from potr_cl.quality.photographs import PhotographFigures
 
 #: By how many decibels held-out views may be matched worse than training views before the reader is told why.
 _APART = 6.0

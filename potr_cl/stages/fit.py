@@ -17,7 +17,7 @@ from potr_cl.host.process import first_interrupt_asks
 from potr_cl.model.views_between import views_between
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.discovery import Family
-from potr_cl.quality.ground_truth import GroundTruth
+from potr_cl.quality.photographs import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Rates
 from potr_cl.stages.fitting.fit import FitOptions, FitProgress, SupportsBool, fit_scene, held_out_error, kept_pictures

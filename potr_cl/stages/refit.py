@@ -16,9 +16,8 @@ from potr_cl.host.threads import in_background, thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
-from potr_cl.outputs.colour_grid import ColourGrid
-from potr_cl.outputs.output import Rounded
-from potr_cl.quality.ground_truth import GroundTruth
+from potr_cl.outputs.output import ColourGrid, Rounded
+from potr_cl.quality.photographs import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.held_out import PhotographChoice, hold_out
 from potr_cl.stages.refitting.coefficients import residency_of

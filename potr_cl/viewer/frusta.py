@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from potr_cl.model.camera import Camera, camera_centres
-from potr_cl.report.colours import TEST_VIEW, TRAINING_VIEW, rgb
+from potr_cl.report.style import TEST_VIEW, TRAINING_VIEW, rgb
 
 #: More would only hide the scene: of more, as many are drawn, evenly spread.
 MOST_FRUSTA = 400

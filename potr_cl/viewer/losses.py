@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.images import to_8_bits
 from potr_cl.model.camera import Camera
-from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.quality.metrics import psnr
+from potr_cl.quality.photographs import GroundTruth
 from potr_cl.report.labels import U8
 from potr_cl.viewer.session import Session
 

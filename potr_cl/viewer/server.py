@@ -21,10 +21,10 @@ from potr_cl.host.libraries import install_command
 from potr_cl.model.camera import Camera, focus
 from potr_cl.opencl.device import Device
 from potr_cl.plain_text import LONGEST_VALUE, plain
-from potr_cl.quality.ground_truth import GroundTruth
+from potr_cl.quality.photographs import GroundTruth
 from potr_cl.raster.rules import RasterRules
-from potr_cl.report.colours import ACCENT, rgb
 from potr_cl.report.labels import U8
+from potr_cl.report.style import ACCENT, rgb
 from potr_cl.viewer import page
 from potr_cl.viewer.access import Door
 from potr_cl.viewer.channel import Channel

@@ -16,8 +16,7 @@ from potr_cl.formats.scenes.page import potr_of
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
-from potr_cl.quality.metrics_device import Similarity
-from potr_cl.quality.pictures import rendered
+from potr_cl.quality.metrics_device import Similarity, rendered
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import RasterRules
 

@@ -104,7 +104,7 @@ def targets_of(
 
 
 class Photographs(Protocol):
-    """Gives pictures by camera; :class:`potr_cl.quality.ground_truth.GroundTruth` does."""
+    """Gives pictures by camera; :class:`potr_cl.quality.photographs.GroundTruth` does."""
 
     def picture(self, camera: Camera) -> FloatArray:
         """(H, W, 3) float32, the photograph of a view."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 
 import numpy as np
 import pytest
@@ -42,6 +43,14 @@ def test_a_ladder_has_the_files_of_plain_encodes(files, tmp_path, capsys, caplog
     assert json.loads(capsys.readouterr().out) == ladder.document()
     for path in ladder.path.parent.iterdir():
         assert (tmp_path / "typed" / path.name).read_bytes() == path.read_bytes()
+
+
+def test_what_shows_a_ladder_is_a_whole_command(files, tmp_path, capsys):  # noqa: F811
+    scene, cameras, folder = (str(each) for each in (files["scene"], files["cameras"], tmp_path / "a ladder"))
+    plain = ["--no-prune", "--no-compact", "--refit", "off", "--no-quality"]
+    assert main(["encode", scene, "-o", folder, "--cameras", cameras, "--ladder", "0.5", *plain]) == 0
+    command = capsys.readouterr().out.splitlines()[-1]
+    assert shlex.split(command)[-6:] == ["potr-cl", "view", scene, folder, "--cameras", cameras]
 
 
 def test_without_views_nothing_is_judged(files, tmp_path):  # noqa: F811

@@ -125,7 +125,7 @@ def test_an_output_that_is_an_input(
         out = out / source.name
     words = ["would be replaced"]
     if out.name == source.name and source.suffix != written_suffix(call):
-        words += ["a name that ends in", "scenes are written as"]
+        words += ["a name that ends in", "give it one of"]
     refused(capsys, folder, [word.format(out=out) for word in call.split()], *words)
 
 

@@ -171,7 +171,7 @@ def test_what_takes_long_to_read_is_named(encode, told, capsys, monkeypatch):
 def test_a_stage_is_told_once_in_a_log(encode, capsys):
     _, _, err = called(capsys, *encode, "--max-size", "20k")
     lines = err.splitlines()
-    for stage in ("prepare views", "prune", "refit", "write file", "evaluate"):
+    for stage in ("prepare views", "prune", "refit", "entropy coding", "evaluate"):
         assert lines.count(f"{stage} …") == 1, err
         assert sum(line.startswith(f"{stage}: ") for line in lines) == 1, err
     assert not re.search("[\x1b\r]", err)

@@ -48,28 +48,28 @@ WRONG = {
 @pytest.mark.parametrize(
     ("call", "said"),
     [
-        ("encode a.ply -o b.gltf", "give it a name that ends in .glb"),
-        ("encode a.ply -o b.splat", "encode writes .potr, .spz"),
+        ("encode a.ply -o b.gltf", "encode to 'b.potr', then 'potr-cl decode b.potr -o b.gltf'"),
+        ("encode a.ply -o b.splat", "ends in '.splat', which cannot be written: give it one of .potr, .spz"),
         ("encode a.ply -o b.spz --entropy zstd", "--entropy does not apply to .spz files"),
         ("encode a.ply -o b.ply --sf-dc 9", "--sf-dc does not apply to .ply files"),
         ("encode a.ply -o b.potr --spz-version 3", "potr_cl has no version to choose"),
         ("encode a.ply -o sub --to sog4", "'.sog4' is no suffix of what encode writes"),
-        ("encode a.ply -o b.png", "a name that ends in .potr"),
-        ("encode a.ply -o b", "a name that ends in .potr"),
+        ("encode a.ply -o b.png", "ends in '.png', which cannot be written: give it one of .potr, .spz"),
+        ("encode a.ply -o b", "'b' has no suffix to tell the format: give it one of .potr, .spz"),
         ("encode a.ply -o b.potr --report b.png", "a name that ends in .html"),
-        ("decode a.potr -o b.splat", "written as"),
+        ("decode a.potr -o b.splat", "give it one of .ply, .compressed.ply"),
         ("decode a.potr -o b.potr", "command encode"),
-        ("decode a.potr -o b.png", "written as"),
-        ("decode a.potr -o b", "written as"),
+        ("decode a.potr -o b.png", "ends in '.png', which cannot be written: give it one of .ply"),
+        ("decode a.potr -o b", "'b' has no suffix to tell the format: give it one of .ply"),
         ("decode a.potr -o b.ply --to spz", "already gives the format"),
-        ("decode a.potr -o sub --to splat", "written as"),
+        ("decode a.potr -o sub --to splat", "give it one of .ply"),
         ("decode a.potr -o sub --to .xyz", "'.xyz' is no suffix of a scene"),
-        ("convert a.ply b.xyz", "written as"),
-        ("prune a.ply -o b.splat", "written as"),
+        ("convert a.ply b.xyz", "ends in '.xyz', which cannot be written: give it one of .ply"),
+        ("prune a.ply -o b.splat", "give it one of .ply"),
         ("prune a.ply -o b.potr", "command encode"),
         ("prune a.ply -o b.ply --order b.txt", "--order writes an array of NumPy"),
-        ("compact a.ply -o b.png", "written as"),
-        ("refit a.ply --reference a.ply -o b.png", "written as"),
+        ("compact a.ply -o b.png", "give it one of .ply"),
+        ("refit a.ply --reference a.ply -o b.png", "give it one of .ply"),
         ("compare a.ply a.potr --cameras none -o b.jpg", "a name that ends in .png"),
         ("render a.ply --cameras none -o a.potr", "a file of this name"),
         ("render a.ply --cameras none -o b.png", "a folder of pictures is written"),
@@ -101,7 +101,7 @@ WRONG = {
 def test_refused_in_one_line_before_any_work(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, call: str, said: str
 ) -> None:
-    for reader in ("potr_cl.formats.load_scene", "potr_cl.cli.files.decode", "potr_cl.cli.views.load_cameras"):
+    for reader in ("potr_cl.formats.load_scene", "potr_cl.cli.files.decode", "potr_cl.cli.options.load_cameras"):
         monkeypatch.setattr(reader, lambda *_, **__: pytest.fail("something was read"))
     before = sorted(folder.rglob("*"))
     assert cli.main(call.split()) == 2
@@ -148,6 +148,6 @@ def test_versions_of_spz(folder: Path, capsys: pytest.CaptureFixture[str]) -> No
 
 
 def test_encode_from_python_writes_no_other_name(folder: Path) -> None:
-    with pytest.raises(UsageError, match=r"encode writes \.potr"):
+    with pytest.raises(UsageError, match=r"give it one of \.potr"):
         encode("a.ply", output="b.splat", prune=False, compact=False, refit="off")
     assert not Path("b.splat").exists()

@@ -76,7 +76,7 @@ def test_render_bad_calls(tmp_path, scene_path, cameras_path, capsys):
     out = tmp_path / "out"
     render = ["render", scene_path, "--cameras", cameras_path, "-o", out]
     fails(capsys, ["render", tmp_path / "none.ply", *render[2:]], 2, "none.ply")
-    fails(capsys, ["render", cameras_path, *render[2:]], 2, "cameras.json", "unknown kind of scene")
+    fails(capsys, ["render", cameras_path, *render[2:]], 2, "cameras.json", "holds cameras, not a scene")
     fails(capsys, [*render[:3], tmp_path / "none.json", *render[4:]], 2, "none.json")
     fails(capsys, [*render, "--views", "view_9"], 2, "'view_9'", "0 ('view_0') to 7 ('view_7')")
     fails(capsys, [*render, "--views", "8"], 2, "'8'")
@@ -129,7 +129,7 @@ def test_compare_without_cameras(scene_path, potr_path, capsys):
     assert placed[0].endswith("files encoded with cameras look best from those")
     report = json.loads(run(capsys, "compare", scene_path, potr_path, "--json", "--virtual-views", 2, "--size", 64))
     assert (report["a"]["splats"], report["b"]["splats"]) == (200, 200)
-    assert [view["name"] for view in report["views"]] == ["virtual_000", "virtual_001"]
+    assert [view["name"] for view in report["views"]] == ["virtual_test_000", "virtual_test_001"]
     assert all(25 < view["b_against_a"]["psnr"] < 70 for view in report["views"])
     turning = json.loads(run(capsys, "compare", scene_path, potr_path, "--json", "--turntable", 3, "--size", 64))
     assert [view["name"] for view in turning["views"]] == ["turntable_000", "turntable_001", "turntable_002"]
@@ -156,7 +156,7 @@ def test_render_without_cameras_places_views(tmp_path, scene_path, capsys):
     assert len(placed) == 1
     assert "8 virtual views of 40 x 40 pixels" in placed[0]
     files = sorted((tmp_path / "around").iterdir())
-    assert [file.name for file in files] == [f"virtual_{k:03d}.png" for k in range(8)]
+    assert [file.name for file in files] == [f"virtual_test_{k:03d}.png" for k in range(8)]
     run(capsys, "render", scene_path, "-o", tmp_path / "turn", "--turntable", 5, "--size", 40, "--up=-y")
     files += sorted((tmp_path / "turn").iterdir())
     assert [file.name for file in files[8:]] == [f"turntable_{k:03d}.png" for k in range(5)]

@@ -260,7 +260,7 @@ def test_zero_streams_take_no_bytes():
 def test_progress_reaches_the_end():
     seen = []
     encode(random_scene(50), options=KEEP, progress=lambda stage, done: seen.append((stage, done)))
-    assert [s for s, d in seen if d == 1.0] == ["octree", "write file"]
+    assert [s for s, d in seen if d == 1.0] == ["octree", "entropy coding"]
     assert all(0 <= d <= 1 for _, d in seen)
 
 

@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 from potr_cl import DataError, Scene, UsageError, cli, info
 from potr_cl.formats import cameras, load_cameras, load_scene, registry, save_scene, scene_writer, scenes
 from potr_cl.formats.declaration import CameraFormat, SceneFormat
+from potr_cl.formats.ladder import Ladder, Rung
 from potr_cl.formats.registry import CAMERA_FORMATS, SCENE_FORMATS, listed
 from potr_cl.formats.scenes import page
 from potr_cl.formats.scenes.scene_files import opened
@@ -136,7 +137,7 @@ def test_unknown_suffixes(tmp_path: Path) -> None:
         with pytest.raises(UsageError, match="unknown kind of scene, expected a") as caught:
             load_scene(tmp_path / unknown)
         assert all(suffix in str(caught.value) for suffix in known)
-        with pytest.raises(UsageError, match="scenes are written as") as caught:
+        with pytest.raises(UsageError, match="give it one of") as caught:
             scene_writer(tmp_path / unknown)
         assert all(suffix in str(caught.value) for entry in WRITTEN for suffix in entry.suffixes)
         assert not any(tmp_path.iterdir())
@@ -265,10 +266,35 @@ def test_the_folder_of_a_training_is_refused_with_the_name_of_its_scene(tmp_path
     for file in files:
         (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / file).touch()
-    with pytest.raises(UsageError, match="has no scene that can be read as a folder") as caught:
+    with pytest.raises(UsageError) as caught:
         load_scene(tmp_path)
-    inside = [file for file in files if f"give the file in it: '{tmp_path / file}'" in str(caught.value)]
-    assert inside == ([] if named is None else [files[named]])
+    said = str(caught.value)
+    if named is None:
+        assert "has no scene: there is no .ply in it, and no meta.json or lod-meta.json" in said
+    assert [file for file in files if f"'{tmp_path / file}'" in said] == ([] if named is None else [files[named]])
+
+
+def test_a_folder_of_scenes_asks_for_one_of_them(tmp_path, data):
+    for name in ("a.ply", "b.ply"):
+        shutil.copy(data / "plush_excerpt.ply", tmp_path / name)
+    with pytest.raises(UsageError, match=r"holds 2 scenes: give one of them, such as '.*b\.ply', or all, \*\.ply$"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["plush_excerpt_cameras.json", "plush_sparse_text", "plush_transforms"])
+@pytest.mark.parametrize("read", [load_scene, info])
+def test_cameras_in_the_place_of_a_scene(data, name, read):
+    with pytest.raises(UsageError, match="holds cameras, not a scene: give the scene's file, and these as --cameras"):
+        read(data / name)
+
+
+@pytest.mark.parametrize("read", [load_scene, info])
+def test_a_ladder_in_the_place_of_a_scene(tmp_path, read):
+    ladder = Ladder(tmp_path / "ladder.json", "a.ply", 9, "", (Rung(0.5, "a_q0.5.potr", 3, 1),))
+    ladder.save()
+    for path in (tmp_path, ladder.path):
+        with pytest.raises(UsageError, match=r"is a ladder, .* see all of them with potr-cl view SCENE"):
+            read(path)
 
 
 @pytest.mark.parametrize(

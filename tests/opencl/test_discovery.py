@@ -85,7 +85,7 @@ def test_specification_that_fits_nothing(machine: list[DeviceInfo], spec: str) -
 
 
 @pytest.mark.parametrize(
-    ("architecture", "advice"), [("x86_64", "`pip install intel"), ("AMD64", "`pip install intel"), ("aarch64", "PoCL")]
+    ("architecture", "advice"), [("x86_64", "[intel-cpu]"), ("AMD64", "[intel-cpu]"), ("aarch64", "PoCL")]
 )
 def test_no_device_at_all(monkeypatch: pytest.MonkeyPatch, architecture: str, advice: str) -> None:
     monkeypatch.setattr(discovery, "list_devices", list)

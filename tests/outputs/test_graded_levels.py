@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from potr_cl.outputs.graded_levels import STEP_OF_BIT, graded
+from potr_cl.outputs.sog import STEP_OF_BIT, graded
 
 
 def test_even_steps_follow_what_an_error_is_worth():

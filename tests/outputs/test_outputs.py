@@ -20,7 +20,7 @@ from potr_cl.model.camera import train_views
 from potr_cl.model.scene import MIP_SPLATTING_LOW_PASS, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import Output, Request, RoundedScene
-from potr_cl.outputs.page import Page
+from potr_cl.outputs.potr import Page
 from potr_cl.outputs.registry import OUTPUTS, output_of, output_of_suffix
 from potr_cl.outputs.spz import Spz
 from potr_cl.pipeline.encoded import Encoded

@@ -13,8 +13,7 @@ import potr_cl
 from potr_cl.cli import main
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.scenes import page as pages
-from potr_cl.outputs.page import Page
-from potr_cl.outputs.potr import Potr
+from potr_cl.outputs.potr import Page, Potr
 from potr_cl.pipeline.options import EncodeOptions
 
 pytestmark = [pytest.mark.one_family, pytest.mark.one_runtime]

@@ -134,7 +134,7 @@ def test_order_names_the_splats_of_the_source(device, plush_excerpt, views):
 def test_progress_comes_to_an_end(device, plush_excerpt, views):
     seen = []
     encode(plush_excerpt, views, FEW, lambda stage, done: seen.append((stage, done)), device)
-    assert [s for s, d in seen if d == 1] == ["prepare views", "compact", "prune", "octree", "write file"]
+    assert [s for s, d in seen if d == 1] == ["prepare views", "compact", "prune", "octree", "entropy coding"]
 
 
 def progress_of(scene, views, options, device) -> dict[str, list[float]]:

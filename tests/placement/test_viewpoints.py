@@ -10,9 +10,10 @@ import pytest
 
 from potr_cl.errors import UsageError
 from potr_cl.formats import load_scene
-from potr_cl.model.camera import camera_centres, focus
+from potr_cl.model.camera import camera_centres, focus, test_views, train_views
 from potr_cl.model.scene import Scene
-from potr_cl.placement.viewpoints import AXES, guess_up, look_around, turntable
+from potr_cl.placement.upright import AXES, guess_up
+from potr_cl.placement.viewpoints import look_around, turntable
 from potr_cl.placement.virtual import judging_views, place_cameras
 from tests.cases.surfaces import flat_splats
 from tests.reference.scenes import random_scene
@@ -95,14 +96,26 @@ def test_views_are_level(views, up):
 
 
 @pytest.mark.slow
-def test_levelling_moves_no_camera():
+def test_a_view_has_one_name_and_one_way_up_whoever_places_it():
+    scene = rotated(house(), tilt(90))
+    judging, placed = judging_views(scene), place_cameras(scene, 160)
+    for cameras in (look_around(scene, 8, judging[0].width), judging, test_views(placed)):
+        assert [c.name for c in cameras] == [f"virtual_test_{k:03d}" for k in range(len(cameras))]
+        for camera, other in zip(cameras, judging, strict=False):
+            assert np.array_equal(camera.rotation, other.rotation)
+            assert np.array_equal(camera.translation, other.translation)
+    assert [c.name for c in train_views(placed)] == [f"virtual_{k:03d}" for k in range(160)]
+    assert {c.split for c in judging} == {"test"}
+    for camera in placed:
+        assert -camera.rotation[1] @ tilt(90) @ (0, 0, 1) > 0, "upside down"
+
+
+@pytest.mark.slow
+def test_another_way_up_moves_no_camera():
     scene = house()
-    placed = judging_views(scene, 8, 64)
-    level = look_around(scene, 8, 64)
-    assert np.allclose(camera_centres(level), camera_centres(placed))
-    assert np.allclose([c.rotation[2] for c in level], [c.rotation[2] for c in placed])
-    assert {c.split for c in level} == {"test"}
-    assert [c.name for c in level] == [f"virtual_{k:03d}" for k in range(8)]
+    level, askew = (look_around(scene, 8, 64, up) for up in (None, (1, 0, 0)))
+    assert np.allclose(camera_centres(level), camera_centres(askew))
+    assert np.allclose([c.rotation[2] for c in level], [c.rotation[2] for c in askew])
 
 
 def seen(scene: Scene, camera) -> float:

@@ -23,7 +23,6 @@ from potr_cl.quality.compare import (
     ViewFigures,
     comparison_of,
     comparison_report,
-    find_ground_truth,
     format_comparison,
     format_sizes,
     mean_view,
@@ -32,6 +31,7 @@ from potr_cl.quality.compare import (
 )
 from potr_cl.quality.judging import Judging, Looks
 from potr_cl.quality.metrics import psnr, ssim
+from potr_cl.quality.photographs import find_ground_truth
 from potr_cl.raster.rasterizer import Rasterizer
 from tests.reference.scenes import ring_of_cameras
 

@@ -10,8 +10,8 @@ import pytest
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.images import to_8_bits, write_png
 from potr_cl.opencl.device import Device
-from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.quality.metrics import psnr
+from potr_cl.quality.photographs import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions

@@ -9,8 +9,7 @@ import pytest
 
 from potr_cl.opencl.memory import Memory
 from potr_cl.quality.metrics import psnr, ssim
-from potr_cl.quality.metrics_device import Similarity, in_batches
-from potr_cl.quality.pictures import place_pictures, rendered
+from potr_cl.quality.metrics_device import Similarity, in_batches, place_pictures, rendered
 from potr_cl.raster.rasterizer import Rasterizer
 from tests.devices import KERNELS, open_device
 from tests.reference.scenes import random_splats

@@ -197,18 +197,18 @@ def test_sizes_and_stages_as_people_say_them():
 def test_views_to_show():
     shown = views_to_show(REPORT["quality"], "right")
     assert [(title, entry["name"]) for title, entry in shown] == [
-        ("worst view", "left"),
-        ("typical view", "back"),
         ("chosen view", "right"),
+        ("typical view", "back"),
+        ("worst view", "left"),
     ]
     shown = views_to_show(REPORT["quality"], "left")
     assert [(title, entry["name"]) for title, entry in shown] == [
-        ("worst view, chosen view", "left"),
+        ("chosen view, worst view", "left"),
         ("typical view", "back"),
     ]
     assert views_to_show(REPORT["quality"], None)[-1][0] == "first view"
     one = {"views": [view("only", None)]}
-    assert views_to_show(one, None) == [("worst view, typical view, first view", view("only", None))]
+    assert views_to_show(one, None) == [("typical view, worst view, first view", view("only", None))]
 
 
 def test_pictures_that_are_too_wide_for_webp():

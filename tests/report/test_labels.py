@@ -95,7 +95,8 @@ def test_the_report_says_the_same():
     }  # fmt: skip
     page = html_report(report, [PicturePair("worst view", "view_4", 20.5, a, b)])
     assert f"<h3>worst view: {view_label('view_4', 20.5)}</h3>" in page
-    assert f"<figcaption>{difference_label(comparison_picture(a, b, 'v', 20.5)[1])}</figcaption>" in page
+    factor = comparison_picture(a, b, "v", 20.5)[1]
+    assert f"<figcaption>{difference_label(factor)}: white is {round(255 / factor)} of 255 or more</figcaption>" in page
     assert view_label("view_4", 20.5) == "view_4, PSNR 20.50 dB"
     assert view_label("view_4", None) == "view_4, identical"
 

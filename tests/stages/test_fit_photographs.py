@@ -12,7 +12,7 @@ from potr_cl.model.camera import train_views
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.quality.ground_truth import GroundTruth
+from potr_cl.quality.photographs import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.held_out import hold_out
 from tests.cases.photographs import photographed_scene, photographs

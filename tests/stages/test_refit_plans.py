@@ -10,7 +10,7 @@ import pytest
 
 from potr_cl.errors import DeviceMemoryError, UsageError
 from potr_cl.opencl.device import Device
-from potr_cl.outputs.colour_grid import ColourGrid
+from potr_cl.outputs.output import ColourGrid
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.picked_splats import IndexSubset

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from potr_cl.outputs.colour_grid import ColourGrid
+from potr_cl.outputs.output import ColourGrid
 from potr_cl.stages.refitting.colour_refit import ColourRefit
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions

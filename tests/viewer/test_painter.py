@@ -235,7 +235,7 @@ def test_memory_does_not_grow(device, scenes, plush_excerpt_cameras):
 
 @pytest.mark.one_runtime
 def test_a_photograph_that_cannot_be_read_does_not_end_the_list(plush_excerpt_cameras, tmp_path):
-    from potr_cl.quality.ground_truth import GroundTruth
+    from potr_cl.quality.photographs import GroundTruth
 
     cameras = [dataclasses.replace(camera, lens=None) for camera in plush_excerpt_cameras[:2]]
     for camera in cameras:
@@ -280,7 +280,7 @@ def test_the_thread_ends(device, scenes):
 def test_the_photograph_of_a_view_fades_over_it(device, scenes, plush_excerpt_cameras, tmp_path):
     from PIL import Image
 
-    from potr_cl.quality.ground_truth import GroundTruth
+    from potr_cl.quality.photographs import GroundTruth
 
     camera = dataclasses.replace(plush_excerpt_cameras[0], cx=120.0, cy=90.0)
     photograph = np.full((camera.height, camera.width, 3), 200, np.uint8)

@@ -21,7 +21,7 @@ from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model import splat_groups
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import choose_device
-from potr_cl.outputs.coded_scene import CodedScene
+from potr_cl.outputs.output import CodedScene
 from potr_cl.outputs.potr import Potr
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions

@@ -13,14 +13,13 @@ from potr_cl.errors import DeviceError
 from potr_cl.formats.images import write_png
 from potr_cl.model import splat_groups
 from potr_cl.model.splat_groups import SplatGroups
-from potr_cl.outputs.coded_scene import CodedScene
+from potr_cl.outputs.output import CodedScene
 from potr_cl.outputs.potr import Potr
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.quality.by_photographs import judge_by_photographs
-from potr_cl.quality.evaluator import EvaluationViews, Evaluator
-from potr_cl.quality.ground_truth import GroundTruth
+from potr_cl.quality.evaluator import EvaluationViews, Evaluator, judge_by_photographs
 from potr_cl.quality.judging import JudgingPart
+from potr_cl.quality.photographs import GroundTruth
 from potr_cl.raster import resident
 from potr_cl.raster.rasterizer import Rasterizer, render
 from potr_cl.raster.resident import ResidentScene

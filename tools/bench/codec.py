@@ -39,7 +39,7 @@ def _encode(splats: int, with_views: bool, level: int) -> list[Cell]:
     def work() -> None:
         began = time.perf_counter()
         encoded = encode(scene, views, as_it_is("paper", EntropyCoder("zstd", level)))
-        rows.extend(encoded.seconds[stage] for stage in ("octree", "write file"))
+        rows.extend(encoded.seconds[stage] for stage in ("octree", "entropy coding"))
         rows.extend((time.perf_counter() - began, encoded.nbytes / 1e6))
 
     peak = growth(work)

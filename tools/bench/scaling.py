@@ -83,7 +83,7 @@ def measure(point: Point, folder: Path, rounds: int | None, memory: float | None
 
     return {
         **dict(zip(NUMBERS, point, strict=True)), "time": seconds, "pruning": of("prepare views", "prune"),
-        "re-fit": of("refit"), "coding": of("octree", "write file"), "host peak": host / 1e9,
+        "re-fit": of("refit"), "coding": of("octree", "entropy coding"), "host peak": host / 1e9,
         "device peak": taken / 1e9, "splats left": len(done[0].order),
     }  # fmt: skip
 

@@ -23,8 +23,7 @@ from potr_cl.errors import DeviceError
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import DeviceInfo, Family, list_devices
 from potr_cl.quality.metrics import ssim
-from potr_cl.quality.metrics_device import Similarity
-from potr_cl.quality.pictures import Picture
+from potr_cl.quality.metrics_device import Picture, Similarity
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import GSPLAT, INRIA
 from tests.reference import raster as reference

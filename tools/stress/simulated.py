@@ -46,7 +46,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import list_devices
 from potr_cl.opencl.kernel import Kernel
 from potr_cl.opencl.memory import Memory
-from potr_cl.outputs.colour_grid import ColourGrid
+from potr_cl.outputs.output import ColourGrid
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster import launcher as raster_launcher

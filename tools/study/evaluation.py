@@ -12,8 +12,9 @@ from potr_cl.model.camera import Camera, test_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
-from potr_cl.quality.compare import find_ground_truth, mean_view
+from potr_cl.quality.compare import mean_view
 from potr_cl.quality.judging import Judging, Looks
+from potr_cl.quality.photographs import find_ground_truth
 
 
 class EvaluatedScene(Owner):

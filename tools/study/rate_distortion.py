@@ -45,7 +45,7 @@ _STAGES = {
     "prepare views": ("prepare views",),
     "prune": ("prune",),
     "compact or re-fit": ("compact", "refit"),
-    "octree, quantise and code": ("octree", "write file"),
+    "octree, quantise and code": ("octree", "entropy coding"),
 }
 QUALITIES = tuple(round(0.1 * step, 1) for step in range(1, 11))
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.memory import Memory, Owner
-from potr_cl.outputs.colour_grid import ColourGrid
+from potr_cl.outputs.output import ColourGrid
 from potr_cl.raster.scene_buffers import SPLAT_GROUP
 from potr_cl.stages.refitting.coefficients import Coefficients, Vector
 from potr_cl.stages.refitting.sliced_arrays import CHANNELS, Ridge
@@ -154,7 +154,7 @@ class Steps:
 
     Attributes:
         turns: (stride,) int32, the turn in which a splat is due.
-        constant, others: (stride,) float32, as of :class:`potr_cl.outputs.colour_grid.ColourGrid`.
+        constant, others: (stride,) float32, as of :class:`potr_cl.outputs.output.ColourGrid`.
     """
 
     turns: NDArray[np.int32]

@@ -24,7 +24,7 @@ from potr_cl.host.threads import in_background
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
-from potr_cl.outputs.colour_grid import ColourGrid
+from potr_cl.outputs.output import ColourGrid
 from potr_cl.stages.refitting.blocks import ROUNDS, Rounding, Steps
 from potr_cl.stages.refitting.coefficients import Vector
 from potr_cl.stages.refitting.colour_refit import ColourRefit

@@ -6,7 +6,7 @@ from importlib.resources import files
 from string import Template
 
 from potr_cl.formats.scenes.page import viewer_script
-from potr_cl.report import colours
+from potr_cl.report.style import ACCENT, STAGE, TEST_VIEW, TRAINING_VIEW, WARNING
 from potr_cl.viewer.access import Asset
 
 _FOLDER = "/potr_cl"
@@ -33,11 +33,11 @@ def assets() -> dict[str, Asset]:
     """The files of the page by their paths."""
     folder = files(__package__)
     style = Template(folder.joinpath("page.css").read_text("utf-8")).substitute(
-        accent=colours.ACCENT,
-        warning=colours.WARNING,
-        stage=colours.STAGE,
-        training=colours.TRAINING_VIEW,
-        test=colours.TEST_VIEW,
+        accent=ACCENT,
+        warning=WARNING,
+        stage=STAGE,
+        training=TRAINING_VIEW,
+        test=TEST_VIEW,
     )
     script = folder.joinpath("page.js").read_bytes()
     drawing = viewer_script()
