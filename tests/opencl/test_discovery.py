@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -91,7 +92,7 @@ def test_no_device_at_all(monkeypatch: pytest.MonkeyPatch, architecture: str, ad
     monkeypatch.setattr(discovery, "list_devices", list)
     monkeypatch.setattr(discovery, "machine", lambda: architecture)
     monkeypatch.setattr("sys.platform", "linux")
-    with pytest.raises(DeviceError, match=f"or a CPU runtime by .*{advice}"):
+    with pytest.raises(DeviceError, match=rf"or a CPU runtime by .*{re.escape(advice)}"):
         choose_device()
 
 
