@@ -205,7 +205,7 @@ def test_recipes_can_be_followed(tmp_path: Path) -> None:
     # A quirk has no file of its own: it is an entry of quirks.py. Type checkers need the keywords of options by name,
     # and what a stage has found out.
     lists = {"potr_cl/opencl/quirks.py", "potr_cl/api/choices.py", "potr_cl/stages/stage.py"}
-    tests, run = [], []
+    tests, run, docs = [], [], ["tools.make.docs"]
     for title, checks in RECIPES.items():
         blocks = recipe(title)
         assert blocks, title
@@ -223,9 +223,9 @@ def test_recipes_can_be_followed(tmp_path: Path) -> None:
         shows = [line.split()[2:] for line in re.findall(r"^ {4}(python -m .+)$", section(title), re.MULTILINE)]
         own = [path for path, _, _ in blocks if path.startswith("tests/")]
         assert shows or own or checks, f"{title}: a recipe that nobody tries"
-        run += [words for words in shows if words[-1] not in own]
+        run += [words for words in shows if words[-1] not in own and words != docs]
         tests += [*own, *checks]
-    run.append(["tools.make.docs"])
+    run.append(docs)
     if importlib.util.find_spec("ruff"):
         run.append(["ruff", "check", "--no-cache", "."])
     run.append(["pytest", "-q", "-p", "no:cacheprovider", "-m", "not slow", *dict.fromkeys(tests)])
