@@ -189,6 +189,7 @@ def test_comparing_files_says_what_comparing_scenes_says(tmp_path, device, plush
     assert of_file.report()["views"] == of_scene.report()["views"]
 
 
+@pytest.mark.slow
 def test_the_commands_say_the_same_of_a_file_and_of_its_scene(tmp_path, monkeypatch, capsys, plush_excerpt):
     """Render and compare read the file into the device; as a PLY file it takes the way by the host."""
     from potr_cl import cli

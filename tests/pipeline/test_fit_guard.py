@@ -64,6 +64,7 @@ def test_never_worse_or_left_out(judged, plush_excerpt_cameras, views, threshold
     assert made.nbytes < plain.nbytes * math.exp(a_decibel * (with_fit - psnr))
 
 
+@pytest.mark.slow
 def test_what_pays_is_taken(judged, plush_excerpt_cameras):
     options = EncodeOptions(q=0.5).changed(prune={"delta_mse_max": 3e-7}, fit={"steps": 150})
     made, _ = judged(train_views(plush_excerpt_cameras), options)

@@ -192,6 +192,7 @@ def test_no_camera_stands_in_matter():
     assert max(blocked) == 0
 
 
+@pytest.mark.slow
 def test_a_room_is_seen_from_inside():
     views = train_views(placed(ROOM))
     inside = inside_room(views)
@@ -202,6 +203,7 @@ def test_a_room_is_seen_from_inside():
     assert seen.min() >= 1
 
 
+@pytest.mark.slow
 def test_an_object_in_a_room():
     thing = sphere(6000, 0.5, 0.02)
     inside = inside_room(outside_ball(train_views(placed(together(ROOM, thing)))))

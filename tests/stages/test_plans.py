@@ -200,6 +200,7 @@ def test_spared_splats_stay(kernels, grouping, residency):
     assert len(kept[1]) < len(scene) - 100
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("grouping", ["by view", "as drawn"])
 def test_streamed_views_wait_until_they_have_lost_enough(kernels, grouping):
     skip_unless(grouping, kernels)

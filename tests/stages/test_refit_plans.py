@@ -453,6 +453,7 @@ def test_the_same_file(device, plush_excerpt, plush_excerpt_cameras, monkeypatch
     assert sliced.refitted.errors == whole.refitted.errors
 
 
+@pytest.mark.slow
 @pytest.mark.one_family
 def test_the_same_file_of_views_with_splats_of_their_own(device, picked):
     """Of a whole encode, on one device and on two."""
