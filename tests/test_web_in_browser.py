@@ -227,7 +227,9 @@ def test_playcanvas_streams_levels_of_detail(
     with without_complaints(tab):
         on_stage(tab, server)
         budget = 10**6 if level == 0 else 1
-        shown = tab.evaluate("([view, budget]) => potr.streamed('/streamed/lod-meta.json', view, budget)", [view, budget])
+        shown = tab.evaluate(
+            "([view, budget]) => potr.streamed('/streamed/lod-meta.json', view, budget)", [view, budget]
+        )
     assert shown == len(scene)
     check_alike(np.clip(potr_cl.render(scene, camera).image, 0, 1), picture(tab), 30)
 
