@@ -242,7 +242,7 @@ def test_supersplat_streams_levels_of_detail(tab: Any, server: Server, streamed:
     """It turns scenes by 180 degrees about z, and its field of view is that of the longer side."""
     scene, turned = potr_cl.load_scene(f"{streamed}#0"), np.diag([-1.0, -1.0, 1.0])
     target = np.median(scene.means, axis=0).astype(np.float64) @ turned
-    view = {"position": (target + [0.1, 0.15, -0.6]).tolist(), "target": target.tolist(), "fov": 50}
+    view = {"position": (target + np.array([0.1, 0.15, -0.6])).tolist(), "target": target.tolist(), "fov": 50}
     with without_complaints(tab):
         on_stage(tab, server)
         found = tab.evaluate("([view, budget]) => potr.supersplat('/streamed/lod-meta.json', view, budget)", [view, 1])
