@@ -15,8 +15,9 @@ import potr_cl
 from potr_cl import Scene, UsageError, cli
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.formats import load_scene
-from potr_cl.levels.errors import MeasuredErrors, SharedOut, coverage
-from potr_cl.model.camera import train_views
+from potr_cl.levels.errors import MeasuredErrors, SharedOut, coverage, measuring_views
+from potr_cl.model.camera import camera_centres, train_views
+from potr_cl.model.views_between import views_between
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.lod_tree import Limits, extents_of, lod_tree
 from potr_cl.outputs.output import Request
@@ -165,9 +166,10 @@ def test_errors_of_leaves_add_up_and_say_where(plush_excerpt, plush_excerpt_came
     sh = plush_excerpt.sh.copy()
     sh[left, 0] += 0.3
     other = Scene(*(getattr(plush_excerpt, field) for field in FIELDS[:4]), sh)
-    with SharedOut(device, plush_excerpt, views, left.astype(np.int64), 2, (0, 0, 0)) as shared:
-        right_part, left_part = shared.of(other)
-        assert shared.of(plush_excerpt).tolist() == [0, 0]
+    with SharedOut(device, plush_excerpt, views, left.astype(np.int64), 2) as shared:
+        parts = shared.of([other, plush_excerpt])
+    assert not parts[:, :, 1].any()
+    right_part, left_part = parts[:, :, 0].mean(axis=0)
     (whole,) = mean_squared_errors(device, plush_excerpt, [other], views)
     assert left_part + right_part == pytest.approx(whole, rel=1e-5)
     assert left_part > 4 * right_part
@@ -181,9 +183,19 @@ def test_an_error_times_what_the_leaf_covers_is_what_it_adds(plush_excerpt, plus
     leaves = np.zeros(len(plush_excerpt), np.int64)
     errors = MeasuredErrors(device, views, plush_excerpt).of_leaves(scenes.__getitem__, 2, leaves, boxes)
     assert errors[0, 0] == 0
+    views = measuring_views(plush_excerpt, views)
     covered = np.mean([coverage(view, boxes)[0] for view in views])
     (whole,) = mean_squared_errors(device, plush_excerpt, [fewer], views)
     assert errors[0, 1] * covered == pytest.approx(whole, rel=1e-5)
+
+
+def test_errors_are_measured_where_no_level_was_made_for(plush_excerpt, plush_excerpt_cameras):
+    views = train_views(plush_excerpt_cameras)
+    measuring = camera_centres(measuring_views(plush_excerpt, views))
+    for made_for in (views, views_between(plush_excerpt, views, 5)):
+        assert np.linalg.norm(camera_centres(made_for)[:, None] - measuring, axis=2).min() > 1e-6
+    alone = measuring_views(plush_excerpt, views[:1])
+    assert [view.name for view in alone] == [views[0].name]
 
 
 def test_coverage_is_that_of_playcanvas_engine(plush_excerpt_cameras):
