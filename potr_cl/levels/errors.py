@@ -13,12 +13,14 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import islice
 
 import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
+from potr_cl.levels.environment import Surroundings
 from potr_cl.levels.plan import scale_of_level
 from potr_cl.model.camera import Camera, resized
 from potr_cl.model.scene import FloatArray, Scene
@@ -76,6 +78,14 @@ class MeasuredErrors:
             if (depths > 0).any():
                 sizes.append(float(np.median(depths[depths > 0])) / view.fx)
         return float(np.float32(np.median(sizes) / scale_of_level(level))) if sizes else 0.0
+
+    def far(self, scene: Scene) -> NDArray[np.bool_]:
+        """See :meth:`potr_cl.outputs.output.LevelErrors.far`."""
+        return self._surroundings.have(scene)
+
+    @cached_property
+    def _surroundings(self) -> Surroundings:
+        return Surroundings.of(self.scene, self.views)
 
     def of_leaves(
         self, scenes: Callable[[int], Scene], levels: int, leaves: NDArray[np.int64], boxes: NDArray[np.float64]
@@ -135,7 +145,7 @@ class SharedOut:
         device: to render on.
         scene: the finest level, as readers see it.
         views: to look from.
-        leaves: (N,) in which leaf each of its splats lies.
+        leaves: (N,) in which leaf each of its splats lies; ``count``: in none, and the others share its part.
         count: of the leaves.
         background, memory: as of :class:`MeasuredErrors`.
     """
@@ -201,7 +211,7 @@ class SharedOut:
         with OwnViews(self._sweep, self._rasterizer, coefficients, [view], memory=self._memory) as own:
             ColourMap(coefficients, own).gradient(self._black, target, self._sums)
             of_splats = np.maximum(coefficients.read_sh(self._sums)[:, 0].astype(np.float64), 0)
-        parts = np.stack([np.bincount(self._leaves, each, self._count) for each in of_splats.T], axis=1)
+        parts = np.stack([np.bincount(self._leaves, each, self._count + 1)[:-1] for each in of_splats.T], axis=1)
         whole = difference.mean(axis=(0, 1), dtype=np.float64)
         shared: NDArray[np.float64] = parts * (whole / np.maximum(parts.sum(axis=0), 1e-300))
         return shared

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import itertools
 import json
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +34,12 @@ FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
 
 class Told:
     """Errors that are told, in place of measured ones."""
+
+    def __init__(self, far: float = np.inf) -> None:
+        self._far = far
+
+    def far(self, scene):
+        return scene.means[:, 0] > self._far
 
     def of_level(self, level: int) -> float:
         return 0.0
@@ -157,6 +165,36 @@ def mean_squared_errors(device, scene, others, views) -> list[float]:
             own = [another.render(view)[0].clip(0, 1) for view in views]
         found.append(float(np.mean([np.square(a - b).mean() for a, b in zip(pictures, own, strict=True)])))
     return found
+
+
+def test_what_is_far_is_the_environment_once(files, tmp_path):
+    """Every level is shown with what the finest one has there; the tree has and counts the others."""
+    levels = [Sog().read(data) for data in files]
+    far = float(np.quantile(levels[0].means[:, 0], 0.95))
+    shown = []
+
+    class Errors(Told):
+        def of_leaves(self, scenes, levels, leaves, boxes):
+            assert np.array_equal(leaves == len(boxes), self.far(scenes(0)))
+            shown.extend(scenes(level) for level in range(levels))
+            return np.zeros((len(boxes), levels))
+
+    output = StreamedSog(lod_chunk_count=1)
+    pieces = output.levelled(files, Errors(far))
+    path = tmp_path / "lod-meta.json"
+    with path.open("wb") as file:
+        output.write(pieces, file, path)
+    meta = json.loads(path.read_text())
+    assert meta["environment"] == "env/meta.json"
+    sky = levels[0].means[levels[0].means[:, 0] > far]
+    assert json.loads((tmp_path / "env" / "meta.json").read_text())["count"] == len(sky) > 0
+    for level, (scene, own) in enumerate(zip(levels, shown, strict=True)):
+        near = scene.means[scene.means[:, 0] <= far]
+        assert meta["counts"][level] == len(near)
+        for found in (load_scene(f"{path}#{level}"), own):
+            assert np.array_equal(np.sort(found.means, axis=0), np.sort(np.concatenate([near, sky]), axis=0))
+    without = json.loads(zipfile.ZipFile(io.BytesIO(output.levelled(files, Told())[0])).read("lod-meta.json"))
+    assert "environment" not in without
 
 
 def test_errors_of_leaves_add_up_and_say_where(plush_excerpt, plush_excerpt_cameras, device):
