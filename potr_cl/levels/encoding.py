@@ -1,7 +1,9 @@
 """Scenes encoded with levels of detail: :func:`encode_levels`.
 
-A level is one run of the stages: with a number of splats to keep, and smaller views. Levels are made one after the
-other, so no more memory is taken than by one of them; what is kept of each is the file that it became.
+A level is one run of the stages: with a number of splats to keep, and smaller views. It keeps some of the splats that
+the next finer level has kept, as they are in the full scene, and their colours are re-fitted to the full scene's
+pictures. Levels are made one after the other, so no more memory is taken than by one of them; what is kept of each is
+the file that it became.
 """
 
 from __future__ import annotations
@@ -10,6 +12,8 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
+
+import numpy as np
 
 from potr_cl.errors import UsageError
 from potr_cl.levels.errors import MeasuredErrors
@@ -60,12 +64,13 @@ def encode_levels(
     output, wanted = options.output, options.wanted_levels
     single = options.changed(output=output.of_level(), levels=1)
 
-    def one(views: Sequence[Camera] | None, how: EncodeOptions, again: bool) -> Encoded:
+    def one(views: Sequence[Camera] | None, how: EncodeOptions, finer: Encoded | None = None) -> Encoded:
         return encode(
-            scene, views, how, progress, device, kept=kept, in_frame=in_frame or again, pool=pool, tell=tell
+            scene, views, how, progress, device, kept=kept, in_frame=in_frame or finer is not None, pool=pool,
+            tell=tell, among=None if finer is None else np.sort(finer.order),
         )  # fmt: skip
 
-    first = one(cameras, single, False)
+    first = made = one(cameras, single)
     counts = counts_of_levels(len(first.order), wanted)
     if len(counts) > 1 and (cameras is None or not options.stage(Prune).on):
         raise UsageError("coarser levels of detail are pruned: leave out --no-prune, or give --levels 1")
@@ -73,7 +78,7 @@ def encode_levels(
     for level, count in enumerate(counts[1:], 1):
         assert cameras is not None
         _log.info("level %d of %d: %s splats", level, len(counts) - 1, f"{count:,}")
-        made = one(views_of_level(cameras, level), _coarser(single, count), True)
+        made = one(views_of_level(cameras, level), _coarser(single, count), made)
         files.append(made.data)
         seconds = added_up(seconds, made.seconds)
     watch = Stopwatch(progress)
