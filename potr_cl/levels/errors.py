@@ -55,10 +55,12 @@ class MeasuredErrors:
 
     Attributes:
         device: to render on; None only where there are no views.
-        views: the training views; without any, nothing is measured. Leaves' errors are measured between them.
+        views: the training views; without any, nothing is measured.
         scene: the uncompressed scene.
         background: R, G, B behind it.
         memory: bytes of the device's memory that may be filled with views; None: the callee's own default.
+        between: views to measure leaves' errors in, as :func:`measuring_views` gives them; none: the training views.
+        scales: by how much smaller the pictures are in which each level is shown; none: as it was made.
     """
 
     device: Device | None
@@ -66,6 +68,8 @@ class MeasuredErrors:
     scene: Scene
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     memory: int | None = None
+    between: Sequence[Camera] = ()
+    scales: Sequence[float] = ()
 
     def of_level(self, level: int) -> float:
         """The size in the scene of a pixel in the level's pictures, the median over splats and views."""
@@ -77,7 +81,8 @@ class MeasuredErrors:
             depths = some @ view.rotation[2] + view.translation[2]
             if (depths > 0).any():
                 sizes.append(float(np.median(depths[depths > 0])) / view.fx)
-        return float(np.float32(np.median(sizes) / scale_of_level(level))) if sizes else 0.0
+        scale = self.scales[level] if self.scales else scale_of_level(level)
+        return float(np.float32(np.median(sizes) / scale)) if sizes else 0.0
 
     def far(self, scene: Scene) -> NDArray[np.bool_]:
         """See :meth:`potr_cl.outputs.output.LevelErrors.far`."""
@@ -95,30 +100,49 @@ class MeasuredErrors:
         if not self.views or levels < 2:
             return found
         assert self.device is not None
-        views = measuring_views(self.scene, self.views)
-        covered = np.mean([coverage(view, boxes) for view in views], axis=0)
+        views = [_small(view) for view in self.between or self.views]
+        covered = np.array([coverage(view, boxes) for view in views])
         finest = scenes(0)
         with SharedOut(self.device, finest, views, leaves, len(boxes), self.background, self.memory) as shared:
             parts = shared.of(map(scenes, range(1, levels)))
-        found[:, 1:] = parts.mean(axis=0)
-        found /= np.maximum(covered, 1e-12)[:, None]
+        found[:, 1:] = errors_a_coverage(parts, covered)
         return np.maximum.accumulate(found, axis=1)
 
 
+def errors_a_coverage(parts: NDArray[np.float64], covered: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(leaves, levels) by which leaves' coverage is multiplied to foretell what they add to pictures' errors.
+
+    The sum over the views by that of the coverage. Of a view, no more counts than the second most of all per coverage:
+    from one place within a leaf, a single splat may fill the picture, which would tell of that place alone.
+
+    Args:
+        parts: (views, leaves, levels) what they add in some views.
+        covered: (views, leaves) what they cover there.
+    """
+    ratios = parts / np.maximum(covered, 1e-12)[:, :, None]
+    if len(ratios) > 1:
+        ratios = np.minimum(ratios, np.partition(ratios, -2, axis=0)[-2])
+    found: NDArray[np.float64] = (ratios * covered[:, :, None]).sum(axis=0)
+    found /= np.maximum(covered.sum(axis=0), 1e-12)[:, None]
+    return found
+
+
 def measuring_views(scene: Scene, views: Sequence[Camera]) -> list[Camera]:
-    """Views of a scene between some views, spread evenly, in no more pixels than tell a level's error.
+    """Views of a scene between some views, spread evenly.
 
     Levels are nearer to the scene where they were made for than where people look from, so no level is made for these.
     Where a camera can hardly have been anywhere else, the given views have to do.
     """
-    count = min(len(views), _VIEWS)
     between = views_between(scene, views, _VIEWS / len(views), first=_ROUND)
+    count = min(len(views), _VIEWS)
     given = [views[k] for k in np.linspace(0, len(views) - 1, count).round().astype(int)]
-    small = []
-    for view in between if len(between) >= count / 2 else given:
-        part = min(math.sqrt(_PIXELS / (view.width * view.height)), 1.0)
-        small.append(resized(view, max(int(view.width * part), 1), max(int(view.height * part), 1)))
-    return small
+    return between if len(between) >= count / 2 else given
+
+
+def _small(view: Camera) -> Camera:
+    """The view in no more pixels than tell a level's error."""
+    part = min(math.sqrt(_PIXELS / (view.width * view.height)), 1.0)
+    return resized(view, max(int(view.width * part), 1), max(int(view.height * part), 1))
 
 
 def coverage(view: Camera, boxes: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ import potr_cl
 from potr_cl import Scene, UsageError, cli
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.formats import load_scene
-from potr_cl.levels.errors import MeasuredErrors, SharedOut, coverage, measuring_views
+from potr_cl.levels.errors import MeasuredErrors, SharedOut, coverage, errors_a_coverage, measuring_views
 from potr_cl.model.camera import camera_centres, train_views
 from potr_cl.model.views_between import views_between
 from potr_cl.opencl.device import Device
@@ -219,12 +219,20 @@ def test_an_error_times_what_the_leaf_covers_is_what_it_adds(plush_excerpt, plus
     scenes = [plush_excerpt, fewer]
     boxes = np.concatenate([plush_excerpt.means.min(axis=0), plush_excerpt.means.max(axis=0)])[None]
     leaves = np.zeros(len(plush_excerpt), np.int64)
-    errors = MeasuredErrors(device, views, plush_excerpt).of_leaves(scenes.__getitem__, 2, leaves, boxes)
-    assert errors[0, 0] == 0
     views = measuring_views(plush_excerpt, views)
-    covered = np.mean([coverage(view, boxes)[0] for view in views])
-    (whole,) = mean_squared_errors(device, plush_excerpt, [fewer], views)
-    assert errors[0, 1] * covered == pytest.approx(whole, rel=1e-5)
+    errors = MeasuredErrors(device, views, plush_excerpt, between=views).of_leaves(scenes.__getitem__, 2, leaves, boxes)
+    assert errors[0, 0] == 0
+    covered = np.array([coverage(view, boxes)[0] for view in views])
+    each = [mean_squared_errors(device, plush_excerpt, [fewer], [view])[0] for view in views]
+    per_coverage = np.array(each) / covered
+    per_coverage[per_coverage.argmax()] = np.sort(per_coverage)[-2]
+    assert errors[0, 1] == pytest.approx((per_coverage * covered).sum() / covered.sum(), rel=1e-5)
+
+
+def test_one_view_within_a_leaf_does_not_tell_its_error():
+    parts, covered = np.full((9, 2, 1), 1e-4), np.full((9, 2), 0.1)
+    parts[3, 1], covered[3, 1] = 0.5, 1
+    assert np.allclose(errors_a_coverage(parts, covered), 1e-3)
 
 
 def test_errors_are_measured_where_no_level_was_made_for(plush_excerpt, plush_excerpt_cameras):
