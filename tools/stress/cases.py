@@ -33,6 +33,8 @@ F64 = NDArray[np.float64]
 
 #: Conjugate-gradient steps of a re-fit: more than it needs.
 REFIT_STEPS = 200
+#: Splats of a tile, and layers of a pixel, in the cases with many; the tests take fewer.
+MANY = 5000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,7 +75,7 @@ class RefitCase:
 def known_cases() -> Iterator[Case]:
     """What scenes and users come up with at their worst."""
     near, ahead = np.float32(INRIA.near), straight_camera()
-    colours = np.random.default_rng(1).uniform(0, 1, (5000, 3))
+    colours = np.random.default_rng(1).uniform(0, 1, (MANY, 3))
     for label, depth in (
         ("in the camera centre", 0.0),
         ("behind", -0.2),
@@ -101,9 +103,9 @@ def known_cases() -> Iterator[Case]:
         scene = dataclasses.replace(scene, quaternions=unit * np.float32(length))
         yield Case(f"quaternions {length:g} long", scene, tilted_camera(11, 40, 40))
     rng = np.random.default_rng(2)
-    layers = np.zeros((5000, 3))
-    layers[:, 2] = rng.uniform(1, 5, 5000)
-    yield Case("5000 layers of alpha 0.0055", plain_splats(layers, 5, -5.2, colours), straight_camera(4, 4))
+    layers = np.zeros((MANY, 3))
+    layers[:, 2] = rng.uniform(1, 5, MANY)
+    yield Case(f"{MANY} layers of alpha 0.0055", plain_splats(layers, 5, -5.2, colours), straight_camera(4, 4))
     for in_front in (0, 10, 100, 300):
         yield layered(in_front)
     alike = plain_splats(np.tile([0.0, 0, 2], (40, 1)), 0.2, -2, colours[:40])
@@ -136,8 +138,8 @@ def known_cases() -> Iterator[Case]:
         yield Case(name, random_splats(100, degree, seed=degree), tilted_camera(degree, 45, 37), rules)
     for seed in range(3):
         yield Case("extremes of every parameter", extremes(300), tilted_camera(seed, 40, 30))
-    means = np.concatenate([rng.uniform(-0.05, 0.05, (5000, 2)), rng.uniform(1, 2, (5000, 1))], axis=1)
-    yield Case("a tile with 5000 intersections", plain_splats(means, 1e-3, -2, colours), straight_camera(4, 4))
+    means = np.concatenate([rng.uniform(-0.05, 0.05, (MANY, 2)), rng.uniform(1, 2, (MANY, 1))], axis=1)
+    yield Case(f"a tile with {MANY} intersections", plain_splats(means, 1e-3, -2, colours), straight_camera(4, 4))
 
 
 def layered(in_front: int) -> Case:

@@ -97,9 +97,10 @@ except MemoryError:
 
 #: And what ends the process: the exit codes.
 ENDS = {
-    "hang": ("while True: pass", -27),
-    "segmentation fault": ("os.kill(os.getpid(), signal.SIGSEGV)", -11),
-    "abort": ("os.abort()", -6),
+    # Of the processor's time, or on a busy machine of the clock's, which comes first then.
+    "hang": ("while True: pass", (-27, -14)),
+    "segmentation fault": ("os.kill(os.getpid(), signal.SIGSEGV)", (-11,)),
+    "abort": ("os.abort()", (-6,)),
 }
 
 
@@ -122,7 +123,7 @@ def test_the_judge_sees(what, verdicts):
 
 @pytest.mark.parametrize("what", ENDS)
 def test_what_ends_the_process(what, verdicts):
-    assert verdicts[what] == ENDS[what][1]
+    assert verdicts[what] in ENDS[what][1]
 
 
 @pytest.mark.parametrize("form", FORMATS)

@@ -56,6 +56,7 @@ def test_a_curve_is_measured_written_and_continued(monkeypatch, folder, tmp_path
     assert f"| {points[0]['psnr']:.2f} |" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_series_of_the_sweeps_options_and_their_gaps(monkeypatch, folder, tmp_path, capsys):
     _, options = rate_distortion.parse_series("lazy:preset=fast,prune.tolerance=0.1,prune.iterations=8")
     lazy = rate_distortion.encode_options({**options, "q": 0.4})
@@ -131,6 +132,7 @@ def test_interpolation_along_a_curve():
     assert rate_distortion.size_at(points, "psnr", 45.1) is None
 
 
+@pytest.mark.slow
 def test_tables_of_curves_and_formats(monkeypatch, folder, tmp_path, capsys):
     """What docs/benchmarks shows of a measurement, and of formats that were measured before it."""
     out, kept = tmp_path / "out.json", tmp_path / "kept.json"
@@ -187,6 +189,7 @@ def test_rgb_streams_keep_r_g_and_b():
     assert ablation.from_channels(steps).sh.dtype == np.float32
 
 
+@pytest.mark.slow
 def test_ablation(monkeypatch, folder, tmp_path, capsys):
     out = tmp_path / "out.json"
     call(monkeypatch, ablation, "measure", folder, "--json", out)
