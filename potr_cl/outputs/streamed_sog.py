@@ -18,14 +18,17 @@ from numpy.typing import NDArray
 
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes import sog_levels
+from potr_cl.formats.scenes.sog_images import DESCRIPTION as SOG_DESCRIPTION
 from potr_cl.formats.scenes.sog_levels import DESCRIPTION
-from potr_cl.model.scene import Scene
+from potr_cl.model.scene import Scene, joined
 from potr_cl.outputs.level_folder import LevelFolder, archive
 from potr_cl.outputs.lod_tree import Node, lod_tree
 from potr_cl.outputs.output import LevelErrors, Output
 from potr_cl.outputs.sog import Sog
 from potr_cl.outputs.sog_chunks import SogChunks
 
+#: The folder of what viewers always show.
+_ENVIRONMENT = "env"
 #: Digits of an error.
 _DIGITS = 7
 
@@ -50,9 +53,18 @@ class StreamedSog(LevelFolder, Sog):
         read = cache(lambda level: self.of_level().read(files[level], trust=True))
         limits, count = self.limits, self.limits.splats
         scenes: list[Scene] = [read(level) for level in range(len(files))]
-        tree = lod_tree(scenes, limits)
+        far = [errors.far(scene) for scene in scenes]
+        near = [~each if far[0].any() else np.ones(len(each), bool) for each in far]
+        sky = np.flatnonzero(~near[0])
+        tree = lod_tree(scenes, limits, near)
         leaves = list(tree.leaves())
-        lost = errors.of_leaves(read, len(files), _numbers(leaves, len(scenes[0])), _boxes(leaves))
+
+        def shown(level: int) -> Scene:
+            if not level or not len(sky):
+                return scenes[level]
+            return joined([scenes[level].subset(np.flatnonzero(near[level])), scenes[0].subset(sky)])
+
+        lost = errors.of_leaves(shown, len(files), _numbers(leaves, len(scenes[0])), _boxes(leaves))
         folder: dict[str, bytes] = {}
         filenames: list[str] = []
         places: list[dict[str, dict[str, int]]] = [{} for _ in leaves]
@@ -66,14 +78,16 @@ class StreamedSog(LevelFolder, Sog):
                     offset += len(rows)
                 own = chunks.folder(np.concatenate([leaves[leaf].rows[level] for leaf in chunk]))
                 folder |= {f"{name}/{file}": content for file, content in own.items()}
-                filenames.append(f"{name}/meta.json")
+                filenames.append(f"{name}/{SOG_DESCRIPTION}")
+            if len(sky) and not level:
+                folder |= {f"{_ENVIRONMENT}/{file}": content for file, content in chunks.folder(sky).items()}
         told = iter(zip(places, lost.tolist(), strict=True))
 
         def of_leaf(_: Node) -> dict[str, Any]:
             lods, own = next(told)
             return {"lods": lods, "errors": [float(f"{error:.{_DIGITS}g}") for error in own]}
 
-        counts = [len(scene) for scene in scenes]
+        counts = [int(np.count_nonzero(each)) for each in near]
         asset = {"generator": "potr_cl", "chunkGaussians": count, "chunkExtent": self.lod_chunk_extent}
         meta = {
             "version": 1,
@@ -82,6 +96,7 @@ class StreamedSog(LevelFolder, Sog):
             "counts": counts,
             "lodLevels": len(files),
             "lodErrors": True,
+            **({"environment": f"{_ENVIRONMENT}/{SOG_DESCRIPTION}"} if len(sky) else {}),
             "filenames": filenames,
             "tree": tree.document(of_leaf),
         }
@@ -93,8 +108,8 @@ class StreamedSog(LevelFolder, Sog):
 
 
 def _numbers(leaves: Sequence[Node], splats: int) -> NDArray[np.int64]:
-    """(N,) in which leaf each splat of the finest level is."""
-    found = np.zeros(splats, np.int64)
+    """(N,) in which leaf each splat of the finest level is; as many as there are leaves: in the environment."""
+    found = np.full(splats, len(leaves), np.int64)
     for number, leaf in enumerate(leaves):
         found[leaf.rows[0]] = number
     return found

@@ -139,6 +139,9 @@ def files(plush_excerpt: Scene, tmp_path_factory: Any) -> tuple[Path, Path]:
     """Streamed SOG and a .potr, with levels that are the first splats of the scene."""
 
     class Told:
+        def far(self, scene: Scene) -> Any:
+            return np.zeros(len(scene), bool)
+
         def of_level(self, level: int) -> float:
             return float(level)
 
