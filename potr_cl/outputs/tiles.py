@@ -51,7 +51,7 @@ class Tiles(LevelFolder, Gltf):
         """An archive of the folder."""
         scenes = [self.of_level().read(data, trust=True) for data in files]
         packed = [gltf_file.spz_in(data) for data in files]
-        lost = [_PIXELS * errors.of_level(level) for level in range(len(files))]
+        lost = np.maximum.accumulate([_PIXELS * errors.of_level(level) for level in range(len(files))]).tolist()
         tree = lod_tree(scenes, self.limits)
         folder: dict[str, bytes] = {}
         numbers = iter(range(len(files) * len(list(tree.leaves()))))

@@ -69,7 +69,7 @@ def called(capsys, *arguments):
         ([], "a command is missing: encode, prune, "),
         (["encod", "a.ply"], "unknown command 'encod': did you mean encode?"),
         (["a.ply"], "to compress a scene: potr-cl encode a.ply -o OUT.potr"),
-        (["encode"], '.html or lod-meta.json, a folder, or "-" for standard output) is missing (see'),
+        (["encode"], '.html, lod-meta.json or tileset.json, a folder, or "-" for standard output) is missing (see'),
         (["encode", "a.ply", "--outptu", "b"], "unknown option '--outptu': did you mean --output OUT.potr?"),
         (["encode", "a.ply", "--camras=b", "-o", "c"], "did you mean --cameras PATH?"),
         (["encode", "a.ply", "--bananas", "-o", "c"], "unknown option '--bananas'"),

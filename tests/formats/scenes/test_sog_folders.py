@@ -74,7 +74,9 @@ def test_what_a_folder_lacks(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no description of a SOG scene: it has 5242880 bytes"):
         load_scene(folder)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(UsageError, match=r"has no scene: there is no .ply in it, and no meta.json or lod-"):
+    with pytest.raises(
+        UsageError, match=r"has no scene: there is no .ply in it, and no meta.json, lod-meta.json or tileset.json"
+    ):
         load_scene(tmp_path / "empty")
 
 
