@@ -33,6 +33,9 @@ logger = logging.getLogger("potr_cl")
 #: Threads that load programs at a time; drivers build one after another, whatever the threads.
 _BUILDERS = 2
 
+#: Work-items of sub-groups, the narrowest first. pyopencl cannot ask which ones a device has.
+_SUB_GROUPS = (8, 16)
+
 #: Bytes that the driver fills; more are filled by a kernel, with work-groups of so many work-items.
 _FILLED, _FILLING = 1 << 30, 256
 
@@ -64,6 +67,7 @@ class Device:
         info, context, queue.
         family: "cpu" or "gpu".
         vector_width: floats a vector of the CPU kernels has; asked of the device and proved by a build.
+        sub_group: work-items of the narrowest sub-group, of GPUs whose kernels can choose one; None elsewhere.
         allocated: bytes taken with :meth:`allocate` and not freed.
         pieces: cuts launches that would take too long; None where they may take as long as they like.
         timings: (kernel name, event) of the launches since the list was last cleared; empty without profiling.
@@ -118,12 +122,16 @@ class Device:
                 f"device {self.info} supports work-groups of only {self.info.max_work_group} work-items; 256 are "
                 "required: choose another with --device"
             )
+        self.sub_group: int | None = None
+        self.sub_group = self._narrowest_sub_group()
         self.vector_width = self._proven_vector_width()
         self.native_exp2 = self.family == "gpu" and self._native_exp2_is_exact()
 
     @property
-    def _in_pieces(self) -> list[str]:
-        return [] if self.pieces is None else ["-DIN_PIECES=1"]
+    def _of_device(self) -> list[str]:
+        """Macros that every program gets for what the device is like."""
+        pieces = [] if self.pieces is None else ["-DIN_PIECES=1"]
+        return pieces if self.sub_group is None else [*pieces, f"-DSUB_GROUP={self.sub_group}"]
 
     @property
     def several_queues(self) -> bool:
@@ -195,7 +203,7 @@ class Device:
                     options = [
                         "-cl-std=CL1.2",
                         *self._build_options,
-                        *self._in_pieces,
+                        *self._of_device,
                         *(f"-D{name}={value}" for name, value in macros),
                     ]
                     text = kernel_source(source, self._variants)
@@ -402,6 +410,19 @@ class Device:
                 logger.debug("vectors of %d floats: %s", width, error)
             width = {16: 8, 8: 4, 4: 1}[width]
         return 1
+
+    def _narrowest_sub_group(self) -> int | None:
+        """The least of Intel's sizes that builds: work-items have most registers then (cl/include/registers.clh)."""
+        if self.info.kind != "gpu" or "cl_intel_required_subgroup_size" not in self.info.handle.extensions:
+            return None
+        for self.sub_group in _SUB_GROUPS:
+            try:
+                self._native_exp2_is_exact()
+            except DeviceError as error:
+                logger.debug("sub-groups of %d work-items: %s", self.sub_group, error)
+            else:
+                return self.sub_group
+        return None
 
     def _native_exp2_is_exact(self) -> bool:
         """Whether ``native_exp2`` is good to a few units in the last place where alpha needs it."""

@@ -243,3 +243,26 @@ def test_memory_in_use_is_given_back_when_the_device_is_done() -> None:
     assert last.command_execution_status == cl.command_execution_status.COMPLETE
     there.free(more)
     assert there.allocated == 0
+
+
+def test_the_narrowest_sub_groups_are_found_by_trial(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where kernels can choose how wide they are; a CPU's runtime can say so, too, but its kernels need not."""
+    info = dataclasses.replace(choose_device(), kind="gpu")
+    if "cl_intel_required_subgroup_size" not in info.handle.extensions:
+        pytest.skip("no device here whose kernels can choose")
+    assert Device(family="gpu").sub_group is None
+    assert Device(info, family="gpu").sub_group == 8
+    builds, exact = [], Device._native_exp2_is_exact
+
+    def fails_once(device: Device) -> bool:
+        builds.append(device.sub_group)
+        if builds == [8]:
+            raise DeviceError("refused")
+        return exact(device)
+
+    monkeypatch.setattr(Device, "_native_exp2_is_exact", fails_once)
+    wide = Device(info, family="gpu")
+    assert wide.sub_group == 16
+    assert builds == [8, 16, 16]
+    program = wide.program("opencl/probe.cl", LANES=1)
+    assert "-DSUB_GROUP=16" in program.get_build_info(info.handle, cl.program_build_info.OPTIONS)

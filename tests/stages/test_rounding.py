@@ -8,6 +8,7 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
+from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import ColourGrid
 from potr_cl.stages.refitting.blocks import TURNS, Round, Rounding, SplatBlocks, Steps
 from potr_cl.stages.refitting.colour_refit import ColourRefit
@@ -200,3 +201,22 @@ def test_few_splats(device, count):
     with Case(device, scene, visible_scene(5, 2, seed=7), ring_of_cameras(3, size=40)) as case:
         grid = dataclasses.replace(grid_of(count), order=np.arange(count))
         assert np.isfinite(fitted(case, grid)).all()
+
+
+@pytest.mark.parametrize("degree", [1, 3])
+def test_arrays_in_local_memory_hold_the_same(device, degree):
+    """GPUs with few registers have the splats' blocks there (cl/include/registers.clh)."""
+    if device.family != "gpu":
+        pytest.skip("only GPU kernels have arrays in local memory")
+    narrow = Device(device.info, family="gpu", build_options=["-DSUB_GROUP=8"])
+    narrow.sub_group = 8
+    scene, cameras = visible_scene(60, degree), ring_of_cameras(5, size=40)
+    options, found = RefitOptions(steps=10, gain=0, drop=1e-3), []
+    for each in (device, narrow):
+        with Case(each, scene, visible_scene(60, 2, 7), cameras) as case:
+            refitted = refit_colours(
+                each, scene, cameras, case.targets, options, colour_grid=lambda _: grid_of(len(scene))
+            )
+        found.append(refitted.sh)
+    assert (found[0] == 0).any()
+    assert np.array_equal(*found)

@@ -32,7 +32,8 @@ from tests.reference.gpu_programs import gpu_programs, gpu_sources
 from tools.results import Cell, Results
 
 AMD = ("gfx906", "gfx90a", "gfx1030", "gfx1100", "gfx1201")
-INTEL = ("tgllp", "dg2", "pvc")
+#: Work-items of the narrowest sub-group of each (cl/include/registers.clh).
+INTEL = {"tgllp": 8, "dg2": 8, "pvc": 16}
 APPLE = "apple"
 _VERSIONS = (19, 18, 17, 16)
 _CHECKED = ("-pedantic", "-Wall", "-Werror", "-Wno-unused-function", "-Wno-gnu-line-marker", "-Wno-unused-variable")
@@ -137,7 +138,7 @@ def compile_for_intel(program: Program, target: str, file: Path) -> dict[str, Us
     Raises:
         OfflineError: the compiler refuses it.
     """
-    options = " ".join(["-cl-std=CL1.2", *program.defines])
+    options = " ".join(["-cl-std=CL1.2", *program.defines, f"-DSUB_GROUP={INTEL[target]}"])
     with tempfile.TemporaryDirectory() as folder:
         said = _run(
             [_ocloc() or "", "compile", "-file", str(file), "-device", target, "-options", options, "-out_dir", folder],

@@ -17,6 +17,7 @@
        (LOW_PASS_SQUARED=0.01f). */
 
 #include "include/reals.clh"
+#include "include/registers.clh"
 #include "include/splat.clh"
 #include "include/view_set.clh"
 #include "include/sh_basis.clh"
@@ -77,7 +78,7 @@ inline void add_to(global float *column, size_t index, vint seen, vfloat value)
     VSTORE(VLOAD(index, column) + kept, index, column);
 }
 
-kernel void chain(
+kernel NARROW void chain(
     global const float *means,
     global const float *scales,
     global const float *quaternions,

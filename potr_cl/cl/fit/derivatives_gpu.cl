@@ -16,6 +16,7 @@
        INT64_ATOMICS=0,1. */
 
 #include "include/group.clh"
+#include "include/registers.clh"
 #include "include/subtile_lists.clh"
 #include "fit/sums.clh"
 
@@ -27,7 +28,7 @@
    four sub-tiles, each at another splat, read from different banks. */
 #define PAIR(subtile, j, i) (((subtile) * ROUND + (j)) * AREA + (((i) + 2 * (j) + (subtile)) & (AREA - 1)))
 
-kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1)))
+kernel NARROW __attribute__((reqd_work_group_size(ITEMS, 1, 1)))
 void derivatives(
     global const SetView *views,
     uint stride,

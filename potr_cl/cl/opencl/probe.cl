@@ -5,6 +5,7 @@
    On GPUs: LANES=1,4,8,16 NATIVE_EXP2=-,1. */
 
 #include "include/lanes.clh"
+#include "include/registers.clh"
 
 kernel void probe_rows(global const float *values, global float *result)
 {
@@ -25,7 +26,7 @@ kernel void probe_digits(global const float *values, global int *result)
 }
 
 #if LANES == 1
-kernel void probe_native_exp2(global const float *values, global float *result)
+kernel NARROW void probe_native_exp2(global const float *values, global float *result)
 {
     const size_t i = get_global_id(0);
     result[i] = native_exp2(values[i]);

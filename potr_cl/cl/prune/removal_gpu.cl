@@ -21,6 +21,7 @@
 #define ROUND 8
 #define PADDING SHARE
 #include "include/group.clh"
+#include "include/registers.clh"
 #include "include/subtile_batches.clh"
 #include "prune/removal.clh"
 #include "prune/staleness_gpu.clh"
@@ -28,7 +29,7 @@
 /* As first_time: store the target, and measure nothing. */
 #define ONLY_TARGET 2
 
-kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1)))
+kernel NARROW __attribute__((reqd_work_group_size(ITEMS, 1, 1)))
 void removal(
     uint start,
     global const uint *tiles,

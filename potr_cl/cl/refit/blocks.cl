@@ -24,7 +24,7 @@
 
 /* result = the inverse of each splat's own block of the normal equations, restricted to the active coefficients, times
    residual: a Cholesky factorisation a channel, which is the second dimension. The squared lengths of Y, Co and Cg in R, G, B are 3, 2 and 3. */
-kernel void precondition(
+kernel NARROW void precondition(
     global const float *residual,
     global const float *blocks,
     global const uint *active,
@@ -48,7 +48,8 @@ kernel void precondition(
     const vfloat least = trace * (DAMPING * length / SH_COUNT);
     /* Row by row, U with U^T U = block. The diagonal holds the pivots' inverse square roots, and 0 for what is left
        out. */
-    vfloat factor[TRIANGLE], y[SH_COUNT];
+    ARRAY(factor, TRIANGLE);
+    ARRAY(y, SH_COUNT);
     UNROLL
     for (int j = 0; j < SH_COUNT; ++j) {
         const size_t column = 3 * j + c;
@@ -57,39 +58,38 @@ kernel void precondition(
         vfloat pivot = diagonal, rest = VLOAD(index, residual + column * stride);
         UNROLL
         for (int i = 0; i < j; ++i) {
-            pivot = FUSED(-factor[AT(i, j)], factor[AT(i, j)], pivot);
-            rest = FUSED(-factor[AT(i, j)], y[i], rest);
+            pivot = FUSED(-factor[OWN(AT(i, j))], factor[OWN(AT(i, j))], pivot);
+            rest = FUSED(-factor[OWN(AT(i, j))], y[OWN(i)], rest);
         }
         const vint keep = (pivot > LEAST_PIVOT * diagonal) && (pivot > 1e-30f);
         const vfloat inverse =
             (keep ? 1.0f / sqrt(pivot) : (vfloat)(0.0f)) * active_lanes(active, stride, index, column);
-        factor[AT(j, j)] = inverse;
-        y[j] = rest * inverse;
+        factor[OWN(AT(j, j))] = inverse;
+        y[OWN(j)] = rest * inverse;
         UNROLL
         for (int k = j + 1; k < SH_COUNT; ++k) {
             vfloat sum = length * VLOAD(index, blocks + AT(j, k) * stride);
             UNROLL
             for (int i = 0; i < j; ++i)
-                sum = FUSED(-factor[AT(i, j)], factor[AT(i, k)], sum);
-            factor[AT(j, k)] = sum * inverse * active_lanes(active, stride, index, 3 * k + c);
+                sum = FUSED(-factor[OWN(AT(i, j))], factor[OWN(AT(i, k))], sum);
+            factor[OWN(AT(j, k))] = sum * inverse * active_lanes(active, stride, index, 3 * k + c);
         }
     }
     UNROLL
     for (int j = SH_COUNT - 1; j >= 0; --j) {
         UNROLL
         for (int k = j + 1; k < SH_COUNT; ++k)
-            y[j] = FUSED(-factor[AT(j, k)], y[k], y[j]);
-        y[j] *= factor[AT(j, j)];
-        VSTORE(y[j], index, result + (3 * j + c) * stride);
+            y[OWN(j)] = FUSED(-factor[OWN(AT(j, k))], y[OWN(k)], y[OWN(j)]);
+        y[OWN(j)] *= factor[OWN(AT(j, j))];
+        VSTORE(y[OWN(j)], index, result + (3 * j + c) * stride);
     }
 }
 
 /* Where select_active keeps a splat's block, which it indexes while it runs: local memory where a work-item does one splat.
-   Registers would not hold it beside the others. GIVING_UP splats a work-group. */
+   Registers would not hold it beside the others. OWN_GROUP splats a work-group. */
 #if LANES == 1
-#define GIVING_UP 32
-#define BLOCK_MEMORY local float block[TRIANGLE * GIVING_UP]
-#define P(i, j) block[AT(i, j) * GIVING_UP + get_local_id(0)]
+#define BLOCK_MEMORY local float block[TRIANGLE * OWN_GROUP]
+#define P(i, j) block[AT(i, j) * OWN_GROUP + get_local_id(0)]
 #else
 #define BLOCK_MEMORY vfloat block[TRIANGLE]
 #define P(i, j) block[AT(i, j)]
@@ -99,7 +99,7 @@ kernel void precondition(
    long as that is less than `least`. The other coefficients of the channel make up for it as well as they can; all
    other splats stay as they are. With P the inverse of the block, the loss of x_m costs x_m^2 / P_mm, moves the others
    by -x_m P_jm / P_mm, and takes P_im P_jm / P_mm off P. A launch does channel c: flags of all channels share words. */
-kernel void select_active(
+kernel NARROW void select_active(
     global float *coefficients,
     global const float *blocks,
     global uint *active,
@@ -112,81 +112,83 @@ kernel void select_active(
     const float length = c == 1 ? 2.0f : 3.0f;
     /* Scaled to a unit diagonal; what is not active has an empty row and column. */
     BLOCK_MEMORY;
-    vfloat x[SH_COUNT], scale[SH_COUNT], keep[SH_COUNT];
+    ARRAY(x, SH_COUNT);
+    ARRAY(scale, SH_COUNT);
+    ARRAY(keep, SH_COUNT);
+    ARRAY(column, SH_COUNT);
     UNROLL
     for (int j = 0; j < SH_COUNT; ++j) {
         const vfloat diagonal = MAD(length, VLOAD(index, blocks + AT(j, j) * stride), (vfloat)(prior));
-        keep[j] = active_lanes(active, stride, index, 3 * j + c);
-        scale[j] = sqrt(fmax(diagonal, (vfloat)(1e-30f)));
-        x[j] = keep[j] * scale[j] * VLOAD(index, coefficients + (3 * j + c) * stride);
+        keep[OWN(j)] = active_lanes(active, stride, index, 3 * j + c);
+        scale[OWN(j)] = sqrt(fmax(diagonal, (vfloat)(1e-30f)));
+        x[OWN(j)] = keep[OWN(j)] * scale[OWN(j)] * VLOAD(index, coefficients + (3 * j + c) * stride);
     }
     UNROLL
     for (int i = 0; i < SH_COUNT; ++i)
         UNROLL
         for (int j = i; j < SH_COUNT; ++j) {
-            const vfloat product = length * VLOAD(index, blocks + AT(i, j) * stride) / (scale[i] * scale[j]);
-            P(i, j) = i == j ? (vfloat)(1.0f + UNIT_DAMPING) : product * keep[i] * keep[j];
+            const vfloat product = length * VLOAD(index, blocks + AT(i, j) * stride) / (scale[OWN(i)] * scale[OWN(j)]);
+            P(i, j) = i == j ? (vfloat)(1.0f + UNIT_DAMPING) : product * keep[OWN(i)] * keep[OWN(j)];
         }
     /* p becomes minus the inverse: one sweep a column, symmetric all the way. */
     for (int k = 0; k < SH_COUNT; ++k) {
-        vfloat column[SH_COUNT];
         UNROLL
         for (int j = 0; j < SH_COUNT; ++j)
-            column[j] = j < k ? P(j, k) : P(k, j);
+            column[OWN(j)] = j < k ? P(j, k) : P(k, j);
         const vfloat inverse = 1.0f / fmax(P(k, k), (vfloat)(UNIT_DAMPING));
         UNROLL
         for (int i = 0; i < SH_COUNT; ++i)
             UNROLL
             for (int j = i; j < SH_COUNT; ++j)
                 if (i == k || j == k)
-                    P(i, j) = i == j ? -inverse : column[i == k ? j : i] * inverse;
+                    P(i, j) = i == j ? -inverse : column[OWN(i == k ? j : i)] * inverse;
                 else
-                    P(i, j) = MAD(-column[i] * inverse, column[j], P(i, j));
+                    P(i, j) = MAD(-column[OWN(i)] * inverse, column[OWN(j)], P(i, j));
     }
     for (int round = 1; round < SH_COUNT; ++round) {
         vfloat best = (vfloat)(least);
         vint worst = (vint)(0);
         UNROLL
         for (int m = 1; m < SH_COUNT; ++m) {
-            const vfloat cost = x[m] * x[m] / fmax(-P(m, m), (vfloat)(1e-30f));
-            const vint cheaper = (keep[m] > 0.0f) && !(cost >= best);
+            const vfloat cost = x[OWN(m)] * x[OWN(m)] / fmax(-P(m, m), (vfloat)(1e-30f));
+            const vint cheaper = (keep[OWN(m)] > 0.0f) && !(cost >= best);
             best = cheaper ? cost : best;
             worst = cheaper ? (vint)(m) : worst;
         }
         if (!VANY(worst > 0))
             break;
-        vfloat column[SH_COUNT], value = (vfloat)(0.0f), pivot = (vfloat)(-1.0f);
+        vfloat value = (vfloat)(0.0f), pivot = (vfloat)(-1.0f);
         UNROLL
         for (int j = 0; j < SH_COUNT; ++j) {
-            column[j] = (vfloat)(0.0f);
+            column[OWN(j)] = (vfloat)(0.0f);
             UNROLL
             for (int m = 1; m < SH_COUNT; ++m)
-                column[j] = worst == m ? (j < m ? P(j, m) : P(m, j)) : column[j];
+                column[OWN(j)] = worst == m ? (j < m ? P(j, m) : P(m, j)) : column[OWN(j)];
         }
         UNROLL
         for (int m = 1; m < SH_COUNT; ++m) {
-            value = worst == m ? x[m] : value;
+            value = worst == m ? x[OWN(m)] : value;
             pivot = worst == m ? P(m, m) : pivot;
-            keep[m] = worst == m ? (vfloat)(0.0f) : keep[m];
+            keep[OWN(m)] = worst == m ? (vfloat)(0.0f) : keep[OWN(m)];
         }
         const vfloat inverse = 1.0f / fmin(pivot, (vfloat)(-1e-30f));
         UNROLL
         for (int i = 0; i < SH_COUNT; ++i) {
-            x[i] = (MAD(-column[i] * inverse, value, x[i])) * (i ? keep[i] : (vfloat)(1.0f));
+            x[OWN(i)] = (MAD(-column[OWN(i)] * inverse, value, x[OWN(i)])) * (i ? keep[OWN(i)] : (vfloat)(1.0f));
             UNROLL
             for (int j = i; j < SH_COUNT; ++j)
-                P(i, j) = MAD(-column[i] * inverse, column[j], P(i, j));
+                P(i, j) = MAD(-column[OWN(i)] * inverse, column[OWN(j)], P(i, j));
         }
     }
     UNROLL
     for (int j = 0; j < SH_COUNT; ++j) {
         const size_t column = 3 * j + c;
-        const vfloat was = VLOAD(index, coefficients + column * stride), value = x[j] / scale[j];
+        const vfloat was = VLOAD(index, coefficients + column * stride), value = x[OWN(j)] / scale[OWN(j)];
         const vint changed = active_lanes(active, stride, index, column) > 0.0f;
         VSTORE(
             changed ? (fabs(value) < 1e30f ? value : (vfloat)(0.0f)) : was, index, coefficients + column * stride);
         float kept[LANES];
-        VSTORE(keep[j], 0, kept);
+        VSTORE(keep[OWN(j)], 0, kept);
         for (int lane = 0; lane < LANES; ++lane)
             if (j && kept[lane] == 0.0f)
                 active[(column / 24) * stride + index * LANES + lane] &= ~(1u << (column % 24));

@@ -15,10 +15,11 @@
 #define PART float4
 #define ROUND 4
 #include "include/group.clh"
+#include "include/registers.clh"
 #include "include/subtile_batches.clh"
 #include "refit/refit.clh"
 
-kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1)))
+kernel NARROW __attribute__((reqd_work_group_size(ITEMS, 1, 1)))
 void refit_sweep(
     global const SetView *views,
     uint stride,

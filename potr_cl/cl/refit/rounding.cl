@@ -40,7 +40,7 @@ inline vfloat cheap_level(vfloat value, vfloat squared, float to_zero)
    beside the factorisation, more than any GPU has. Flags of all channels share words.
 
    steps: of AC coefficients, one a splat. to_zero: a weighted squared error, see cheap_level. */
-kernel void round_ac(
+kernel NARROW void round_ac(
     global float *coefficients,
     global const float *blocks,
     global uint *active,
@@ -51,6 +51,10 @@ kernel void round_ac(
     float to_zero,
     int c)
 {
+    ARRAY(factor, TRIANGLE);
+    ARRAY(pivots, SH_COUNT);
+    ARRAY(free, SH_COUNT);
+    ARRAY(error, SH_COUNT);
     const size_t index = get_global_id(0);
     const vint due = due_lanes(turns, index, turn);
     if (!VANY(due))
@@ -62,32 +66,29 @@ kernel void round_ac(
         trace += VLOAD(index, blocks + AT(i, i) * stride);
     const float length = c == 1 ? 2.0f : 3.0f;
     const vfloat more = trace * (DAMPING * length / SH_COUNT) + FLOOR;
-    vfloat free[SH_COUNT];
     UNROLL
     for (int j = 0; j < SH_COUNT; ++j)
-        free[j] = active_lanes(active, stride, index, 3 * j + c);
+        free[OWN(j)] = active_lanes(active, stride, index, 3 * j + c);
     /* U with U^T U = block, row by row; rows of what is not free are empty. `pivots` are squares of U's diagonal,
        and what stands beside the diagonal is divided by it. */
-    vfloat factor[TRIANGLE], pivots[SH_COUNT];
     UNROLL
     for (int j = 0; j < SH_COUNT; ++j) {
         const vfloat diagonal = MAD((vfloat)(length), VLOAD(index, blocks + AT(j, j) * stride), more);
         vfloat pivot = diagonal;
         UNROLL
         for (int i = 0; i < j; ++i)
-            pivot = MAD(-pivots[i] * factor[AT(i, j)], factor[AT(i, j)], pivot);
-        pivots[j] = fmax(pivot, more) * free[j];
-        const vfloat inverse = pivots[j] > 0.0f ? 1.0f / pivots[j] : (vfloat)(0.0f);
+            pivot = MAD(-pivots[OWN(i)] * factor[OWN(AT(i, j))], factor[OWN(AT(i, j))], pivot);
+        pivots[OWN(j)] = fmax(pivot, more) * free[OWN(j)];
+        const vfloat inverse = pivots[OWN(j)] > 0.0f ? 1.0f / pivots[OWN(j)] : (vfloat)(0.0f);
         UNROLL
         for (int k = j + 1; k < SH_COUNT; ++k) {
             vfloat sum = length * VLOAD(index, blocks + AT(j, k) * stride);
             UNROLL
             for (int i = 0; i < j; ++i)
-                sum = MAD(-pivots[i] * factor[AT(i, j)], factor[AT(i, k)], sum);
-            factor[AT(j, k)] = sum * inverse * free[k];
+                sum = MAD(-pivots[OWN(i)] * factor[OWN(AT(i, j))], factor[OWN(AT(i, k))], sum);
+            factor[OWN(AT(j, k))] = sum * inverse * free[OWN(k)];
         }
     }
-    vfloat error[SH_COUNT];
     UNROLL
     for (int j = SH_COUNT - 1; j >= 0; --j) {
         const size_t column = 3 * j + c;
@@ -95,15 +96,15 @@ kernel void round_ac(
         vfloat wanted = was;
         UNROLL
         for (int k = j + 1; k < SH_COUNT; ++k)
-            wanted = MAD(factor[AT(j, k)], error[k], wanted);
+            wanted = MAD(factor[OWN(AT(j, k))], error[OWN(k)], wanted);
         vfloat held = wanted;
+        /* What no view shows is left as it is, though it costs nothing. */
+        const vfloat squared = trace > 0.0f ? pivots[OWN(j)] * step * step : (vfloat)(1e30f);
         if (j)
-            /* What no view shows is left as it is, though it costs nothing. */
-            held =
-                step * cheap_level(wanted / step, trace > 0.0f ? pivots[j] * step * step : (vfloat)(1e30f), to_zero);
-        const vint changed = due && free[j] > 0.0f && fabs(held) < 1e30f;
+            held = step * cheap_level(wanted / step, squared, to_zero);
+        const vint changed = due && free[OWN(j)] > 0.0f && fabs(held) < 1e30f;
         held = changed ? held : was;
-        error[j] = was - held;
+        error[OWN(j)] = was - held;
         VSTORE(held, index, coefficients + column * stride);
         int lanes[LANES];
         VSTORE(due, 0, lanes);

@@ -14,6 +14,7 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.model.scene import FloatArray
+from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.outputs.output import ColourGrid
 from potr_cl.raster.scene_buffers import SPLAT_GROUP
@@ -21,8 +22,13 @@ from potr_cl.stages.refitting.coefficients import Coefficients, Vector
 from potr_cl.stages.refitting.sliced_arrays import CHANNELS, Ridge
 
 _SOURCE = "refit/blocks.cl"
-#: Splats of a work-group, GIVING_UP of the kernels.
-_GIVING_UP = 32
+#: Splats of a work-group of kernels that have arrays in local memory, OWN_GROUP of theirs.
+_OWN_GROUP = 32
+
+
+def _group(device: Device) -> dict[str, int]:
+    """The work-group of kernels that have them there on some GPUs only (cl/include/registers.clh)."""
+    return {} if device.sub_group is None else {"group": _OWN_GROUP}
 
 
 class SplatBlocks:
@@ -95,7 +101,7 @@ class SplatBlocks:
                 result=part[result],
                 **ridge.scalars,
             )
-            part.run(self._precondition, CHANNELS)
+            part.run(self._precondition, CHANNELS, **_group(self._coefficients.device))
 
     def give_up(self, x: Vector, prior: float, least: float) -> None:
         """Set AC coefficients that cost less than ``least`` to 0 and make them inactive.
@@ -120,7 +126,7 @@ class SplatBlocks:
                     least=np.float32(least),
                     c=channel,
                 )
-                part.run(self._select_active, group=_GIVING_UP)
+                part.run(self._select_active, group=_OWN_GROUP)
 
 
 _ROUNDING = "refit/rounding.cl"
@@ -225,6 +231,6 @@ class Rounding(Owner):
                     to_zero=np.float32(worth),
                     c=channel,
                 )
-                part.run(self._round_ac)
+                part.run(self._round_ac, **_group(self._coefficients.device))
             self._round_constant.bind(**own, steps=part[self._constant], turn=this.constant)
             part.run(self._round_constant)
