@@ -26,9 +26,9 @@ from potr_cl.opencl.source import kernel_source
 
 #: Of the allowed time, what a piece should take: the next work-groups may have more to do than the last.
 _AIM = 0.4
-#: A piece has at most so many times the work-groups of the one before, and at most so great a part of those of a launch.
+#: A piece has at most so many times the work-groups of the one before, and of a launch's at most one part in so many.
 _GROWTH, _PARTS = 4, 16
-#: What is left of a kernel's slowest piece after each launch; pieces below this part of the aim tell of launching alone.
+#: What is left of the slowest piece's rate at the next launch; pieces below this part of the aim tell of launching alone.
 _MEMORY, _TELLING = 0.9, 1 / 16
 #: Work-groups of a first piece for each compute unit; how many launches of a short kernel go unmeasured.
 _FIRST, _UNMEASURED = 2, 15
