@@ -39,6 +39,13 @@ settings.register_profile("explore", deadline=None, suppress_health_check=[Healt
 settings.load_profile("potr_cl")
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_cmdline_main(config: pytest.Config) -> None:
+    """With ``-n`` each worker takes tests that stand together, so what a module has made once is rarely made twice."""
+    if getattr(config.option, "numprocesses", None) and config.option.dist == "no":
+        config.option.dist = "worksteal"
+
+
 def pytest_collection_finish() -> None:
     """What is there now stays: the garbage collection, which each device that is opened asks for, need not look at it.
 

@@ -6,7 +6,8 @@ do with the same options (docs/python.md has examples):
 - :func:`encode`, :func:`decode`: to a .potr file and back; :class:`EncodeOptions`, all options of an encode at once;
 - :func:`decode_to_device`: a .potr file in the memory of an OpenCL device, for a renderer that runs there;
 - :func:`prune`, :func:`compact`, :func:`refit`: one stage alone, from a scene to a scene;
-- :func:`render`, :func:`compare`: pictures of a scene, and one scene judged by another's;
+- :func:`render`, :func:`compare`: pictures of a scene, and one scene judged by another's; :func:`compare_budgets`,
+  levels of detail;
 - :func:`read_scene`, :func:`read_cameras`, :func:`save`, :func:`convert`, :func:`info`: files, of all formats;
 - :func:`place_cameras`, :func:`look_around`, :func:`turntable`: views for a scene that comes without any;
 - :func:`encode_ladder`, a scene at several qualities; :func:`view`, a page in the browser that shows scenes;
@@ -26,6 +27,7 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
+    from potr_cl.api.budgets import BudgetComparison, compare_budgets
     from potr_cl.api.choices import EncodeChoices
     from potr_cl.api.comparing import SceneComparison, compare
     from potr_cl.api.describing import SceneInfo, info
@@ -67,6 +69,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
+    "BudgetComparison",
     "Camera",
     "CompactedScene",
     "DataError",
@@ -93,6 +96,7 @@ __all__ = [
     "__version__",
     "compact",
     "compare",
+    "compare_budgets",
     "convert",
     "decode",
     "decode_to_device",
@@ -119,6 +123,7 @@ __all__ = [
 
 #: Imported on first use: the OpenCL loader and NumPy are not everybody's who asks for the version.
 _NAMES = {
+    "api.budgets": "BudgetComparison compare_budgets",
     "api.choices": "EncodeChoices",
     "api.comparing": "SceneComparison compare",
     "api.describing": "SceneInfo info",

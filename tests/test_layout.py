@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -36,12 +36,12 @@ FOLDERS: dict[str, set[str]] = {
     },
     "pipeline": {
         "errors", "host", "model", "opencl", "placement",
-        "raster", "views", "workers", "codec", "formats", "stages", "quality", "outputs",
+        "raster", "views", "workers", "codec", "stages", "quality", "outputs",
     },
     "levels": {
         "errors", "host", "model", "opencl", "raster", "workers", "stages", "quality", "pipeline",
     },
-    "report": {"plain_text", "errors", "host", "model", "opencl", "codec", "formats", "quality", "pipeline"},
+    "report": {"plain_text", "errors", "model", "opencl", "codec", "formats", "quality", "pipeline"},
     "viewer": {"plain_text", "errors", "host", "model", "opencl", "raster", "formats", "quality", "report"},
     "api": {
         "plain_text", "errors", "host", "model", "opencl", "placement",
@@ -66,32 +66,47 @@ def sources(folder: str) -> list[Path]:
     return found
 
 
-def imports(path: Path, only_at_import: bool = False) -> Iterator[tuple[str, int]]:
+@functools.cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text("utf-8"))
+
+
+@functools.cache
+def is_module(name: str) -> bool:
+    place = ROOT.joinpath(*name.split("."))
+    return place.with_suffix(".py").exists() or place.is_dir()
+
+
+def statements(node: ast.AST, only_at_import: bool) -> list[ast.Import | ast.ImportFrom]:
+    """The import statements below a node; they stand in bodies, never in expressions, which are not looked into."""
+    found: list[ast.Import | ast.ImportFrom] = []
+    blocks = [getattr(node, name, []) for name in ("body", "orelse", "finalbody", "handlers", "cases")]
+    for child in (child for block in blocks if isinstance(block, list) for child in block):
+        late = isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef))
+        typing = isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test)
+        if isinstance(child, (ast.Import, ast.ImportFrom)):
+            found.append(child)
+        elif not (only_at_import and (late or typing)):
+            found += statements(child, only_at_import)
+    return found
+
+
+@functools.cache
+def imports(path: Path, only_at_import: bool = False) -> list[tuple[str, int]]:
     """Modules that a file imports, and where: anywhere in it, or just what runs when it is imported itself.
 
     ``from a import b`` counts as ``a.b`` where that is a module, else as ``a``.
     """
-
-    def walk(node: ast.AST) -> Iterator[ast.AST]:
-        for child in ast.iter_child_nodes(node):
-            late = isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
-            typing = isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test)
-            if only_at_import and (late or typing):
-                continue
-            yield child
-            yield from walk(child)
-
-    for node in walk(ast.parse(path.read_text("utf-8"))):
+    found = []
+    for node in statements(tree_of(path), only_at_import):
         if isinstance(node, ast.Import):
-            yield from ((alias.name, node.lineno) for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
+            found += [(alias.name, node.lineno) for alias in node.names]
+        else:
             assert not node.level, f"{path}:{node.lineno}: a relative import"
             assert node.module
-            for alias in node.names:
-                name = f"{node.module}.{alias.name}"
-                place = ROOT.joinpath(*name.split("."))
-                is_module = place.with_suffix(".py").exists() or place.is_dir()
-                yield (name if is_module else node.module), node.lineno
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+            found += [(name if is_module(name) else node.module, node.lineno) for name in names]
+    return found
 
 
 def folder_of(module: str) -> str | None:

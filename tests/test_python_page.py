@@ -114,6 +114,7 @@ def test_there_are_examples():
         assert file.name == "README.md" or f"({file.name})" in listed, f"examples/README.md does not list {file.name}"
 
 
+@pytest.mark.slow
 def test_the_bundled_scene_shows_something():
     scene = potr_cl.read_scene(EXAMPLES / "playbot.sog")
     assert (len(scene), scene.sh_degree) == (31_000, 2)

@@ -188,6 +188,72 @@ def test_engines_draw_what_our_renderer_does(
     check_alike(ours, picture(tab), least)
 
 
+@pytest.fixture(scope="module")
+def streamed(plush_excerpt: Any, plush_excerpt_cameras: list[Camera], server: Server, tmp_path_factory: Any) -> Path:
+    """Levels of detail, as streamed SOG; in the browser below /streamed."""
+    path: Path = tmp_path_factory.mktemp("streamed") / "lod-meta.json"
+    potr_cl.encode(
+        plush_excerpt, plush_excerpt_cameras, output=path, levels=3, lod_chunk_count=1, iterations=2, refit=2,
+        views_between=0,
+    )  # fmt: skip
+    for file in filter(Path.is_file, path.parent.rglob("*")):
+        server.files[f"/streamed/{file.relative_to(path.parent)}"] = file.read_bytes()
+    return path
+
+
+@contextmanager
+def without_complaints(tab: Any) -> Iterator[None]:
+    """Of a block in which pages complain of nothing."""
+    said: list[str] = []
+
+    def on_console(message: Any) -> None:
+        of_browser = "GPU stall" in message.text or message.location["url"].endswith("/favicon.ico")
+        if message.type in ("warning", "error") and not of_browser:
+            said.append(f"{message.text} ({message.location['url']})")
+
+    tab.on("console", on_console)
+    tab.on("pageerror", lambda error: said.append(str(error)))
+    yield
+    tab.remove_listener("console", on_console)
+    assert said == []
+
+
+@pytest.mark.parametrize("level", [0, 2])
+def test_playcanvas_streams_levels_of_detail(
+    level: int, tab: Any, server: Server, streamed: Path, plush_excerpt_cameras: list[Camera]
+) -> None:
+    camera, view = stage_view(plush_excerpt_cameras[0])
+    scene = potr_cl.load_scene(f"{streamed}#{level}")
+    with without_complaints(tab):
+        on_stage(tab, server)
+        budget = 10**6 if level == 0 else 1
+        shown = tab.evaluate(
+            "([view, budget]) => potr.streamed('/streamed/lod-meta.json', view, budget)", [view, budget]
+        )
+    assert shown == len(scene)
+    check_alike(np.clip(potr_cl.render(scene, camera).image, 0, 1), picture(tab), 30)
+
+
+@pytest.mark.skipif(
+    not (WEB / "node_modules" / "@playcanvas" / "supersplat-viewer").exists(),
+    reason="SuperSplat's viewer is not installed: npm ci in web/",
+)
+def test_supersplat_streams_levels_of_detail(tab: Any, server: Server, streamed: Path) -> None:
+    """It turns scenes by 180 degrees about z, and its field of view is that of the longer side."""
+    scene, turned = potr_cl.load_scene(f"{streamed}#0"), np.diag([-1.0, -1.0, 1.0])
+    target = np.median(scene.means, axis=0).astype(np.float64) @ turned
+    view = {"position": (target + np.array([0.1, 0.15, -0.6])).tolist(), "target": target.tolist(), "fov": 50}
+    with without_complaints(tab):
+        on_stage(tab, server)
+        found = tab.evaluate("([view, budget]) => potr.supersplat('/streamed/lod-meta.json', view, budget)", [view, 1])
+    assert found["splats"] == len(scene)
+    to_world = np.array(found["matrix"]).reshape(4, 4).T
+    rotation, centre = np.diag([1.0, -1.0, -1.0]) @ to_world[:3, :3].T @ turned, turned @ to_world[:3, 3]
+    focal = WIDTH / 2 / np.tan(np.radians(found["fov"] / 2))
+    camera = Camera("viewer", WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2, rotation, -rotation @ centre)
+    check_alike(np.clip(potr_cl.render(scene, camera).image, 0, 1), picture(tab), 28)
+
+
 def view_of(scene: Any) -> dict[str, Any]:
     """All of a scene, from in front of it."""
     middle, reach = np.median(scene.means, axis=0), float(np.ptp(scene.means, axis=0).max())

@@ -101,11 +101,11 @@ class EncodeChoices(StageChoices, total=False):
 
     Attributes:
         to: suffix of the kind of file (".spz") where there is no ``output`` to tell it; .potr by default.
-        spz_version: of an .spz file: 2, 3 or 4.
+        spz_version: of an .spz file, 2, 3 or 4; of tiles (tileset.json), 2 or 3.
         title, author: shown on a page (.html).
         levels: of detail, each with half as many splats: a number or "auto"; of a .potr file 1 by default.
-        lod_chunk_count, lod_chunk_extent: of lod-meta.json: the most splats of a leaf of its tree, in thousands (1024),
-            and its largest side in world units.
+        lod_chunk_count, lod_chunk_extent: of lod-meta.json and tileset.json: the most splats of a leaf of the tree, in
+            thousands (1024), and its largest side in world units.
         virtual_views: how many views to place without cameras.
         cameras_anyway: use the cameras even if they do not seem to be in the scene's frame.
         background: R, G, B from 0 to 1, or a colour's name; black by default.

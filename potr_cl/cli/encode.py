@@ -205,19 +205,21 @@ def add_encode(commands: Commands) -> None:
         type=number_or_auto,
         metavar="N|auto",
         help="levels of detail in the file, each with half the splats of the one before, made for views half as large; "
-        "auto: until one has fewer than 30,000, at most 6; default: 1 in .potr files, auto in lod-meta.json",
+        "auto: until one has fewer than 30,000, at most 6; default: 1 in .potr files, auto in lod-meta.json "
+        "and tileset.json",
     )
     p.add_argument(
         "--lod-chunk-count",
         type=whole_number,
         metavar="K",
-        help="of lod-meta.json: the most splats of a leaf of its tree, in thousands (1024); default 512",
+        help="of lod-meta.json and tileset.json: most splats of a leaf of the tree, in thousands (1024); default 512, "
+        "and 128",
     )
     p.add_argument(
         "--lod-chunk-extent",
         type=float,
         metavar="UNITS",
-        help="of lod-meta.json: the largest side of a leaf, in world units; default 16",
+        help="of the same: the largest side of a leaf, in world units; default 16",
     )
     add_cameras_options(p)
     p.add_argument("--no-quality", action="store_true", help="skip judging the result; saves time")

@@ -155,7 +155,7 @@ def add_convert(commands: Commands) -> None:
         usage="potr-cl convert IN OUT [options]\n       potr-cl convert IN [IN ...] -o FOLDER --to SUFFIX [options]",
         description=f"Read a scene ({suffixes_read()}) and write it as {suffixes_written()}. Nothing but what the "
         "format itself rounds is changed; axes are kept. All may be gzipped (.ply.gz). SOG is read "
-        "from folders too (meta.json, lod-meta.json), level N of streamed SOG by FOLDER#N.",
+        "from folders too (meta.json, lod-meta.json, tileset.json), level N of streamed SOG by FOLDER#N.",
     )
     p.add_argument(
         "scenes",

@@ -40,8 +40,8 @@ class WrittenNumbers(WrittenFile):
     """An array of NumPy."""
 
 
-#: The name of a file whose folder is made with it.
-_FOLDER = "lod-meta.json"
+#: The names of files whose folder is made with them.
+_FOLDERS = {"lod-meta.json", "tileset.json"}
 
 #: What has suffixes of its own, and what it is called.
 _SUFFIXES: dict[type[WrittenFile], tuple[tuple[str, ...], str]] = {
@@ -90,7 +90,7 @@ def check_file(path: WrittenFile, option: str = "-o") -> None:
     Raises:
         UsageError: it cannot be written, or not under this name.
     """
-    made = path.name == _FOLDER and not path.parent.exists()
+    made = path.name in _FOLDERS and not path.parent.exists()
     check_place(path.parent if made else path)
     check_name(path, option)
 

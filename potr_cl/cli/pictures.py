@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
+from potr_cl.api.budgets import compare_budgets
 from potr_cl.api.comparing import compare, compare_sizes
 from potr_cl.api.pictures import render_to_files
 from potr_cl.api.views import AXES, SIZE, VIEWS, Viewpoints
@@ -25,6 +26,7 @@ from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
 from potr_cl.cli.scenes import ANTIALIASED, add_antialiased_option, add_trust_option
 from potr_cl.cli.terminal import note, say, say_document, say_done
+from potr_cl.errors import UsageError
 from potr_cl.formats.registry import suffixes_read
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.camera import Camera
@@ -92,6 +94,11 @@ def add_render(commands: Commands) -> None:
 
 
 def _compare(args: argparse.Namespace) -> None:
+    if args.budget is not None:
+        _compare_budgets(args)
+        return
+    if args.more:
+        raise UsageError("several scenes to judge: give --budget too, to compare their levels of detail")
     points = _viewpoints(args)
     given = [args.views, args.split, args.output, args.device, args.cluster]
     pictures_asked_for = any(each is not None for each in given) or points.asked_for
@@ -125,6 +132,27 @@ def _compare(args: argparse.Namespace) -> None:
             _tell(args, comparison.report(), str(comparison))  # the figures are not lost with the picture
 
 
+def _compare_budgets(args: argparse.Namespace) -> None:
+    _viewpoints(args)
+    for name in ("truth", "lpips", "cluster"):
+        if getattr(args, name):
+            raise UsageError(f"--{name} does not go with --budget, which compares with the uncompressed scene, here")
+    cameras = None if args.cameras is None else read_cameras(args)
+    with ExitStack() as stack:
+        picture = None if args.output is None else stack.enter_context(replacing(args.output))
+        progress = stack.enter_context(Progress())
+        comparison = compare_budgets(
+            args.a, [args.b, *args.more], args.budget, cameras, views=args.views, split=args.split,
+            virtual_views=args.virtual_views, turntable=args.turntable, up=args.up, size=args.size, device=args.device,
+            rules=args.rules, background=args.background, trust=args.trust,
+            antialiased=ANTIALIASED[args.antialiased], progress=progress,
+        )  # fmt: skip
+        if picture is not None:
+            comparison.write_picture(picture)
+            comparison.notes.append(f"{args.output}: {comparison.caption}")
+    _tell(args, comparison.report(), str(comparison))
+
+
 def _tell(args: argparse.Namespace, report: dict[str, object], text: str) -> None:
     if args.json:
         say_document(report)
@@ -141,6 +169,14 @@ def add_compare(commands: Commands) -> None:
     )
     p.add_argument("a", type=ReadFile, metavar="A", help=f"the uncompressed scene: {suffixes_read()}")
     p.add_argument("b", type=ReadFile, metavar="B", help="the scene to judge")
+    p.add_argument("more", type=ReadFile, nargs="*", metavar="MORE", help="more of them, with --budget")
+    p.add_argument(
+        "--budget",
+        type=whole_number,
+        nargs="+",
+        metavar="N",
+        help="judge levels of detail: render what PlayCanvas' engine would show of B for a budget of N splats",
+    )
     p.add_argument("--cameras", type=ReadCameras, metavar="PATH", help=f"{CAMERAS_HELP}; without it, views are placed")
     p.add_argument(
         "--truth", type=ReadPhotographs, metavar="DIR", help="photographs, named after the views: judge A and B by them"

@@ -19,7 +19,7 @@ from potr_cl.formats.cameras import cameras_json, colmap, transforms
 from potr_cl.formats.cameras.view_files import read_json
 from potr_cl.formats.declaration import CameraFormat, SceneFormat
 from potr_cl.formats.ladder import ladder_at
-from potr_cl.formats.scenes import compressed_ply, gltf, ksplat, page, ply, sog, sog_levels, splat, spz
+from potr_cl.formats.scenes import compressed_ply, gltf, ksplat, page, ply, sog, sog_levels, splat, spz, tileset
 from potr_cl.formats.scenes.scene_files import without_level
 
 _GSPLAT = "export it as PLY, by gsplat's simple_trainer.py with --save-ply or by gsplat.export_splats"
@@ -35,6 +35,7 @@ SCENE_FORMATS: tuple[SceneFormat, ...] = (
     spz.FORMAT,
     sog.FORMAT,
     sog_levels.FORMAT,
+    tileset.FORMAT,
     gltf.FORMAT,
     splat.FORMAT,
     ksplat.FORMAT,

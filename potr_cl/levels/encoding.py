@@ -1,7 +1,9 @@
 """Scenes encoded with levels of detail: :func:`encode_levels`.
 
-A level is one run of the stages: with a number of splats to keep, and smaller views. Levels are made one after the
-other, so no more memory is taken than by one of them; what is kept of each is the file that it became.
+A level is one run of the stages: with a number of splats to keep, and smaller views. It keeps some of the splats that
+the next finer level has kept, as they are in the full scene, and their colours are re-fitted to the full scene's
+pictures. Levels are made one after the other, so no more memory is taken than by one of them; what is kept of each is
+the file that it became.
 """
 
 from __future__ import annotations
@@ -9,25 +11,34 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
+import numpy as np
+
 from potr_cl.errors import UsageError
-from potr_cl.levels.errors import MeasuredErrors
-from potr_cl.levels.plan import counts_of_levels, scale_of_level, views_of_level
+from potr_cl.levels.errors import MeasuredErrors, measuring_views
+from potr_cl.levels.plan import counts_of_levels, scaled, views_of_level
+from potr_cl.levels.seams import scales_shown
 from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import Family
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.encoded import Encoded, LevelMade
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.run import Stopwatch, added_up
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.raster.resident import ResidentScene
+from potr_cl.stages.fit import STEPS, Fit
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.stage import Progress
 from potr_cl.workers.pool import Pool
 
 _log = logging.getLogger("potr_cl")
+
+#: The part of a usual fit's steps that a level is fitted for where no fit is asked for.
+_FITTED = 0.25
 
 
 def encode_levels(
@@ -60,12 +71,13 @@ def encode_levels(
     output, wanted = options.output, options.wanted_levels
     single = options.changed(output=output.of_level(), levels=1)
 
-    def one(views: Sequence[Camera] | None, how: EncodeOptions, again: bool) -> Encoded:
+    def one(views: Sequence[Camera] | None, how: EncodeOptions, finer: Encoded | None = None) -> Encoded:
         return encode(
-            scene, views, how, progress, device, kept=kept, in_frame=in_frame or again, pool=pool, tell=tell
+            scene, views, how, progress, device, kept=kept, in_frame=in_frame or finer is not None, pool=pool,
+            tell=tell, among=None if finer is None else np.sort(finer.order),
         )  # fmt: skip
 
-    first = one(cameras, single, False)
+    first = made = one(cameras, single)
     counts = counts_of_levels(len(first.order), wanted)
     if len(counts) > 1 and (cameras is None or not options.stage(Prune).on):
         raise UsageError("coarser levels of detail are pruned: leave out --no-prune, or give --levels 1")
@@ -73,22 +85,32 @@ def encode_levels(
     for level, count in enumerate(counts[1:], 1):
         assert cameras is not None
         _log.info("level %d of %d: %s splats", level, len(counts) - 1, f"{count:,}")
-        made = one(views_of_level(cameras, level), _coarser(single, count), True)
+        family = None if made.device is None else made.device.family
+        made = one(views_of_level(cameras, level), coarser(single, count, family), made)
         files.append(made.data)
         seconds = added_up(seconds, made.seconds)
     watch = Stopwatch(progress)
     watch("levels", 0.0)
     opened = first.device or device
-    errors = MeasuredErrors(opened, train_views(cameras) if cameras else [], scene, options.background, options.memory)
+
+    @lru_cache(maxsize=2)  # a level and the one before: of a large scene, no more fit the memory
+    def read(level: int) -> Scene:
+        return single.output.read(files[level], trust=True)
+
+    scales, views, between = [1.0], train_views(cameras) if cameras else [], list[Camera]()
+    if len(files) > 1 and opened is not None:
+        between = measuring_views(scene, views)
+        scales = scales_shown(opened, read, len(files), between, options.background)
+    errors = MeasuredErrors(opened, views, scene, options.background, options.memory, between, scales)
     pieces = output.levelled(files, errors)
-    levels = [LevelMade(count, scale_of_level(k)) for k, count in enumerate(counts)]
+    levels = [LevelMade(*each) for each in zip(counts, scales, strict=True)]
     if judge and cameras is not None and opened is not None:
-        for k, data in enumerate(files):
+        for k, scale in enumerate(scales):
             if k:
                 watch("levels", k / len(files))
-            views = EvaluationViews.of(views_of_level(cameras, k))
-            with Evaluator(opened, kept or scene, views, options.background, pool, remember=False) as evaluator:
-                levels[k] = replace(levels[k], psnr=evaluator.psnr(single.output.read(data, trust=True)))
+            judged = EvaluationViews.of(scaled(cameras, scale))
+            with Evaluator(opened, kept or scene, judged, options.background, pool, remember=False) as evaluator:
+                levels[k] = replace(levels[k], psnr=evaluator.psnr(read(k)))
     watch("levels", 1.0)
     return replace(
         first, pieces=pieces, nbytes=output.size(pieces), options=options, levels=tuple(levels),
@@ -96,9 +118,21 @@ def encode_levels(
     )  # fmt: skip
 
 
-def _coarser(options: EncodeOptions, count: int) -> EncodeOptions:
-    """The options of a level of so many splats: those of photographs' size are not looked at."""
+def coarser(options: EncodeOptions, count: int, family: Family | None) -> EncodeOptions:
+    """The options of a level of so many splats: those of photographs' size are not looked at.
+
+    It is fitted in any case, if only for a while: few splats in small pictures have to be wider and more opaque than
+    those of the full scene, which colours alone cannot make up for. But not with preset paper.
+
+    Args:
+        options: of the finest level.
+        count: of the splats.
+        family: of the device; None: there is none.
+    """
     prune: dict[str, Any] = {"keep": None, "count": count}
     if options.stage(Prune).unseen == "protect":
         prune["unseen"] = "keep"
-    return options.changed(prune=prune, refit={"ground_truth": None})
+    fit: dict[str, Any] = {}
+    if family is not None and options.preset != "paper" and not options.stage(Fit).asked_for:
+        fit = {"steps": round(_FITTED * STEPS[family]), "compared": False}
+    return options.changed(prune=prune, fit=fit, refit={"ground_truth": None})

@@ -29,14 +29,17 @@ def counts_of_levels(splats: int, levels: int | str) -> list[int]:
 
 
 def scale_of_level(level: int) -> float:
-    """By how much smaller pictures are in which a level is shown: half the splats for half the pixels."""
+    """By how much smaller pictures are for which a level is made: half the splats for half the pixels."""
     return float(HALVING ** (level / 2))
 
 
 def views_of_level(cameras: Sequence[Camera], level: int) -> list[Camera]:
-    """The same views in as many pixels as they have where a level is shown."""
-    scale = scale_of_level(level)
-    return [
-        resized(view, max(round(view.width * scale), 1), max(round(view.height * scale), 1)) if level else view
-        for view in cameras
-    ]
+    """The same views in as many pixels as they have where a level is to be shown."""
+    return scaled(cameras, scale_of_level(level))
+
+
+def scaled(cameras: Sequence[Camera], scale: float) -> list[Camera]:
+    """The same views in smaller pictures."""
+    if scale == 1:
+        return list(cameras)
+    return [resized(view, max(round(view.width * scale), 1), max(round(view.height * scale), 1)) for view in cameras]

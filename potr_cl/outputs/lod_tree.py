@@ -63,12 +63,13 @@ class Node:
         return {"bound": bound, "children": [child.document(of_leaf) for child in self.children]}
 
 
-def lod_tree(scenes: Sequence[Scene], limits: Limits) -> Node:
+def lod_tree(scenes: Sequence[Scene], limits: Limits, near: Sequence[NDArray[np.bool_]] | None = None) -> Node:
     """Cut space at medians of the centres of all levels, across the longest side each time.
 
     Args:
         scenes: of the levels, the finest first.
         limits: of the leaves.
+        near: for each level, (N,) which of its splats are in the tree, one at least; None: all.
     """
     means = np.concatenate([scene.means for scene in scenes])
     extents = np.concatenate([extents_of(scene) for scene in scenes])
@@ -89,7 +90,7 @@ def lod_tree(scenes: Sequence[Scene], limits: Limits) -> Node:
         exact = centres.astype(np.float64)
         return Node((exact - extents[numbers]).min(axis=0), (exact + extents[numbers]).max(axis=0), (), rows)
 
-    return node(np.arange(len(means)))
+    return node(np.arange(len(means)) if near is None else np.flatnonzero(np.concatenate(near)))
 
 
 def extents_of(scene: Scene) -> FloatArray:

@@ -70,6 +70,10 @@ class LevelErrors(Protocol):
         """By how far, world units, the splats of a level may be off those of the finest one; 0 of that itself."""
         ...
 
+    def far(self, scene: Scene) -> NDArray[np.bool_]:
+        """(N,) which of a level's splats look the same from wherever somebody stands; of these there is one level."""
+        ...
+
     def of_leaves(
         self, scenes: Callable[[int], Scene], levels: int, leaves: NDArray[np.int64], boxes: NDArray[np.float64]
     ) -> NDArray[np.float64]:
@@ -78,7 +82,7 @@ class LevelErrors(Protocol):
         Args:
             scenes: gives a level's scene, as readers see it.
             levels: how many there are.
-            leaves: (N,) in which leaf each splat of the finest level lies.
+            leaves: (N,) in which leaf each splat of the finest level lies; as many as there are leaves: in none.
             boxes: (leaves, 6) x0, y0, z0, x1, y1, z1 of each, world units.
 
         Returns:

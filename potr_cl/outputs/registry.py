@@ -14,6 +14,7 @@ from potr_cl.outputs.potr import Page, Potr
 from potr_cl.outputs.sog import Sog
 from potr_cl.outputs.spz import Gltf, Spz
 from potr_cl.outputs.streamed_sog import StreamedSog
+from potr_cl.outputs.tiles import Tiles
 
 #: In the order in which people are told of them; the first is the usual one.
 OUTPUTS: tuple[type[Output], ...] = (
@@ -28,7 +29,7 @@ OUTPUTS: tuple[type[Output], ...] = (
 
 
 #: Those that are folders, which the name of the description asks for.
-FOLDERS: tuple[type[Output], ...] = (StreamedSog,)
+FOLDERS: tuple[type[Output], ...] = (StreamedSog, Tiles)
 
 
 def output_of(path: Path, **choices: Any) -> Output:

@@ -6,6 +6,9 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 
+import numpy as np
+from numpy.typing import NDArray
+
 from potr_cl.host.mapped import bounded
 from potr_cl.host.threads import in_background
 from potr_cl.model.agreement import require_agreement
@@ -37,6 +40,7 @@ def encode(
     in_frame: bool = False,
     pool: Pool | None = None,
     tell: Callable[[str], None] | None = None,
+    among: NDArray[np.int64] | None = None,
 ) -> Encoded:
     """Encode a scene.
 
@@ -53,6 +57,8 @@ def encode(
         in_frame: whether :func:`check_frame` has found the cameras to be in the scene's frame.
         pool: workers that views are shared out to, of which ``device`` is the first; None: the device does all.
         tell: told a line for every round of a fit.
+        among: (n,) the numbers, ascending, of the splats that may be kept, whose colours are re-fitted to the whole
+            scene's pictures all the same; None: all.
 
     Raises:
         UsageError: options out of range, cameras without a training view, or cameras that are probably not in the
@@ -74,7 +80,8 @@ def encode(
                 others = () if pool is None else pool.devices
                 kept = stack.enter_context(ResidentScene(device, scene, options.memory, others))
         run = Run(options, watch, device, kept, pool)
-        encoded = run.finished(run.stages(State.of(scene, train_views(cameras) if cameras else [])))
+        start = State.of(scene, train_views(cameras) if cameras else [])
+        encoded = run.finished(run.stages(start if among is None else start.keeping(among)))
     tell_left_out(scene, encoded)
     return encoded
 

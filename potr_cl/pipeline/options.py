@@ -79,8 +79,8 @@ class EncodeOptions:
         if levels is None or levels == "auto" or (type(levels) is int and 1 <= levels <= MOST_LEVELS):
             if self.output.levels is None and levels not in (None, 1):
                 raise UsageError(
-                    f"--levels does not apply to {self.output.suffix} files: only .potr files and lod-meta.json hold "
-                    "levels of detail"
+                    f"--levels does not apply to {self.output.suffix} files: only .potr files, lod-meta.json and "
+                    "tileset.json hold levels of detail"
                 )
             return
         raise UsageError(f"--levels is {levels!r}: give a number from 1 to {MOST_LEVELS}, or auto")

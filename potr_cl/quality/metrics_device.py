@@ -87,69 +87,12 @@ def rendered(rasterizer: Renderer, cameras: Sequence[Camera]) -> Iterator[list[P
         yield place_pictures(buffer, cameras)
 
 
-#: Pixels along a side of a tile: GROUP in cl/quality/similarity_gpu.cl.
+#: Pixels along a side of a GPU's work-group: GROUP in cl/quality/similarity_gpu.cl.
 _TILE = 16
-
-
-class GpuSimilarityLauncher:
-    """See :class:`potr_cl.quality.metrics_device.SimilarityLauncher`."""
-
-    most_views = 32
-
-    def __init__(self, device: Device, macros: dict[str, float | int]) -> None:
-        self._kernel = device.shared_kernel("quality/similarity_gpu.cl", "similarity", **macros)
-
-    def parts(self, picture: Picture) -> tuple[int, int]:
-        return -(-picture.width // _TILE), -(-picture.height // _TILE)
-
-    def enqueue(self, image: Picture, reference: Picture, sums: cl.Buffer, first_sum: int) -> None:
-        columns, rows = self.parts(image)
-        self._kernel.bind(
-            images=image.buffer,
-            first_image=image.first,
-            references=reference.buffer,
-            first_reference=reference.first,
-            width=image.width,
-            height=image.height,
-            sums=sums,
-            first_sum=first_sum,
-        )
-        self._kernel.launch((columns * _TILE, rows * _TILE), (_TILE, _TILE))
-
-
-#: Values (of three a pixel) and rows that a work-item does.
+#: Values (of three a pixel) and rows that a work-item does on a CPU.
 _VALUES, _ROWS = 96, 32
 #: Fewest values that the kernel takes at a time.
 _LEAST_LANES = 8
-
-
-class CpuSimilarityLauncher:
-    """See :class:`potr_cl.quality.metrics_device.SimilarityLauncher`."""
-
-    most_views = 1
-
-    def __init__(self, device: Device, macros: dict[str, float | int]) -> None:
-        lanes = max(device.vector_width, _LEAST_LANES)
-        sizes = {"LANES": lanes, "BLOCK": _VALUES, "ROWS": _ROWS}
-        self._kernel = device.shared_kernel("quality/similarity_cpu.cl", "similarity", **sizes, **macros)
-
-    def parts(self, picture: Picture) -> tuple[int, int]:
-        return -(-3 * picture.width // _VALUES), -(-picture.height // _ROWS)
-
-    def enqueue(self, image: Picture, reference: Picture, sums: cl.Buffer, first_sum: int) -> None:
-        self._kernel.bind(
-            images=image.buffer,
-            first_image=image.first,
-            references=reference.buffer,
-            first_reference=reference.first,
-            width=image.width,
-            height=image.height,
-            sums=sums,
-            first_sum=first_sum,
-        )
-        self._kernel.launch(self.parts(image), (1, 1))
-
-
 #: Bytes that the pictures of views that are rendered together may take.
 _MOST_BYTES = 1 << 28
 
@@ -166,8 +109,11 @@ class Similarity:
 
     def __init__(self, device: Device) -> None:
         self._device = device
-        window: dict[str, float | int] = {f"WEIGHT_{k}": float(weight) for k, weight in enumerate(WINDOW)}
-        self._launcher: SimilarityLauncher = _launcher_class(device)(device, window | {"C1": C1, "C2": C2})
+        self._on_gpu = device.family == "gpu"
+        sizes = {"LANES": max(device.vector_width, _LEAST_LANES), "BLOCK": _VALUES, "ROWS": _ROWS}
+        macros: dict[str, float | int] = {f"WEIGHT_{k}": float(weight) for k, weight in enumerate(WINDOW)}
+        macros |= {"C1": C1, "C2": C2} | ({} if self._on_gpu else sizes)
+        self._kernel = device.shared_kernel(f"quality/similarity_{device.family}.cl", "similarity", **macros)
 
     def __call__(self, pairs: Sequence[tuple[Picture, Picture]]) -> list[tuple[float, float]]:
         """PSNR in decibels (infinite for identical pictures) and SSIM of each pair of pictures of one size.
@@ -175,42 +121,38 @@ class Similarity:
         Raises:
             DeviceError: the device failed, or has no room for the sums.
         """
-        device, launcher = self._device, self._launcher
-        starts = np.cumsum([0, *(math.prod(launcher.parts(image)) for image, _ in pairs)])
+        device = self._device
+        starts = np.cumsum([0, *(math.prod(self._parts(image)) for image, _ in pairs)])
         with Memory(device) as memory:
             sums = memory.allocate(8 * int(starts[-1]), "the pictures' similarities")
             for (image, reference), start in zip(pairs, starts, strict=False):
-                launcher.enqueue(image, reference, sums, int(start))
+                self._enqueue(image, reference, sums, int(start))
             parts = device.download(sums, (int(starts[-1]), 2), np.float32).astype(np.float64)
         return [
             _figures(parts[start:stop].sum(axis=0) / (3 * image.width * image.height))
             for (image, _), start, stop in zip(pairs, starts, starts[1:], strict=False)
         ]
 
+    def _parts(self, picture: Picture) -> tuple[int, int]:
+        """Parts that are summed on their own, along a row and along a column."""
+        if self._on_gpu:
+            return -(-picture.width // _TILE), -(-picture.height // _TILE)
+        return -(-3 * picture.width // _VALUES), -(-picture.height // _ROWS)
 
-class SimilarityLauncher(Protocol):
-    """Enqueues the sums of one kernel family.
-
-    Attributes:
-        most_views: views to render together.
-    """
-
-    most_views: int
-
-    def parts(self, picture: Picture) -> tuple[int, int]:
-        """Parts of a picture that are summed on their own, along a row and along a column."""
-
-    def enqueue(self, image: Picture, reference: Picture, sums: cl.Buffer, first_sum: int) -> None:
-        """Enqueue the comparison of two pictures of one size.
-
-        Args:
-            sums: (parts of all pictures, 2) float32, squared errors and 1 - SSIM.
-            first_sum: where those of these pictures begin.
-        """
-
-
-def _launcher_class(device: Device) -> type[CpuSimilarityLauncher] | type[GpuSimilarityLauncher]:
-    return GpuSimilarityLauncher if device.family == "gpu" else CpuSimilarityLauncher
+    def _enqueue(self, image: Picture, reference: Picture, sums: cl.Buffer, first_sum: int) -> None:
+        """Sums (parts of all pictures, 2) float32, squared errors and 1 - SSIM, from ``first_sum`` on."""
+        self._kernel.bind(
+            images=image.buffer,
+            first_image=image.first,
+            references=reference.buffer,
+            first_reference=reference.first,
+            width=image.width,
+            height=image.height,
+            sums=sums,
+            first_sum=first_sum,
+        )
+        (columns, rows), side = self._parts(image), _TILE if self._on_gpu else 1
+        self._kernel.launch((columns * side, rows * side), (side, side))
 
 
 def _figures(means: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> tuple[float, float]:
@@ -224,7 +166,7 @@ def in_batches(device: Device, cameras: Sequence[Camera], most_bytes: int = _MOS
     Args:
         most_bytes: that the pictures of several views may take.
     """
-    most = _launcher_class(device).most_views
+    most = 32 if device.family == "gpu" else 1
     room = min(most_bytes, device.info.largest_buffer, (device.info.memory - device.allocated) // 8)
     start = 0
     while start < len(cameras):

@@ -13,9 +13,8 @@ from potr_cl import cli
 from potr_cl.formats import load_scene
 from potr_cl.formats.scenes import ply
 from potr_cl.workers.host import Workers, open_workers
+from tests.cli.calls import KEEP
 from tests.reference.scenes import random_scene
-
-KEEP = ["--no-prune", "--no-compact", "--refit", "off"]
 
 
 @pytest.fixture

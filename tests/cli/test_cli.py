@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -108,27 +109,35 @@ def test_no_permission(scene_path):
         for path, mode in ((Path(folder), 0o755), (locked, 0o555), (scene, 0o644), (secret, 0o000)):
             path.chmod(mode)
         # Root may do anything: give the right up, once everything is imported.
-        script = (
-            "import locale, os, sys; from potr_cl.cli import edit, encode, main; os.geteuid() or os.setuid(65534); "
-            "sys.exit(main(sys.argv[1:]))"
-        )
-        for source, target in ((scene, locked / "a.potr"), (secret, Path(folder) / "a.potr")):
-            command = [sys.executable, "-c", script, "encode", str(source), "-o", str(target), *KEEP]
-            result = subprocess.run(command, capture_output=True, text=True, check=False)
-            assert result.returncode == 2, result.stderr
-            assert "Permission denied" in result.stderr
-            assert "Traceback" not in result.stderr
-            assert not target.exists()
+        script = """
+import contextlib, io, json, locale, os, sys
+from potr_cl.cli import edit, encode, main
+os.geteuid() or os.setuid(65534)
+told = []
+for words in json.loads(sys.argv[1]):
+    with contextlib.redirect_stderr(io.StringIO()) as said:
+        told.append([main(words), said.getvalue()])
+print(json.dumps(told))
+"""
+        targets = [locked / "a.potr", Path(folder) / "a.potr"]
+        calls = [["encode", scene, "-o", targets[0], *KEEP], ["encode", secret, "-o", targets[1], *KEEP]]
         # What takes long looks first.
-        few = ["--iterations", "1", "--virtual-views", "4"]
-        for words in (["prune", *few], ["compact", "--virtual-views", "4"], ["encode", "--ladder", "0.2", *KEEP]):
-            name = "" if "--ladder" in words else "a.ply"
-            command = [sys.executable, "-c", script, words[0], str(scene), "-o", f"{locked}/{name}", *words[1:]]
-            result = subprocess.run(command, capture_output=True, text=True, check=False)
-            assert result.returncode == 2, result.stderr
-            assert result.stderr.startswith("potr-cl: cannot write")
-            assert "Permission denied\n" in result.stderr
-            assert result.stderr.count("\n") == 1
+        few = ["--virtual-views", "4"]
+        calls += [["prune", scene, "-o", locked / "a.ply", "--iterations", "1", *few]]
+        calls += [["compact", scene, "-o", locked / "a.ply", *few]]
+        calls += [["encode", scene, "-o", f"{locked}/", "--ladder", "0.2", *KEEP]]
+        command = [sys.executable, "-c", script, json.dumps([[str(word) for word in call] for call in calls])]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        told = json.loads(done.stdout)
+        for code, said in told:
+            assert code == 2, said
+            assert "Permission denied" in said
+            assert "Traceback" not in said + done.stderr
+        assert not any(target.exists() for target in targets)
+        for _, said in told[2:]:
+            assert said.startswith("potr-cl: cannot write")
+            assert said.endswith("Permission denied\n")
+            assert said.count("\n") == 1
 
 
 def test_interrupt(tmp_path, scene_path, capsys, monkeypatch):

@@ -100,6 +100,7 @@ def test_one_training_view_is_too_few(paths, capsys):
     assert not (paths / "out.ply").exists()
 
 
+@pytest.mark.slow
 def test_encode_with_a_fit(paths, capsys):
     # Of so few splats a fit mends half of the error, far more than the third that it has to.
     words = ["encode", paths / "scene.ply", "--cameras", paths / "cameras.json", "--keep", "0.3", "--json"]

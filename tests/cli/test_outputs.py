@@ -9,9 +9,8 @@ import pytest
 from potr_cl import UsageError, cli, encode
 from potr_cl.formats import load_scene
 from potr_cl.formats.scenes import ply
+from tests.cli.calls import KEEP, cameras_json
 from tests.reference.scenes import random_scene
-
-KEEP = ["--no-prune", "--no-compact", "--refit", "off"]
 
 
 @pytest.fixture
@@ -20,6 +19,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
     monkeypatch.chdir(tmp_path)
     ply.save("a.ply", random_scene(100, 1))
     assert cli.main(["encode", "a.ply", "-o", "a.potr", *KEEP]) == 0
+    cameras_json(tmp_path / "cameras.json")
     (tmp_path / "sub").mkdir()
     capsys.readouterr()
     return tmp_path
@@ -119,9 +119,9 @@ def test_refused_in_one_line_before_any_work(
     [
         *(("convert a.ply", suffix) for suffix in (".spz", ".PLY", ".compressed.ply")),
         ("decode a.potr -o", ".spz"),
-        ("prune a.ply --iterations 2 --virtual-views 8 -o", ".PLY"),
-        ("compact a.ply --virtual-views 8 -o", ".compressed.ply"),
-        ("refit a.ply --reference a.ply --steps 1 --virtual-views 8 -o", ".spz"),
+        ("prune a.ply --iterations 2 --cameras cameras.json -o", ".PLY"),
+        ("compact a.ply --cameras cameras.json -o", ".compressed.ply"),
+        ("refit a.ply --reference a.ply --steps 1 --cameras cameras.json -o", ".spz"),
     ],
 )
 def test_a_scene_is_written_as_its_name_says(folder: Path, command: str, suffix: str) -> None:

@@ -15,10 +15,9 @@ import pytest
 from potr_cl import cli
 from potr_cl.formats import load_scene
 from potr_cl.formats.scenes import ply, spz
+from tests.cli.calls import KEEP, cameras_json
 from tests.reference.scenes import random_scene
 
-KEEP = ["--no-prune", "--no-compact", "--refit", "off"]
-FEW = ["--virtual-views", "8"]
 ROOT = Path(__file__).parents[2]
 
 
@@ -26,6 +25,7 @@ ROOT = Path(__file__).parents[2]
 def folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
     ply.save(tmp_path / "a.ply", random_scene(100, 1))
     spz.save(tmp_path / "a.spz", random_scene(100, 1))
+    cameras_json(tmp_path / "cameras.json")
     assert cli.main(["encode", str(tmp_path / "a.ply"), "-o", str(tmp_path / "a.potr"), *KEEP]) == 0
     capsys.readouterr()
     return tmp_path
@@ -58,7 +58,7 @@ def piped(folder: Path, call: str, source: str | bytes = "a.ply", code: int = 0)
         (f"encode - -o - {' '.join(KEEP)}", "a.spz"),
         ("decode - -o - --to spz", "a.potr"),
         ("convert - - --to .spz", "a.ply"),
-        (f"prune - -o - --from ply --iterations 2 {' '.join(FEW)}", "a.ply"),
+        ("prune - -o - --from ply --iterations 2 --cameras cameras.json", "a.ply"),
     ],
 )
 def test_the_same_bytes_as_through_files(folder: Path, monkeypatch: pytest.MonkeyPatch, call: str, source: str) -> None:

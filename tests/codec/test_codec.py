@@ -300,6 +300,9 @@ def test_golden_files_decode_for_ever(path):
         rendered = (True, 0.1 if "mip_splatting" in path.stem else 0.3)
     assert (scene.antialiased, scene.low_pass) == rendered
     assert (independent["antialiased"], independent["low_pass"]) == rendered
+    metadata = open_file(path).metadata
+    assert isinstance(metadata, dict)
+    json.dumps(metadata)
 
 
 def test_flags_are_all_that_marks_an_antialiased_scene():
@@ -326,9 +329,3 @@ def test_scales_of_antialiased_scenes_have_finer_steps(preset):
     log_scales = [np.sort(decode(each).log_scales.astype(np.float64), axis=None) for each in data]
     errors = [np.abs(np.exp(each) - np.exp(np.sort(scene.log_scales, axis=None))).mean() for each in log_scales]
     assert errors[1] < 0.6 * errors[0]
-
-
-@pytest.mark.parametrize("path", GOLDEN, ids=lambda p: p.stem)
-def test_golden_metadata(path):
-    assert isinstance(open_file(path).metadata, dict)
-    json.dumps(open_file(path).metadata)

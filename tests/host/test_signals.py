@@ -56,8 +56,11 @@ with process.unwinding(), replacing(sys.argv[2]) as file, temporary_folder() as 
 """
 
 
-@pytest.mark.parametrize("how", ["raised", "turned into another", "swallowed", "twice"])
-@pytest.mark.parametrize(("number", "code"), SIGNALS)
+@pytest.mark.parametrize(
+    ("number", "code", "how"),
+    [(*each, "raised") for each in SIGNALS]
+    + [(signal.SIGTERM, 143, "turned into another"), (signal.SIGTERM, 143, "swallowed"), (signal.SIGINT, 130, "twice")],
+)
 def test_nothing_is_left(tmp_path: Path, number: signal.Signals, code: int, how: str) -> None:
     target = tmp_path / "out.bin"
     target.write_bytes(b"old")
@@ -149,9 +152,12 @@ runpy.run_module("potr_cl", run_name="__main__", alter_sys=True)
 """
 
 
-@pytest.mark.parametrize("module", ["argparse", "potr_cl.cli", "numpy", "numpy.linalg", "potr_cl.codec.decoder"])
-@pytest.mark.parametrize(("number", "code"), SIGNALS)
-def test_while_modules_are_imported(module: str, number: signal.Signals, code: int) -> None:
+@pytest.mark.parametrize(
+    ("number", "code", "module"),
+    [(*each, "potr_cl.cli") for each in SIGNALS]
+    + [(*SIGNALS[0], name) for name in ("argparse", "numpy", "numpy.linalg", "potr_cl.codec.decoder")],
+)
+def test_while_modules_are_imported(number: signal.Signals, code: int, module: str) -> None:
     result = run(WHILE_IMPORTING, module, number.name, "info", "nothing.potr")
     assert result.returncode == code, result.stderr
     assert result.stderr.count("\n") == 1

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -9,10 +11,14 @@ import potr_cl
 from potr_cl import UsageError, cli
 from potr_cl.codec.decoder import open_file
 from potr_cl.codec.levels import splats_of_levels
+from potr_cl.levels import encoding
 from potr_cl.levels.plan import views_of_level
 from potr_cl.model.camera import test_views as held_out
 from potr_cl.opencl.device import Device
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.stages.fit import STEPS
 
 QUICK = {"iterations": 6, "views_between": 0, "refit": 2}
 
@@ -73,12 +79,13 @@ def test_the_report_tells_each_level(encoded):
 def test_errors_are_those_of_pixels_in_the_scene(encoded):
     errors = [block.error for block in open_file(encoded.data).blocks]
     assert errors[2] == 0
-    assert errors[0] == pytest.approx(np.sqrt(2) * errors[1])
+    scales = [level.scale for level in encoded.levels]
+    assert errors[0] / errors[1] == pytest.approx(scales[1] / scales[2])
 
 
 def test_the_same_bytes_each_time(plush_excerpt, plush_excerpt_cameras, device):
     files = [
-        potr_cl.encode(plush_excerpt, plush_excerpt_cameras, levels=2, count=200, device=device, **QUICK).data
+        potr_cl.encode(plush_excerpt, plush_excerpt_cameras, levels=2, count=200, device=device, fit=5, **QUICK).data
         for _ in range(2)
     ]
     assert files[0] == files[1]
@@ -103,3 +110,42 @@ def test_the_command_line_takes_a_number_or_auto(capsys):
     with pytest.raises(SystemExit):
         cli.main(["encode", "no.ply", "-o", "a.potr", "--levels", "some"])
     assert "--levels" in capsys.readouterr().err
+
+
+def test_a_level_keeps_some_of_the_splats_of_the_next_finer_one(
+    plush_excerpt, plush_excerpt_cameras, device, monkeypatch
+):
+    made = []
+
+    def watched(*args, **named):
+        made.append(encode(*args, **named))
+        return made[-1]
+
+    monkeypatch.setattr(encoding, "encode", watched)
+    potr_cl.encode(plush_excerpt, plush_excerpt_cameras, levels=3, count=400, device=device, fit=5, **QUICK)
+    assert [level.options.fit.steps for level in made] == [5, 5, 5]
+    assert [len(level.order) for level in made] == [400, 200, 100]
+    for finer, coarser in itertools.pairwise(made):
+        assert np.isin(coarser.order, finer.order).all()
+
+
+@pytest.mark.parametrize(("preset", "steps"), [("fast", STEPS["cpu"] // 4), ("paper", 0)])
+def test_coarser_levels_are_fitted_where_nobody_asks_for_it(preset, steps):
+    given = EncodeOptions(preset=preset)
+    assert given.fit.steps == 0
+    assert encoding.coarser(given, 100, "cpu").fit.steps == steps
+    assert encoding.coarser(given.changed(fit={"steps": 7}), 100, "cpu").fit.steps == 7
+
+
+def test_what_is_left_of_some_splats_shows_the_whole_scene(plush_excerpt, plush_excerpt_cameras, device):
+    """Its colours make up for those that could not be kept."""
+    among = np.arange(0, len(plush_excerpt), 3)
+    options = EncodeOptions().changed(prune={"count": len(among)}, between={"views": 0.0})
+    found = encode(plush_excerpt, plush_excerpt_cameras, options, device=device, among=among)
+    assert np.array_equal(np.sort(found.order), among)
+    views = held_out(plush_excerpt_cameras)
+    error, plain = (
+        mean_squared_error(device, plush_excerpt, scene, views)
+        for scene in (potr_cl.decode(found.data), plush_excerpt.subset(among))
+    )
+    assert error < 0.7 * plain

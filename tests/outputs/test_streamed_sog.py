@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import itertools
 import json
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +17,9 @@ import potr_cl
 from potr_cl import Scene, UsageError, cli
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.formats import load_scene
-from potr_cl.levels.errors import MeasuredErrors, SharedOut, coverage
-from potr_cl.model.camera import train_views
+from potr_cl.levels.errors import MeasuredErrors, SharedOut, coverage, errors_a_coverage, measuring_views
+from potr_cl.model.camera import camera_centres, train_views
+from potr_cl.model.views_between import views_between
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.lod_tree import Limits, extents_of, lod_tree
 from potr_cl.outputs.output import Request
@@ -31,6 +34,12 @@ FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
 
 class Told:
     """Errors that are told, in place of measured ones."""
+
+    def __init__(self, far: float = np.inf) -> None:
+        self._far = far
+
+    def far(self, scene):
+        return scene.means[:, 0] > self._far
 
     def of_level(self, level: int) -> float:
         return 0.0
@@ -158,6 +167,36 @@ def mean_squared_errors(device, scene, others, views) -> list[float]:
     return found
 
 
+def test_what_is_far_is_the_environment_once(files, tmp_path):
+    """Every level is shown with what the finest one has there; the tree has and counts the others."""
+    levels = [Sog().read(data) for data in files]
+    far = float(np.quantile(levels[0].means[:, 0], 0.95))
+    shown = []
+
+    class Errors(Told):
+        def of_leaves(self, scenes, levels, leaves, boxes):
+            assert np.array_equal(leaves == len(boxes), self.far(scenes(0)))
+            shown.extend(scenes(level) for level in range(levels))
+            return np.zeros((len(boxes), levels))
+
+    output = StreamedSog(lod_chunk_count=1)
+    pieces = output.levelled(files, Errors(far))
+    path = tmp_path / "lod-meta.json"
+    with path.open("wb") as file:
+        output.write(pieces, file, path)
+    meta = json.loads(path.read_text())
+    assert meta["environment"] == "env/meta.json"
+    sky = levels[0].means[levels[0].means[:, 0] > far]
+    assert json.loads((tmp_path / "env" / "meta.json").read_text())["count"] == len(sky) > 0
+    for level, (scene, own) in enumerate(zip(levels, shown, strict=True)):
+        near = scene.means[scene.means[:, 0] <= far]
+        assert meta["counts"][level] == len(near)
+        for found in (load_scene(f"{path}#{level}"), own):
+            assert np.array_equal(np.sort(found.means, axis=0), np.sort(np.concatenate([near, sky]), axis=0))
+    without = json.loads(zipfile.ZipFile(io.BytesIO(output.levelled(files, Told())[0])).read("lod-meta.json"))
+    assert "environment" not in without
+
+
 def test_errors_of_leaves_add_up_and_say_where(plush_excerpt, plush_excerpt_cameras, device):
     """Of a scene whose left half has lost its colours: the error is there, and all of it."""
     views = train_views(plush_excerpt_cameras)
@@ -165,9 +204,10 @@ def test_errors_of_leaves_add_up_and_say_where(plush_excerpt, plush_excerpt_came
     sh = plush_excerpt.sh.copy()
     sh[left, 0] += 0.3
     other = Scene(*(getattr(plush_excerpt, field) for field in FIELDS[:4]), sh)
-    with SharedOut(device, plush_excerpt, views, left.astype(np.int64), 2, (0, 0, 0)) as shared:
-        right_part, left_part = shared.of(other)
-        assert shared.of(plush_excerpt).tolist() == [0, 0]
+    with SharedOut(device, plush_excerpt, views, left.astype(np.int64), 2) as shared:
+        parts = shared.of([other, plush_excerpt])
+    assert not parts[:, :, 1].any()
+    right_part, left_part = parts[:, :, 0].mean(axis=0)
     (whole,) = mean_squared_errors(device, plush_excerpt, [other], views)
     assert left_part + right_part == pytest.approx(whole, rel=1e-5)
     assert left_part > 4 * right_part
@@ -179,11 +219,29 @@ def test_an_error_times_what_the_leaf_covers_is_what_it_adds(plush_excerpt, plus
     scenes = [plush_excerpt, fewer]
     boxes = np.concatenate([plush_excerpt.means.min(axis=0), plush_excerpt.means.max(axis=0)])[None]
     leaves = np.zeros(len(plush_excerpt), np.int64)
-    errors = MeasuredErrors(device, views, plush_excerpt).of_leaves(scenes.__getitem__, 2, leaves, boxes)
+    views = measuring_views(plush_excerpt, views)
+    errors = MeasuredErrors(device, views, plush_excerpt, between=views).of_leaves(scenes.__getitem__, 2, leaves, boxes)
     assert errors[0, 0] == 0
-    covered = np.mean([coverage(view, boxes)[0] for view in views])
-    (whole,) = mean_squared_errors(device, plush_excerpt, [fewer], views)
-    assert errors[0, 1] * covered == pytest.approx(whole, rel=1e-5)
+    covered = np.array([coverage(view, boxes)[0] for view in views])
+    each = [mean_squared_errors(device, plush_excerpt, [fewer], [view])[0] for view in views]
+    per_coverage = np.array(each) / covered
+    per_coverage[per_coverage.argmax()] = np.sort(per_coverage)[-2]
+    assert errors[0, 1] == pytest.approx((per_coverage * covered).sum() / covered.sum(), rel=1e-5)
+
+
+def test_one_view_within_a_leaf_does_not_tell_its_error():
+    parts, covered = np.full((9, 2, 1), 1e-4), np.full((9, 2), 0.1)
+    parts[3, 1], covered[3, 1] = 0.5, 1
+    assert np.allclose(errors_a_coverage(parts, covered), 1e-3)
+
+
+def test_errors_are_measured_where_no_level_was_made_for(plush_excerpt, plush_excerpt_cameras):
+    views = train_views(plush_excerpt_cameras)
+    measuring = camera_centres(measuring_views(plush_excerpt, views))
+    for made_for in (views, views_between(plush_excerpt, views, 5)):
+        assert np.linalg.norm(camera_centres(made_for)[:, None] - measuring, axis=2).min() > 1e-6
+    alone = measuring_views(plush_excerpt, views[:1])
+    assert [view.name for view in alone] == [views[0].name]
 
 
 def test_coverage_is_that_of_playcanvas_engine(plush_excerpt_cameras):

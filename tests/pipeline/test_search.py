@@ -84,9 +84,9 @@ class HalfOpaque(Stage):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("place", [pytest.param(0, marks=pytest.mark.slow), -1])
+@pytest.mark.parametrize("place", [0, -1])
 def test_a_stage_of_ones_own_takes_part_in_a_search_as_in_an_encode(device, plush_excerpt, cameras, place):
-    stages = list(EncodeOptions.for_preset("best", prune={"iterations": 4}, refit={"steps": 3}).stages)
+    stages = list(EncodeOptions.for_preset("best", between=False, prune={"iterations": 4}, refit={"steps": 3}).stages)
     stages.insert(place, HalfOpaque())
     options = EncodeOptions(stages=tuple(stages))
     found = encode_to_target(plush_excerpt, cameras, Target(max_bytes=24_000), options, device=device)
@@ -122,8 +122,7 @@ def test_a_psnr_is_reached_with_little_to_spare(device, plush_excerpt, cameras, 
     ("preset", "target"),
     [
         ("best", Target(max_bytes=22_000)),
-        pytest.param("best", Target(max_bytes=28_000), marks=pytest.mark.slow),
-        pytest.param("fast", Target(min_psnr=46), marks=pytest.mark.slow),
+        ("fast", Target(min_psnr=46)),
     ],
 )
 def test_what_is_found_is_what_a_plain_encode_makes(device, plush_excerpt, cameras, preset, target):
@@ -146,9 +145,8 @@ def test_a_rough_encode_comes_first_where_it_saves_time(device, plush_excerpt, c
     target = Target(max_bytes=20_000)
     for options, first in (
         (FEW, "encode"),
-        (FEW.changed(prune={"iterations": 48}), "scout"),
-        (EncodeOptions.for_preset("fast"), "scout"),
-        (EncodeOptions.for_preset("best", prune={"iterations": 6}, refit={"steps": 2}), "encode"),
+        (FEW.changed(compact=False, prune={"iterations": 48}), "scout"),
+        (EncodeOptions.for_preset("best", between=False, prune={"iterations": 6}, refit={"steps": 2}), "encode"),
         (FEW.changed(prune={"iterations": 48, "on": False}), "encode"),
     ):
         found = encode_to_target(plush_excerpt, cameras, target, options, device=device)
@@ -259,7 +257,7 @@ def test_colours_may_be_fitted_to_ground_truth(device, plush_excerpt, cameras, t
 def test_a_cpu_takes_over(plush_excerpt, cameras, caplog):
     """From a device whose memory does not hold the scene's views."""
     skip_without_cpu()
-    options = EncodeOptions.for_preset("fast", prune={"iterations": 3})
+    options = FEW.changed(prune={"iterations": 3})
     target = Target(max_bytes=20_000)
     wanted = encode_to_target(plush_excerpt, cameras, target, options)
     small = Device()

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from potr_cl.errors import UsageError
-from potr_cl.formats import load_scene
 from potr_cl.model.camera import camera_centres, focus, test_views, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.placement.upright import AXES, guess_up
@@ -76,16 +75,8 @@ def test_a_scene_that_stands_askew_is_held_level():
     assert angle(up, (0, 0, 1)) > 15
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "up"), [("lego", (0, 0, 1)), ("plush", (-0.0497, -0.8993, -0.4344))])
-def test_of_trained_scenes(name, up, request):
-    """Against what their cameras say: the direction across which all pictures' horizontals lie."""
-    scene = load_scene(request.getfixturevalue(name) / "point_cloud.ply")
-    assert angle(guess_up(scene, place_cameras(scene, 32)), up) < 12
-
-
 @pytest.mark.parametrize("views", [look_around, turntable])
-@pytest.mark.parametrize("up", [AXES["z"], AXES["-y"], AXES["x"], (1.0, 2.0, -0.5)])
+@pytest.mark.parametrize("up", [AXES["-y"], (1.0, 2.0, -0.5)])
 def test_views_are_level(views, up):
     direction = np.array(up) / np.linalg.norm(up)
     for camera in views(house(), 5, 64, up):
@@ -150,14 +141,6 @@ def test_one_splat_can_be_looked_at():
     assert len(look_around(scene, 3, 32)) == 3
     (view,) = turntable(scene, 1, 32)
     assert seen(dataclasses.replace(scene, opacity_logits=np.full(1, 5, np.float32)), view) == 1
-
-
-@pytest.mark.slow
-def test_the_same_scene_gives_the_same_views():
-    for make in (look_around, lambda scene: turntable(scene, 4)):
-        first = make(house())
-        again = make(house())
-        assert all(np.array_equal(a.rotation, b.rotation) for a, b in zip(first, again, strict=True))
 
 
 @pytest.mark.parametrize("up", [(0, 0, 0), (1, 2), (np.nan, 0, 1), (np.inf, 0, 1)])

@@ -49,7 +49,7 @@ def device(request: pytest.FixtureRequest) -> Iterator[Device]:
 def test_the_definition(device: Device, changes: dict[str, object]) -> None:
     for degree in [1, 2, 3]:
         options = replace(CompactionOptions(), **changes)  # type: ignore[arg-type]
-        scene = random_scene(40, degree, seed=degree)
+        scene = random_scene(20, degree, seed=degree)
         centres = on_a_sphere(30)
         dense = sparse_weights(len(scene), 30)
         compacted = Compactor(device).compact(scene, centres, dense_weights(dense), options)

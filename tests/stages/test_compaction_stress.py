@@ -76,8 +76,8 @@ def test_the_stress_reaches_condition_numbers_of_1e14() -> None:
 
 @pytest.mark.parametrize("views", ["one", "opposite", "same place", "ring", "sphere"])
 def test_extreme_weights(device: Device, views: str) -> None:
-    for lam in [0.0, 1e-6, 1.0, 1e12]:
-        for weight in [1e-12, 1e-6, 1.0, 1e6]:
+    for lam in [0.0, 1.0, 1e12]:
+        for weight in [1e-12, 1.0, 1e6]:
             centres = {
                 "one": on_a_sphere(1),
                 "opposite": np.array([[0.0, 6, 0], [0, -6, 0]]),

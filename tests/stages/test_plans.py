@@ -88,18 +88,20 @@ def course(kernels, tolerance):
 
 
 @pytest.mark.parametrize(
-    ("residency", "workers"),
+    ("residency", "workers", "grouping"),
     [
-        ("all", "one device"),
-        ("nothing", "one device"),
-        ("nothing", "two devices"),
-        ("all", "two workers elsewhere"),
-        pytest.param("some", "one device", marks=pytest.mark.slow),
-        pytest.param("some", "two devices", marks=pytest.mark.slow),
-        pytest.param("pictures", "two workers elsewhere", marks=pytest.mark.slow),
+        *((*plan, grouping) for plan in (("all", "one device"), ("nothing", "two devices")) for grouping in GROUPINGS),
+        ("nothing", "one device", "by view"),
+        ("nothing", "one device", "as drawn"),
+        ("all", "two workers elsewhere", "whole"),
+        ("all", "two workers elsewhere", "by cluster"),
+        ("all", "two workers elsewhere", "as drawn"),
+        *(pytest.param("some", "one device", grouping, marks=pytest.mark.slow) for grouping in list(GROUPINGS)[1:]),
+        pytest.param("some", "two devices", "by cluster", marks=pytest.mark.slow),
+        pytest.param("pictures", "two workers elsewhere", "by view", marks=pytest.mark.slow),
+        pytest.param("pictures", "two workers elsewhere", "as drawn", marks=pytest.mark.slow),
     ],
 )
-@pytest.mark.parametrize("grouping", GROUPINGS)
 def test_the_same_bits(kernels, grouping, residency, workers):
     """While splats go and colours change. Which views are resident is another matter: so no tile may be skipped."""
     skip_unless(grouping, kernels)
@@ -140,8 +142,10 @@ def test_the_same_choice(kernels, grouping):
     assert np.array_equal(a.iteration_of, b.iteration_of)
 
 
-@pytest.mark.parametrize("residency", ["all", "nothing"])
-@pytest.mark.parametrize("grouping", GROUPINGS)
+@pytest.mark.parametrize(
+    ("grouping", "residency"),
+    [("whole", "nothing"), ("by view", "nothing"), ("by cluster", "all"), ("as drawn", "nothing")],
+)
 def test_removal_before_anything_was_measured(kernels, grouping, residency):
     """The targets show the splats that are gone."""
     skip_unless(grouping, kernels)
@@ -158,8 +162,9 @@ def test_removal_before_anything_was_measured(kernels, grouping, residency):
         assert np.array_equal(wanted[0][left], got.measure()[0][left])
 
 
-@pytest.mark.parametrize("residency", ["all", "nothing"])
-@pytest.mark.parametrize("grouping", list(GROUPINGS)[1:])
+@pytest.mark.parametrize(
+    ("grouping", "residency"), [("by view", "nothing"), ("by cluster", "all"), ("as drawn", "nothing")]
+)
 def test_views_that_draw_nothing_are_views_too(kernels, grouping, residency):
     skip_unless(grouping, kernels)
     scene, cameras = street(2)
@@ -178,8 +183,9 @@ def test_views_that_draw_nothing_are_views_too(kernels, grouping, residency):
     assert not importances.any()
 
 
-@pytest.mark.parametrize("residency", ["all", "nothing"])
-@pytest.mark.parametrize("grouping", list(GROUPINGS)[1:])
+@pytest.mark.parametrize(
+    ("grouping", "residency"), [("by view", "all"), ("by cluster", "nothing"), ("as drawn", "all")]
+)
 def test_spared_splats_stay(kernels, grouping, residency):
     skip_unless(grouping, kernels)
     scene, cameras = street()

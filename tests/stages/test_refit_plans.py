@@ -157,18 +157,17 @@ def plain(device):
         return {way: fitted(device, Plan(), way) for way in WAYS}
 
 
+#: Each plan with one of them, and each of them with memory that is short, slices, own splats, devices and a cluster.
+TOGETHER = [(name, WAYS[place % 3]) for place, name in enumerate(PLANS)]
+SLOW = [("no view kept", "fix_ac"), ("two devices", "solve"), ("a cluster of three", "fix_ac")]
+
+
 @pytest.mark.parametrize(
     ("plan", "way"),
-    [
-        pytest.param(
-            plan, way, id=f"{name}, {way}",
-            marks=() if way == WAYS[place % 3] else [pytest.mark.slow, pytest.mark.one_family, pytest.mark.one_runtime],
-        )
-        for place, (name, plan) in enumerate(PLANS.items())
-        for way in WAYS
-    ],
-)  # fmt: skip
+    [*TOGETHER, *(pytest.param(*both, marks=[pytest.mark.slow, pytest.mark.one_family]) for both in SLOW)],
+)
 def test_the_same_solution(device, plain, picked, plan, way, monkeypatch):
+    plan = PLANS[plan]
     monkeypatch.setattr(own_views, "ENOUGH", 4)
     monkeypatch.setattr(coefficients, "_FEWEST", plan.resident)
     made = picked(plan.picked)

@@ -101,18 +101,18 @@ def test_dense_views_get_none(device, plush_excerpt, plush_excerpt_cameras):
 def test_only_as_many_are_added_as_fit_the_memory_beside_the_given_ones(device, plush_excerpt, plush_excerpt_cameras):
     given = train_views(plush_excerpt_cameras)
     wanted, _ = added(device, plush_excerpt, given)
-    counts = [added(device, plush_excerpt, given, memory=megabytes * 250_000)[0] for megabytes in range(60)]
+    counts = [added(device, plush_excerpt, given, memory=step * 1_000_000)[0] for step in range(16)]
     assert counts[0] == 0
     assert counts[-1] == wanted
     assert counts == sorted(counts)
     some = counts.index(next(count for count in counts if 0 < count < wanted))
     # What pruning keeps of views with that budget is within it, and no view is made again for each measurement.
-    _, state = added(device, plush_excerpt, given, memory=some * 250_000)
+    _, state = added(device, plush_excerpt, given, memory=some * 1_000_000)
     with Rasterizer(device, plush_excerpt) as rasterizer:
         before = device.allocated
-        with RemovalSweep(rasterizer, state.views, SweepOptions(memory=some * 250_000)) as sweep:
+        with RemovalSweep(rasterizer, state.views, SweepOptions(memory=some * 1_000_000)) as sweep:
             assert sweep.resident_views == len(state.views)
-            assert device.allocated - before < some * 250_000 + 1_000_000
+            assert device.allocated - before < (some + 1) * 1_000_000
     assert device.allocated == 0
 
 

@@ -74,6 +74,7 @@ def test_the_same_bits(family, alone, kind, count, monkeypatch, steps):
     assert [device.allocated for device in devices] == [0] * count
 
 
+@pytest.mark.one_family
 @pytest.mark.parametrize("faster", ["alone", "together"])
 def test_steps_are_taken_as_is_faster(family, alone, faster, monkeypatch, steps):
     """Who was left out of some steps is told what the others know by then."""
@@ -92,9 +93,16 @@ def test_steps_are_taken_as_is_faster(family, alone, faster, monkeypatch, steps)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [HostPool, ElsewherePool])
-@pytest.mark.parametrize("command", ["__init__", "sums"])
-@pytest.mark.parametrize("lost", ["one", "all"])
+@pytest.mark.one_family
+@pytest.mark.parametrize(
+    ("kind", "command", "lost"),
+    [
+        (HostPool, "__init__", "one"),
+        (ElsewherePool, "sums", "one"),
+        (HostPool, "sums", "all"),
+        (ElsewherePool, "__init__", "all"),
+    ],
+)
 def test_a_worker_that_is_lost(family, alone, kind, command, lost, monkeypatch, caplog):
     monkeypatch.setattr(together, "_TRIED", OPTIONS.steps)
     devices = [open_device(family) for _ in range(3)]
@@ -116,6 +124,7 @@ def test_a_worker_that_is_lost(family, alone, kind, command, lost, monkeypatch, 
     assert [device.allocated for device in devices] == [0] * 3
 
 
+@pytest.mark.one_family
 def test_a_pool_of_one_device_helps_nobody(family, alone):
     device = open_device(family)
     with HostPool([device]) as pool:

@@ -274,7 +274,7 @@ def test_python_takes_several_devices(plush_excerpt, plush_excerpt_cameras):
 @pytest.mark.slow
 def test_large_scenes_view_by_view(monkeypatch):
     """Each device looks at its views with what these may draw."""
-    scene, cameras = street(5, 900)
+    scene, cameras = street(5, 400)
     options = EncodeOptions.for_preset("best", between=False, prune={"iterations": 6}, refit={"steps": 2})
     options = dataclasses.replace(options, cameras_anyway=True)
     alone = open_device("gpu")

@@ -69,12 +69,17 @@ def judged(device, scene, coded, views, pool=None):
     return comparison, beside
 
 
+@pytest.fixture(scope="module")
+def alone(family, plush_excerpt, cameras, coded):
+    """The figures of one device."""
+    return judged(open_device(family), plush_excerpt, coded, EvaluationViews.of(cameras))
+
+
 @pytest.mark.parametrize("kind", [HostPool, ElsewherePool])
-def test_the_same_figures(plush_excerpt, cameras, coded, family, kind):
-    views = EvaluationViews.of(cameras)
+def test_the_same_figures(plush_excerpt, cameras, coded, alone, family, kind):
+    views, expected = EvaluationViews.of(cameras), alone
     assert len(views.views) == 5
     assert len(views.beside) == 4
-    expected = judged(open_device(family), plush_excerpt, coded, views)
     assert 20 < expected[1] < 90
     devices = [open_device(family) for _ in range(3)]
     done = {device: 0 for device in devices}
@@ -95,9 +100,8 @@ def test_the_same_figures(plush_excerpt, cameras, coded, family, kind):
 
 
 @pytest.mark.one_family
-def test_a_scene_that_is_kept_is_not_sent_again(plush_excerpt, cameras, coded, family, monkeypatch):
-    views = EvaluationViews.of(cameras)
-    expected = judged(open_device(family), plush_excerpt, coded, views)
+def test_a_scene_that_is_kept_is_not_sent_again(plush_excerpt, cameras, coded, alone, family, monkeypatch):
+    views, expected = EvaluationViews.of(cameras), alone
     devices = [open_device(family) for _ in range(2)]
     with HostPool(devices) as pool, ResidentScene(devices[0], plush_excerpt) as kept:
         for device in devices:
@@ -143,12 +147,19 @@ def test_views_of_the_same_name(plush_excerpt, cameras, coded, family):
 
 @pytest.mark.slow
 @pytest.mark.one_family
-@pytest.mark.parametrize("kind", [HostPool, ElsewherePool])
-@pytest.mark.parametrize("command", ["__init__", "take", "figures"])
-@pytest.mark.parametrize("lost", ["one", "all"])
-def test_a_worker_that_is_lost(plush_excerpt, cameras, coded, family, kind, command, lost, monkeypatch, caplog):
-    views = EvaluationViews.of(cameras)
-    expected = judged(open_device(family), plush_excerpt, coded, views)
+@pytest.mark.parametrize(
+    ("kind", "command", "lost"),
+    [
+        (HostPool, "__init__", "one"),
+        (ElsewherePool, "take", "one"),
+        (HostPool, "figures", "one"),
+        (ElsewherePool, "__init__", "all"),
+        (HostPool, "take", "all"),
+        (ElsewherePool, "figures", "all"),
+    ],
+)
+def test_a_worker_that_is_lost(plush_excerpt, cameras, coded, alone, family, kind, command, lost, monkeypatch, caplog):
+    views, expected = EvaluationViews.of(cameras), alone
     devices = [open_device(family) for _ in range(3)]
     real = getattr(JudgingPart, command)
 
@@ -234,7 +245,7 @@ def _small_groups(monkeypatch):
 @pytest.mark.usefixtures("_small_groups")
 @pytest.mark.one_family
 def test_views_of_a_large_scene_are_judged_by_what_they_see(family, monkeypatch):
-    scene, cameras = street(5, 500, across=True)
+    scene, cameras = street(5, 250, across=True)
     cameras = [dataclasses.replace(c, split="test" if k % 2 else "train") for k, c in enumerate(cameras)]
     coded = CodedScene(Potr(), encode(scene, None, OPTIONS.changed(prune=False, refit=False, compact=False)).data)
     views = EvaluationViews.of(cameras)
@@ -267,7 +278,7 @@ def test_views_of_a_large_scene_are_judged_by_what_they_see(family, monkeypatch)
 @pytest.mark.usefixtures("_small_groups")
 def test_with_little_memory_a_decoded_file_is_judged_by_what_views_see_too(family, monkeypatch):
     """On a CPU, whose memory is the host's: neither scene lies whole on the device."""
-    scene, cameras = street(5, 500, across=True)
+    scene, cameras = street(5, 250, across=True)
     views = EvaluationViews.of(
         [dataclasses.replace(c, split="test" if k % 2 else "train") for k, c in enumerate(cameras)]
     )
@@ -303,7 +314,7 @@ def test_with_little_memory_a_decoded_file_is_judged_by_what_views_see_too(famil
 @pytest.mark.one_family
 def test_an_encode_leaves_the_groups_that_it_has_found(family, monkeypatch):
     monkeypatch.setattr("potr_cl.views.visibility.LEAST_SPLATS", 1)
-    scene, cameras = street(5, 500, across=True)
+    scene, cameras = street(5, 250, across=True)
     device = open_device(family)
     with ResidentScene(device, scene) as kept:
         encode(scene, cameras, dataclasses.replace(OPTIONS, cameras_anyway=True), device=device, kept=kept)
@@ -316,7 +327,7 @@ def test_an_encode_leaves_the_groups_that_it_has_found(family, monkeypatch):
 @pytest.mark.parametrize("rules", ["inria", "gsplat"])
 def test_pictures_of_what_views_see(family, where, rules):
     """Of the host's scene and of one that lies on the device, one view and several, one of which sees nothing."""
-    scene, cameras = street(5, 500, across=True)
+    scene, cameras = street(5, 250, across=True)
     away = dataclasses.replace(cameras[0], translation=cameras[0].translation + np.array([0, 0, -500.0]))
     device, rules = open_device(family), potr_cl.raster.rules.RULES[rules]
     groups = SplatGroups.of(scene)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib
 import pickle
 from itertools import chain
@@ -48,16 +49,28 @@ def family(request):
     return request.param
 
 
-def with_a_house_that_nobody_sees(scene):
-    behind = scene.subset(np.arange(200))
+@functools.cache
+def street_with_a_house_that_nobody_sees():
+    scene, cameras = street(5, 250, across=True)
+    behind = scene.subset(np.arange(150))
     behind = dataclasses.replace(behind, means=behind.means - np.float32([500, 0, 0]))
     together = (np.concatenate([getattr(each, f.name) for each in (scene, behind)]) for f in array_fields(scene))
     named = dict(zip([f.name for f in array_fields(scene)], together, strict=True))
-    return dataclasses.replace(scene, **named)
+    return dataclasses.replace(scene, **named), cameras
 
 
 def array_fields(scene):
     return [f for f in dataclasses.fields(scene) if isinstance(getattr(scene, f.name), np.ndarray)]
+
+
+#: A GPU decides itself, and what nobody sees stays; no re-fits on the way.
+IN_THE_END = OPTIONS.changed(prune={"keep": None}, refit={"at": ()})
+
+
+@functools.cache
+def in_the_end_alone(family):
+    """What one device makes of that street."""
+    return encode(*street_with_a_house_that_nobody_sees(), IN_THE_END, device=open_device(family))
 
 
 @pytest.mark.slow
@@ -73,8 +86,7 @@ def array_fields(scene):
     ids=["by number", "little memory", "by threshold"],
 )
 def test_the_same_bytes(family, options, monkeypatch):
-    scene, cameras = street(5, 500, across=True)
-    scene = with_a_house_that_nobody_sees(scene)
+    scene, cameras = street_with_a_house_that_nobody_sees()
     expected = encode(scene, cameras, options, device=open_device(family)).data
     made = []
 
@@ -106,17 +118,15 @@ def test_the_same_bytes(family, options, monkeypatch):
 @pytest.mark.one_family
 def test_a_re_fit_sends_what_views_draw(family, monkeypatch):
     """Of a direction, each worker gets the coefficients of these splats alone; what it finds is the same."""
-    scene, cameras = street(5, 500, across=True)
-    scene = with_a_house_that_nobody_sees(scene)
-    options = OPTIONS.changed(prune={"keep": None}, refit={"at": ()})
+    scene, cameras = street_with_a_house_that_nobody_sees()
     found, sent = [], []
     for left_out in (False, True):
         with monkeypatch.context() as patched, ElsewherePool([open_device(family) for _ in range(4)]) as pool:
             if not left_out:
                 patched.setattr(DrawnRows, "are_worth_it", lambda drawn: False)
-            found.append(encode(scene, cameras, options, device=pool.first, pool=pool).data)
+            found.append(encode(scene, cameras, IN_THE_END, device=pool.first, pool=pool).data)
             sent.append(pool.traffic.of["normal"].sent)
-    assert found[0] == found[1]
+    assert found[0] == found[1] == in_the_end_alone(family).data
     assert 0 < sent[1] < 0.8 * sent[0]
 
 
@@ -150,11 +160,9 @@ def test_who_is_told_again_is_told_the_colours_of_then(lost_at, monkeypatch, plu
 @pytest.mark.slow
 def test_a_re_fit_without_room_for_that_sends_all(monkeypatch):
     """The bytes are the same, and nothing stays taken."""
-    scene, cameras = street(5, 500, across=True)
-    scene = with_a_house_that_nobody_sees(scene)
-    options = OPTIONS.changed(prune={"keep": None}, refit={"at": ()})
+    scene, cameras = street_with_a_house_that_nobody_sees()
     devices = [open_device("cpu") for _ in range(4)]
-    expected = encode(scene, cameras, options, device=devices[0]).data
+    expected = in_the_end_alone("cpu").data
     refused = []
 
     class WithoutRoom(DrawnRows):
@@ -164,7 +172,7 @@ def test_a_re_fit_without_room_for_that_sends_all(monkeypatch):
 
     monkeypatch.setattr("potr_cl.stages.refitting.helpers.DrawnRows", WithoutRoom)
     with ElsewherePool(devices) as pool:
-        assert encode(scene, cameras, options, device=devices[0], pool=pool).data == expected
+        assert encode(scene, cameras, IN_THE_END, device=devices[0], pool=pool).data == expected
     assert refused
     assert [device.allocated for device in devices] == [0] * 4
 
@@ -174,14 +182,12 @@ def test_a_re_fit_without_room_for_that_sends_all(monkeypatch):
 def test_the_uncompressed_scene_travels_once(family, monkeypatch):
     """Where workers get all of it: of what is pruned, once unseen splats are set aside, they get the numbers."""
     monkeypatch.setattr(visibility, "LEAST_SPLATS", 1 << 40)
-    scene, cameras = street(5, 500, across=True)
-    scene = with_a_house_that_nobody_sees(scene)
-    options = OPTIONS.changed(prune={"keep": None}, refit={"at": ()})
+    scene, cameras = street_with_a_house_that_nobody_sees()
     devices = [open_device(family) for _ in range(3)]
-    expected = encode(scene, cameras, options, device=devices[0])
+    expected = in_the_end_alone(family)
     assert expected.unseen.splats > 100
     with ElsewherePool(devices) as pool:
-        assert encode(scene, cameras, options, device=devices[0], pool=pool).data == expected.data
+        assert encode(scene, cameras, IN_THE_END, device=devices[0], pool=pool).data == expected.data
         constant = 56 * len(scene)
         assert pool.scenes < scene.nbytes + constant
 
@@ -192,8 +198,7 @@ def test_workers_with_gpus_look_at_each_view_with_what_it_may_draw(keep, monkeyp
     """As a GPU with memory of its own does: a CPU that runs its kernels has none."""
     family = next(each for each in FAMILIES if "gpu" in str(each))
     family = getattr(family, "values", [family])[0]
-    scene, cameras = street(5, 500, across=True)
-    scene = with_a_house_that_nobody_sees(scene)
+    scene, cameras = street_with_a_house_that_nobody_sees()
     options = OPTIONS.changed(prune={"keep": keep})
     expected = encode(scene, cameras, options, device=open_device(family)).data
     monkeypatch.setattr("potr_cl.raster.resident.fits_whole", lambda device, scene: True)

@@ -4,8 +4,8 @@
 
 The folder is streamed SOG, by any tool. Two tables, both of held-out views:
 
-- of each level: PSNR against the full scene in views that are smaller by √½ a level, and against the level before it
-  there, where a viewer changes from one to the other;
+- of each level: PSNR against the full scene in views that are smaller by √½ a level, for which our levels are made, and
+  against the level before it there; the same where one does not see a viewer change from one to the other, or hardly;
 - of budgets: the levels that PlayCanvas' engine would show of each leaf in each view for so many splats (coverage ×
   error removed / splats added, until one does not fit), the PSNR of that, and how far the sum of coverage × error is
   from the squared error that the picture really has against the finest level, the median over the views.
@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 
 from potr_cl import load_cameras, load_scene
 from potr_cl.levels.errors import coverage
-from potr_cl.levels.plan import scale_of_level, views_of_level
+from potr_cl.levels.plan import scale_of_level, scaled
+from potr_cl.levels.seams import scales_shown
 from potr_cl.model.camera import Camera, test_views
 from potr_cl.model.scene import Scene, joined
 from potr_cl.opencl.device import Device
@@ -141,14 +142,19 @@ def main() -> None:
     name = args.scene.name
     table = results.table(
         f"levels_{name}", f"Levels of {name}, in views of the size in which each is shown",
-        "level; splats||,; of the scene|%|.1f; size of views||.2f; PSNR|dB|.2f; PSNR against the level before|dB|.2f",
+        "level; splats||,; of the scene|%|.1f; size of views||.2f; PSNR|dB|.2f; PSNR against the level before|dB|.2f; "
+        "shown from, size of views||.2f; PSNR there|dB|.2f; against the level before there|dB|.2f",
     )  # fmt: skip
+    scales = scales_shown(device, streamed.scenes.__getitem__, len(streamed.scenes), views)
     for level, scene in enumerate(streamed.scenes):
-        small = views_of_level(views, level)
-        own, whole = pictures(device, scene, small), pictures(device, full, small)
-        seam = None if not level else decibels(differences(pictures(device, streamed.scenes[level - 1], small), own))
-        part = 100 * len(scene) / len(full)
-        table.add(level, len(scene), part, scale_of_level(level), decibels(differences(own, whole)), seam)
+        cells: list[float | None] = []
+        for scale in (scale_of_level(level), scales[level]):
+            small = scaled(views, scale)
+            own = pictures(device, scene, small)
+            finer = pictures(device, streamed.scenes[level - 1], small) if level else []
+            cells += [scale, decibels(differences(own, pictures(device, full, small)))]
+            cells.append(decibels(differences(finer, own)) if level else None)
+        table.add(level, len(scene), 100 * len(scene) / len(full), *cells)
     table = results.table(
         f"budgets_{name}", f"What is shown of {name} for a budget of splats, {len(streamed.boxes)} leaves",
         "budget||,; splats shown||,; PSNR|dB|.2f; error against the finest|dB|.2f; foretold|dB|.2f; "

@@ -16,9 +16,6 @@ from tools.stress import native as stress
 from tools.stress.hostile.formats import WrongResult
 from tools.stress.hostile.worker import changed_files
 
-COMPILER = shutil.which("cc")
-needs_compiler = pytest.mark.skipif(COMPILER is None, reason="there is no C compiler")
-
 #: Tells C of one number more than there is.
 BEYOND = """
 import ctypes, sys
@@ -39,11 +36,18 @@ def run(program, *arguments, **environment):
     )  # fmt: skip
 
 
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    """The compiled part with sanitizers."""
+    if shutil.which("cc") is None:
+        pytest.skip("there is no C compiler")
+    path = tmp_path_factory.mktemp("native") / "sanitized.so"
+    compile_library(path, sanitize=True)
+    return path
+
+
 @pytest.mark.slow
-@needs_compiler
-def test_the_sanitizer_sees_one_byte_beyond(tmp_path):
-    library = tmp_path / "sanitized.so"
-    compile_library(library, sanitize=True)
+def test_the_sanitizer_sees_one_byte_beyond(library):
     environment = stress.sanitizers(library)
     assert run(["-c", BEYOND], library, 0, **environment).returncode == 0
     beyond = run(["-c", BEYOND], library, 1, **environment)
@@ -51,23 +55,17 @@ def test_the_sanitizer_sees_one_byte_beyond(tmp_path):
     assert "heap-buffer-overflow" in beyond.stderr
 
 
-@needs_compiler
 @pytest.mark.slow
-def test_changed_files_are_read_alike(tmp_path):
-    command = [
-        "-m",
-        "tools.stress.native",
-        "--count",
-        "60",
-        "--processes",
-        "2",
-        "--json",
-        str(tmp_path / "native.json"),
-    ]
-    done = run(command)
-    assert done.returncode == 0, done.stderr
-    ((_, files, read, refused, findings, *_),) = json.loads((tmp_path / "native.json").read_text())["native"]["rows"]
-    assert (files, findings) == (60, 0)
+def test_changed_files_are_read_alike(tmp_path, library, monkeypatch):
+    """By the whole command, which need not compile again."""
+    report = tmp_path / "native.json"
+    monkeypatch.setattr(stress, "compile_library", lambda path, **_: shutil.copyfile(library, path))
+    monkeypatch.setattr(sys, "argv", ["native", "--seed", "8", "--count", "15", "--json", str(report)])
+    with pytest.raises(SystemExit) as ended:
+        stress.main()
+    assert ended.value.code == 0
+    ((_, files, read, refused, findings, *_),) = json.loads(report.read_text())["native"]["rows"]
+    assert (files, findings) == (15, 0)
     assert read + refused == files
     assert read > 0 < refused
 

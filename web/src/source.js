@@ -46,7 +46,7 @@ class Arriving {
  * @typedef {object} Opened
  * @property {import('./container.js').Header} header
  * @property {(offset: number, number: number) => Promise<Uint8Array>} read
- * @property {() => Promise<void>} end checks that nothing follows, where that is not known
+ * @property {() => Promise<void>} end checks that nothing follows, where that is not known and the file's end was wanted
  * @property {(wanted: [number, number][]) => Promise<void>} only tells which ranges will be read, in their order
  */
 
@@ -76,7 +76,7 @@ export async function open(source, trust, signal) {
   const fixed = await body.read(0, FIXED_BYTES, true), whole = fixed.length === FIXED_BYTES;
   const size = headerBytes(fixed, fixed.length), said = whole ? Number(saidBytes(fixed)) : fixed.length;
   const start = await body.read(0, size, true), header = readHeader(start, start.length < size ? start.length : said, trust);
-  let ranges = false;
+  let ranges = false, last = said;
   /** @param {number} offset @param {number} number */
   const read = async (offset, number) => {
     const bytes = ranges ? await range(url, offset, number, signal) : await body.read(offset, number);
@@ -88,11 +88,12 @@ export async function open(source, trust, signal) {
     read,
     end: async () => {
       if (ranges) return;
-      const more = await body.read(said, 1);
+      const more = last < said ? [] : await body.read(said, 1);
       await body.cancel();
       if (more.length) refuse(`followed by something else: the file has more than the ${said} bytes that its header says`);
     },
     only: async (wanted) => {
+      last = Math.max(...wanted.map(([offset, number]) => offset + number));
       const bytes = wanted.reduce((sum, [, number]) => sum + number, 0);
       if (!url || !wanted.length || bytes > 0.75 * said) return;
       // A server that has ranges answers 206; if not, the body goes on arriving.

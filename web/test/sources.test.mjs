@@ -9,6 +9,9 @@ import { BUILDS, DATA, PotrError, decode } from './decoders.mjs';
 
 const { 'with SIMD': wasm } = BUILDS;
 const BLOCKS = new Uint8Array(readFileSync(new URL('golden_blocks.potr', DATA)));
+const LEVELS = new Uint8Array(readFileSync(new URL('golden_levels.potr', DATA)));
+/** The header and the coarsest level, of a single block, which comes first. */
+const COARSE = 994;
 const BITS = (scene) => ['positions', 'scales', 'rotations', 'opacities', 'sh'].map((name) => Buffer.from(scene[name].buffer, scene[name].byteOffset, scene[name].byteLength).toString('base64'));
 
 let server, base;
@@ -17,6 +20,8 @@ before(async () => {
   server = createServer((request, response) => {
     const path = request.url ?? '', [, from, to] = /bytes=(\d+)-(\d+)/.exec(request.headers.range ?? '') ?? [];
     asked.push([path, request.headers.range]);
+    if (path === '/levels') return from ? response.writeHead(206).end(LEVELS.subarray(+from, +to + 1)) : response.writeHead(200).write(LEVELS.subarray(0, COARSE - 200));
+    if (path === '/coarse') return response.writeHead(200).write(LEVELS.subarray(0, COARSE)); // and nothing more
     if (path === '/none') return response.writeHead(404).end();
     if (path === '/ranges' && from) return response.writeHead(206).end(BLOCKS.subarray(+from, +to + 1));
     let at = 0, end = path === '/short' ? BLOCKS.length - 100 : BLOCKS.length;
@@ -67,6 +72,20 @@ for (const path of ['ranges', 'slow'])
     assert.deepEqual(BITS(await decode(`${base}/${path}`, { wasm, box, maxShDegree: 0 })), BITS(local));
     assert.ok(path !== 'ranges' || asked.some(([, range]) => range), 'no range was asked for');
   });
+
+test('the coarsest level is there before the others have arrived', async () => {
+  const coarse = await decode(LEVELS, { wasm, level: 1 }), finest = await decode(LEVELS, { wasm });
+  assert.ok(coarse.count > 0 && coarse.count < finest.count);
+  assert.deepEqual(BITS(await decode(`${base}/coarse`, { wasm, level: 1 })), BITS(coarse));
+});
+
+test('of a server that has ranges, a level is all that is asked for', async () => {
+  asked.length = 0;
+  assert.deepEqual(BITS(await decode(`${base}/levels`, { wasm, level: 1 })), BITS(await decode(LEVELS, { wasm, level: 1 })));
+  const ranges = asked.map(([, range]) => range).filter(Boolean).map((range) => range.match(/\d+/g).map(Number));
+  assert.ok(ranges.length);
+  assert.equal(Math.max(...ranges.flat()), COARSE - 1);
+});
 
 test('what is broken off, or goes on, or is not there', async () => {
   await assert.rejects(decode(`${base}/short`, { wasm }), new RegExp(`truncated: the file has ${BLOCKS.length - 100} bytes, its header says ${BLOCKS.length}`));

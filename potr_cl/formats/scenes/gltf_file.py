@@ -308,6 +308,15 @@ def binary(scene: Scene, spz: Sequence[bytes]) -> list[bytes]:
     return [head, said, _CHUNK.pack(chunk, _BINARY), *spz, padding]
 
 
+def spz_in(data: bytes) -> bytes:
+    """The SPZ of a file that :func:`binary` has made."""
+    (said, _) = _CHUNK.unpack_from(data, _HEADER.size)
+    start = _HEADER.size + _CHUNK.size
+    (view,) = json.loads(data[start : start + said])["bufferViews"]
+    start += said + _CHUNK.size
+    return data[start : start + view["byteLength"]]
+
+
 def _accessor(scene: Scene, name: str, parts: int) -> dict[str, Any]:
     accessor: dict[str, Any] = {
         "componentType": _FLOAT,

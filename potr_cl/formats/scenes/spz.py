@@ -7,6 +7,7 @@ a file rarely says which it holds. So axes are kept as they are, in both directi
 from __future__ import annotations
 
 import gzip
+import io
 import logging
 import os
 import struct
@@ -16,6 +17,7 @@ from typing import BinaryIO
 
 import numpy as np
 import zstandard
+from numpy.typing import NDArray
 
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
@@ -160,6 +162,19 @@ def pieces(properties: list[bytes], scene: Scene, fractional_bits: int, version:
     streams = sum(map(bool, properties)) if version > 3 else 0
     header = _HEADER.pack(_MAGIC, version, len(scene), scene.sh_degree, fractional_bits, flags, streams)
     return _streams(header, properties) if version > 3 else _gzipped(header, properties)
+
+
+def part(data: bytes, rows: NDArray[np.int64]) -> list[bytes]:
+    """Some splats of a gzipped file as one of their own, in pieces; nothing is rounded anew.
+
+    Args:
+        data: the file, of version 2 or 3, that this package has written.
+        rows: (n,) the numbers of the splats in it.
+    """
+    header, properties = _read_gzip("", gzip.GzipFile(fileobj=io.BytesIO(data)), len(data), True)
+    own = [np.frombuffer(each, np.uint8).reshape(header.splats, -1)[rows].tobytes() for each in properties]
+    bits = header.fractional_bits
+    return _gzipped(_HEADER.pack(_MAGIC, header.version, len(rows), header.degree, bits, header.flags, 0), own)
 
 
 def stream_sizes(data: bytes) -> dict[str, int]:

@@ -34,15 +34,7 @@ def prune_scene(
     after_iteration: Callable[[int], None] | None = None,
     spared: NDArray[np.bool_] | None = None,
 ) -> Pruned:
-    """Run the schedule: on the device if it can decide for itself, else on the host.
-
-    Args:
-        removal: measures and removes.
-        options: thresholds and iterations.
-        progress: called with the iterations done and the number of splats left.
-        after_iteration: called with the iteration.
-        spared: (N,) splats that stay, whatever their effect; None: none.
-    """
+    """As :func:`potr_cl.stages.pruning.schedule.prune`, on the device if it can decide for itself, else on the host."""
     if removal.steering is None or options.count is not None or not np.isfinite(options.delta_mse_max):
         return prune(removal, removal.splats, options, progress, after_iteration, spared)
     with _Controller(removal.steering, options, spared) as controller:

@@ -1,0 +1,151 @@
+"""3D Tiles: the tree of tiles, what is in them, and what is read of them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from potr_cl import DataError, Scene, UsageError, cli
+from potr_cl.codec.quantize import HyperParameters
+from potr_cl.formats import load_scene
+from potr_cl.formats.registry import bytes_of_scene
+from potr_cl.outputs.lod_tree import extents_of
+from potr_cl.outputs.output import Request
+from potr_cl.outputs.spz import Gltf
+from potr_cl.outputs.tiles import Tiles
+from tests.reference.scenes import random_scene
+
+COUNTS = (3000, 1500, 400)
+FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
+
+
+class Told:
+    """Errors that are told, in place of measured ones."""
+
+    def of_level(self, level: int) -> float:
+        return level / 4
+
+
+@pytest.fixture(scope="module", params=[2, 3])
+def made(request: Any, tmp_path_factory: Any) -> tuple[list[Scene], Path]:
+    """What the levels are read as, and the folder."""
+    output, asked = Tiles(lod_chunk_count=1, version=request.param), Request(HyperParameters.from_quality(0.5, "best"))
+    scene = random_scene(COUNTS[0], 1)
+    files = [
+        b"".join(output.of_level().file(scene.subset(np.arange(n)), None, asked).pieces)
+        for n in COUNTS
+    ]  # fmt: skip
+    path = tmp_path_factory.mktemp("city") / "tileset.json"
+    with path.open("wb") as file:
+        output.write(output.levelled(files, Told()), file, path)  # type: ignore[arg-type]
+    return [Gltf().read(data) for data in files], path
+
+
+def tiles_of(path: Path) -> Iterator[tuple[dict[str, Any], dict[str, Any] | None]]:
+    """Each tile, and the one above it."""
+    tiles: list[tuple[dict[str, Any], dict[str, Any] | None]] = [(json.loads(path.read_text())["root"], None)]
+    while tiles:
+        tile, above = tiles.pop()
+        yield tile, above
+        tiles += [(child, tile) for child in tile.get("children", [])]
+
+
+def rows_of(scene: Scene) -> set[bytes]:
+    flat = [getattr(scene, field).reshape(len(scene), -1) for field in FIELDS]
+    return {row.tobytes() for row in np.concatenate(flat, axis=1)}
+
+
+def test_tiles_hold_every_level_as_it_was_encoded(made: tuple[list[Scene], Path]) -> None:
+    levels, path = made
+    found: list[set[bytes]] = [set() for _ in COUNTS]
+    counts = [0] * len(COUNTS)
+    for tile, _ in tiles_of(path):
+        if "content" in tile:
+            scene, level = load_scene(path.parent / tile["content"]["uri"]), int(tile["content"]["uri"][0])
+            found[level] |= rows_of(scene)
+            counts[level] += len(scene)
+    assert counts == list(COUNTS)
+    assert found == [rows_of(scene) for scene in levels]
+
+
+def test_finer_tiles_replace_coarser_ones(made: tuple[list[Scene], Path]) -> None:
+    _, path = made
+    description = json.loads(path.read_text())
+    assert description["asset"]["version"] == "1.1"
+    assert description["root"]["refine"] == "REPLACE"
+    assert description["geometricError"] >= description["root"]["geometricError"]
+    contents = 0
+    for tile, above in tiles_of(path):
+        children, error = tile.get("children", []), tile["geometricError"]
+        assert above is None or above["geometricError"] >= error
+        if "content" in tile:
+            contents += 1
+            level = int(tile["content"]["uri"][0])
+            assert error == (16 * level / 4 if children else 0)
+            assert all(int(child["content"]["uri"][0]) < level for child in children)
+        else:
+            assert len(children) == 2
+    assert contents > 3 * 4
+
+
+def test_boxes_hold_the_ellipsoids_where_tiles_have_them(made: tuple[list[Scene], Path]) -> None:
+    """In tiles z is up where y is in glTF, whose x, y, z are x, -z, y of tiles."""
+    _, path = made
+    for tile, above in tiles_of(path):
+        box = np.array(tile["boundingVolume"]["box"])
+        centre, half = box[:3], np.abs(box[3:].reshape(3, 3)).sum(axis=0)
+        if above is not None:
+            outer = np.array(above["boundingVolume"]["box"])
+            assert (np.abs(centre - outer[:3]) + half <= np.abs(outer[3:].reshape(3, 3)).sum(axis=0) + 1e-9).all()
+        if "content" in tile:
+            scene = load_scene(path.parent / tile["content"]["uri"])
+            places = np.stack([scene.means[:, 0], -scene.means[:, 2], scene.means[:, 1]], axis=1)
+            extents = extents_of(scene)[:, [0, 2, 1]]
+            assert (np.abs(places - centre) + extents <= half * (1 + 1e-6) + 1e-6).all()
+
+
+def test_the_finest_tiles_are_read(made: tuple[list[Scene], Path]) -> None:
+    levels, path = made
+    assert rows_of(load_scene(path)) == rows_of(load_scene(path.parent)) == rows_of(levels[0])
+    assert bytes_of_scene(path) == sum(file.stat().st_size for file in path.parent.rglob("*") if file.is_file())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda m: m.pop("root"), "it has no root"),
+        (lambda m: m["root"].update(children=3), "a tile is invalid"),
+        (lambda m: m["root"].update(children=[3]), "a tile is invalid"),
+        (lambda m: m["root"].update(children=[]), "no tiles with content"),
+        (lambda m: m["root"].update(children=[], content=3), "it names a file None"),
+        (lambda m: m["root"].update(children=[], content={"uri": "../a.glb"}), "it names a file"),
+        (lambda m: m["root"].update(children=[], content={"uri": "a.b3dm"}), "only those of glTF"),
+        (lambda m: m["root"]["children"][0].update(transform=[2] * 16), "a place of their own"),
+    ],
+)
+def test_bad_tilesets(
+    change: Callable[[Any], Any], message: str, made: tuple[list[Scene], Path], tmp_path: Path
+) -> None:
+    description = json.loads(made[1].read_text())
+    change(description)
+    (tmp_path / "tileset.json").write_text(json.dumps(description))
+    with pytest.raises(DataError, match=message):
+        load_scene(tmp_path)
+
+
+def test_the_command_writes_a_folder(data: Path, tmp_path: Path, capsys: Any) -> None:
+    path, words = tmp_path / "city" / "tileset.json", ["encode", f"{data}/plush_excerpt.ply", "-o"]
+    choices = f"--cameras {data}/plush_excerpt_cameras.json --levels 2 --lod-chunk-count 1 --iterations 2 --refit 2"
+    assert cli.main([*words, str(path), *choices.split(), "--views-between", "0", "--no-quality", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert len(load_scene(path)) == report["splats"]
+    assert report["bytes"] == bytes_of_scene(path)
+    assert cli.main([*words, str(tmp_path / "tileset.json"), "--lod-chunk-count", "0"]) == 2
+    assert "--lod-chunk-count is 0, it must be above 0" in capsys.readouterr().err
+    with pytest.raises(UsageError, match="version 2 or 3"):
+        Tiles(version=4)
