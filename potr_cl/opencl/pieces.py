@@ -28,7 +28,7 @@ from potr_cl.opencl.source import kernel_source
 _AIM = 0.4
 #: A piece has at most so many times the work-groups of the one before, and of a launch's at most one part in so many.
 _GROWTH, _PARTS = 4, 16
-#: What is left of the slowest piece's rate at the next launch; pieces below this part of the aim tell of overhead alone.
+#: What is left of the slowest piece's rate at the next launch; below this part of the aim a piece tells of overhead.
 _MEMORY, _TELLING = 0.9, 1 / 16
 #: Work-groups of a first piece for each compute unit; how many launches of a short kernel go unmeasured.
 _FIRST, _UNMEASURED = 2, 15
