@@ -26,8 +26,10 @@ from potr_cl.opencl.source import kernel_source
 
 #: Of the allowed time, what a piece should take: the next work-groups may have more to do than the last.
 _AIM = 0.4
-#: A piece has at most so many times the work-groups of the one before.
-_GROWTH = 4
+#: A piece has at most so many times the work-groups of the one before, and of a launch's at most one part in so many.
+_GROWTH, _PARTS = 4, 16
+#: What is left of the slowest piece's rate at the next launch; below this part of the aim a piece tells of overhead.
+_MEMORY, _TELLING = 0.9, 1 / 16
 #: Work-groups of a first piece for each compute unit; how many launches of a short kernel go unmeasured.
 _FIRST, _UNMEASURED = 2, 15
 #: Work-items of the smallest piece where the driver chooses work-groups.
@@ -49,11 +51,12 @@ def uncut(kernel: Declared) -> frozenset[int]:
 
 @dataclass
 class _Known:
-    """Of a kernel: seconds a work-group, work-groups of the last piece, and launches until it is measured again."""
+    """Of a kernel: seconds a work-group in whole launches and in the slowest pieces, and launches until it is measured
+    again."""
 
     rate: float
-    last: int
-    unmeasured: int = 0
+    slowest: float
+    unmeasured: int
 
 
 @dataclass
@@ -94,7 +97,8 @@ class Pieces:
         unit = group or (min(_OWN_GROUP, items[0]), *items[1:])
         grid = tuple(-(-n // u) for n, u in zip(items, unit, strict=True))
         known, total, aim = self._known.get(kernel), prod(grid), _AIM * self.seconds
-        if known is not None and known.unmeasured > 0 and known.rate * total <= aim / 2:
+        is_short = known is not None and known.rate * total <= aim / 2
+        if known is not None and is_short and known.unmeasured > 0:
             known.unmeasured -= 1
             if self._pending + known.rate * total > aim:
                 queue.finish()
@@ -105,12 +109,10 @@ class Pieces:
         queue.finish()
         self._pending = 0.0
         walk = _Walk(grid, uncut(kernel))
-        pieces, name = 0, kernel[1]
+        pieces, whole, name = 0, 0.0, kernel[1]
+        slowest = 0.0 if known is None else _MEMORY * known.slowest
+        count = total if is_short else _FIRST * self.compute_units
         while not walk.done:
-            if known is None:
-                count = _FIRST * self.compute_units
-            else:
-                count = int(min(aim / max(known.rate, 1e-12), _GROWTH * known.last, total))
             place, size = walk.next(max(count, 1))
             offset = tuple(p * u for p, u in zip(place, unit, strict=True))
             wide = tuple(min(s * u, n - o) for s, u, n, o in zip(size, unit, items, offset, strict=True))
@@ -119,11 +121,14 @@ class Pieces:
             queue.finish()
             took = perf_counter() - began
             self.longest[name] = max(took, self.longest.get(name, 0.0))
-            rate = took / prod(size)
-            known = self._known[kernel] = _Known(
-                rate if known is None else max(rate, known.rate / 2), prod(size), _UNMEASURED
-            )
+            whole += took
             pieces += 1
+            rate = took / prod(size)
+            if took >= _TELLING * aim:
+                slowest = max(rate, slowest)
+            count = int(min(aim / max(rate, slowest, 1e-12), _GROWTH * prod(size), total / _PARTS))
+        rate = whole / max(total, 1)
+        self._known[kernel] = _Known(rate if known is None else max(rate, known.rate / 2), slowest, _UNMEASURED)
         self.cut[name] = self.cut.get(name, 0) + (pieces > 1)
 
 

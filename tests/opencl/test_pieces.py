@@ -72,9 +72,27 @@ def test_pieces_are_as_long_as_they_may_be(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr("potr_cl.opencl.pieces.perf_counter", lambda: clock.now)
     pieces = Pieces(seconds=100, compute_units=1)
     pieces.launch(clock.enqueue, clock, ("raster/reached.cl", "mark_reached", ()), (300,), (1,))  # type: ignore[arg-type]
-    assert clock.pieces == [2, 8, 32, *[40] * 6, 18]
-    assert pieces.longest == {"mark_reached": 40}
+    assert clock.pieces == [2, 8, *[18] * 16, 2]
+    assert pieces.longest == {"mark_reached": 18}
     assert pieces.cut == {"mark_reached": 1}
+
+
+class Uneven(Clock):
+    """Work-groups of the second half take a hundred times as long, 5 s in all."""
+
+    def enqueue(self, items: tuple[int, ...], offset: tuple[int, ...]) -> None:
+        slow = sum(items[0] + offset[0] > place >= offset[0] for place in range(1000, 2000))
+        self.now += (100 * slow + items[0] - slow) * 5 / 101_000
+
+
+def test_pieces_are_short_where_some_work_groups_have_much_more_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = Uneven()
+    monkeypatch.setattr("potr_cl.opencl.pieces.perf_counter", lambda: clock.now)
+    pieces = Pieces(seconds=0.25, compute_units=8)
+    for longest in (0.62, 0.25, 0.25):  # of the first launch nothing is known before
+        pieces.longest.clear()
+        pieces.launch(clock.enqueue, clock, ("raster/reached.cl", "mark_reached", ()), (2000,), (1,))  # type: ignore[arg-type]
+        assert pieces.longest["mark_reached"] <= longest
 
 
 @pytest.mark.slow

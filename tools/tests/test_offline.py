@@ -52,6 +52,16 @@ def test_nothing_is_spilled(source) -> None:
     assert all(use.scratch == 0 and use.waves >= 4 for use in uses.values()), uses
 
 
+@pytest.mark.skipif(not set(offline.INTEL) & set(offline.available()), reason="Intel's ocloc is not installed")
+@pytest.mark.slow
+@pytest.mark.parametrize("source", _LARGEST)
+def test_intel_gpus_spill_nothing(source) -> None:
+    for target in ("dg2", "pvc"):
+        uses = offline.measure(offline.programs(source, target)[-1], target)
+        assert uses
+        assert all(use.scratch == 0 for use in uses.values()), (target, uses)
+
+
 @needs_clang
 def test_a_program_that_is_refused_is_told(tmp_path) -> None:
     with pytest.raises(offline.OfflineError, match=r"refit/blocks.cl LANES=1 does not compile for gfx1100"):
