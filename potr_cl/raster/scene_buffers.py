@@ -41,6 +41,7 @@ class SceneBuffers(Owner):
         splats: N.
         sh_count: M, SH coefficients of a colour channel.
         antialiased, low_pass: as of :class:`potr_cl.model.scene.Scene`.
+        memory: owns the buffers, somebody else's; None: their own.
 
     Attributes:
         device, splats, sh_count, antialiased, low_pass: as given.
@@ -56,8 +57,9 @@ class SceneBuffers(Owner):
     """
 
     def __init__(
-        self, device: Device, splats: int, sh_count: int, antialiased: bool = False, low_pass: float = LOW_PASS
-    ) -> None:
+        self, device: Device, splats: int, sh_count: int, antialiased: bool = False, low_pass: float = LOW_PASS,
+        memory: Memory | None = None,
+    ) -> None:  # fmt: skip
         if splats > 0xFFFFFF00:
             raise DeviceError(f"{splats} splats are more than the kernels can number")
         self.device = device
@@ -65,7 +67,7 @@ class SceneBuffers(Owner):
         self.stride = stride_of(splats)
         self.sh_count = sh_count
         self.antialiased, self.low_pass = antialiased, low_pass
-        self._memory = Memory(device)
+        self._memory = memory or Memory(device)
         self.wake()
 
     def wake(self) -> None:

@@ -315,10 +315,13 @@ class CopiedSplats(_Parted):
         self._scene, self._whole = scene, whole
         self._other: FloatArray | None = None
 
-    def empty(self, count: int) -> SceneBuffers:
+    def streams_in(self) -> Memory:
+        return Reused(self.device)
+
+    def empty(self, count: int, memory: Memory | None = None) -> SceneBuffers:
         """Room for so many splats."""
         scene = self._scene
-        return SceneBuffers(self.device, count, scene.sh.shape[1], scene.antialiased, scene.low_pass)
+        return SceneBuffers(self.device, count, scene.sh.shape[1], scene.antialiased, scene.low_pass, memory)
 
     def fill(self, part: SceneBuffers, splats: Indices) -> None:
         """Write splats of these numbers there."""
@@ -336,7 +339,8 @@ class CopiedSplats(_Parted):
             splats = splats[left.mask[splats]]
         if not len(splats):
             return None
-        own = stack.enter_context(self.empty(len(splats)))
+        # What stays rests and wakes by itself; streamed splats lie where those before them lay.
+        own = stack.enter_context(self.empty(len(splats), memory if isinstance(memory, Reused) else None))
         self.fill(own, splats)
         rasterizer = stack.enter_context(self._rasterizer(own))
         named = splats.astype(np.uint32)
