@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -175,4 +176,11 @@ def test_every_format_that_is_read_is_told(tmp_path, data, scene):
             assert info["splats"] == len(potr_cl.read_scene(path)), path
             assert sum(info["opacity"]["counts"]) == info["splats"]
             told.add(info["format"])
+    tile = {"boundingVolume": {"sphere": [0, 0, 0, 9]}, "geometricError": 0, "content": {"uri": "tile.glb"}}
+    tileset = {"asset": {"version": "1.1"}, "geometricError": 1, "root": tile}
+    (tmp_path / "tileset.json").write_text(json.dumps(tileset))
+    shutil.copy(data / "other_tools" / "splat-transform.glb", tmp_path / "tile.glb")
+    info = potr_cl.info(tmp_path / "tileset.json")
+    assert info["splats"] == len(potr_cl.read_scene(tmp_path / "tile.glb"))
+    told.add(info["format"])
     assert told == {entry.name for entry in registry.SCENE_FORMATS}
