@@ -413,7 +413,8 @@ class Device:
 
     def _narrowest_sub_group(self) -> int | None:
         """The least of Intel's sizes that builds: work-items have most registers then (cl/include/registers.clh)."""
-        if {self.family, self.info.kind} != {"gpu"} or "cl_intel_required_subgroup_size" not in self.info.handle.extensions:
+        on_gpu = self.family == self.info.kind == "gpu"
+        if not on_gpu or "cl_intel_required_subgroup_size" not in self.info.handle.extensions:
             return None
         for self.sub_group in _SUB_GROUPS:
             try:
