@@ -17,7 +17,6 @@ from potr_cl.api.inputs import (
     ColourSource,
     SceneSource,
     bytes_of_source,
-    cameras_of,
     colour_of,
     encoded_bytes,
     holds_potr,
@@ -216,9 +215,7 @@ def compare_budgets(
     if not files or not wanted or wanted[-1] < 1:
         raise UsageError("--budget compares one scene or more, for numbers of splats of 1 or more")
     points = Viewpoints(**views)
-    given = cameras_of(cameras)
-    if given is not None:
-        points.refuse_with_cameras()
+    given = points.given(cameras)
     looks = Looks(colour_of(background), rules_of(rules), remember=True)
     levels, scene = [levelled(file, trust) for file in files], scene_of(a, trust, antialiased)
     with open_workers(device) as workers:

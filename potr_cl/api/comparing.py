@@ -14,7 +14,6 @@ from potr_cl.api.inputs import (
     ColourSource,
     SceneSource,
     bytes_of_source,
-    cameras_of,
     coded_scene,
     colour_of,
     drawable_of,
@@ -203,10 +202,8 @@ def compare(
     """
     colour, wanted = colour_of(background), rules_of(rules)
     points = Viewpoints(**views)
-    given = cameras_of(cameras)
-    if given is not None:
-        points.refuse_with_cameras()
-    elif truth is not None:
+    given = points.given(cameras)
+    if given is None and truth is not None:
         raise UsageError("--truth needs --cameras, the views that the photographs show")
     # Views are placed in a scene that the host has.
     source_a = a if given is not None else scene_of(a, trust, antialiased)

@@ -21,7 +21,6 @@ from potr_cl.api.inputs import (
     ColourSource,
     DeviceSource,
     SceneSource,
-    cameras_of,
     colour_of,
     device_of,
     drawable_of,
@@ -288,9 +287,7 @@ class _Views:
         trust: bool,
         antialiased: bool | None,
     ) -> None:
-        given = cameras_of(cameras)
-        if given is not None:
-            points.refuse_with_cameras()
+        given = points.given(cameras)
         self.device, self._trust, self._antialiased = device, trust, antialiased
         # Views are placed in a scene that the host has.
         self._source = scene if given is not None else scene_of(scene, trust, antialiased)

@@ -11,7 +11,7 @@ from typing import TypedDict
 
 import numpy as np
 
-from potr_cl.api.inputs import SceneSource, chosen_views, name_of, placed_beside_cameras
+from potr_cl.api.inputs import CamerasSource, SceneSource, cameras_of, chosen_views, name_of, placed_beside_cameras
 from potr_cl.errors import UsageError
 from potr_cl.formats.registry import cameras_beside
 from potr_cl.model.agreement import judge_cameras
@@ -128,6 +128,17 @@ class Viewpoints:
             UsageError: there is no such view, or none is asked for.
         """
         return chosen_views(cameras, self.views, self.split or (split if self.views is None else None))
+
+    def given(self, cameras: CamerasSource | None) -> list[Camera] | None:
+        """Cameras that stand for views to be placed, if there are any.
+
+        Raises:
+            UsageError: views are to be placed as well.
+        """
+        given = cameras_of(cameras)
+        if given is not None:
+            self.refuse_with_cameras()
+        return given
 
     def refuse_with_cameras(self) -> None:
         """Say that cameras are given and that views are to be placed contradict each other.
