@@ -96,17 +96,6 @@ def test_steps_of_the_fit(tables, folder):
 
 
 @pytest.mark.slow
-def test_ways_to_refit(tables, folder):
-    few = ["--removed", 0.4, 0.6, "--drops", 1e-10, "--iterations", 4, "--every", 2]
-    found = tables("refit", folder, *few)
-    names = ["as they were", "splat by splat", "joint", "splat by splat, then joint", "joint, drop 1e-10"]
-    assert [row[:2] for row in found["curves_excerpt"]] == [[part, name] for part in (0.4, 0.6) for name in names]
-    gains = {row[0]: row[1] for row in found["smaller_excerpt"]}
-    assert gains["splat by splat"] == pytest.approx(0, abs=1e-9)
-    assert gains["joint"] < 0
-
-
-@pytest.mark.slow
 def test_orders_of_pruning(tables, folder):
     found = tables("pruning", folder, "--every", 2, "--iterations", 2, "--removed", 20, 50)
     curves = {row[0]: row[1:] for row in found["curves_excerpt"]}
