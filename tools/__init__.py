@@ -11,7 +11,7 @@ bench.rasterizer       frames a second, and time by kernel
 bench.pruning          what does pruning keep, against other pruners?
 bench.fit              how fast are the fit's steps?
 bench.decode           how fast does a file decode, by compiled code, NumPy or OpenCL, and in how much memory?
-bench.codec            speed, memory and size of the codec alone
+bench.codec            speed and memory of the codec alone
 bench.paired           are whole encodes faster or slower than those of another checkout?
 bench.scaling          time and memory against splats, views and workers: with which exponents?
 bench.levels           how close are levels of detail where they are shown, and do leaves' errors foretell pictures'?

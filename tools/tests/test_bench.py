@@ -110,7 +110,7 @@ def test_frames_and_decodes(tables, folder, monkeypatch):
     if sys.platform == "linux":
         # A process of its own for each figure is tried below and by test_encodes_of_cities.
         monkeypatch.setattr("tools.bench.codec.in_process", lambda work, *given: work(*given))
-        assert len(tables("codec", "--part", "encode", "--splats", 1000)["encode"]) == 3
+        assert len(tables("codec", "--splats", 1000)["encode"]) == 3
         monkeypatch.setattr("tools.bench.decode._MADE", ("best",))
         monkeypatch.setattr("tools.bench.decode.processors", lambda: 1)
         found = tables("decode", "--splats", 2000, "--runs", 1, "--part", "speed", "--part", "memory")
