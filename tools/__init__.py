@@ -9,10 +9,9 @@ How fast, how large, how much memory (``bench``):
 bench.encode           run time against error of every stage and variant on every device: what is on the Pareto front?
 bench.rasterizer       frames a second, and time by kernel
 bench.pruning          what does pruning keep, against other pruners?
-bench.refit            what does the re-fit of the colours bring, and what does it take?
 bench.fit              how fast are the fit's steps?
 bench.decode           how fast does a file decode, by compiled code, NumPy or OpenCL, and in how much memory?
-bench.codec            speed, memory and size of the codec alone
+bench.codec            speed and memory of the codec alone
 bench.paired           are whole encodes faster or slower than those of another checkout?
 bench.scaling          time and memory against splats, views and workers: with which exponents?
 bench.levels           how close are levels of detail where they are shown, and do leaves' errors foretell pictures'?
@@ -22,7 +21,7 @@ bench.web              how fast is the browser's decoder against native C, and i
 What a choice costs or brings, against the alternatives (``study``):
 
 =========================  =============================================================================================
-study.rate_distortion      size against quality: the curves that other studies compare with
+study.rate_distortion      size against quality, of any options: presets, what the re-fit brings, what pruning may skip
 study.ablation             what does each part of the codec contribute?
 study.formats              how small are encodes to the formats that viewers open, and what do others make of scenes?
 =========================  =============================================================================================

@@ -41,7 +41,7 @@ def plain_parser(description: str | None) -> argparse.ArgumentParser:
     return parser
 
 
-def scene_parser(description: str | None, number: str = "+") -> argparse.ArgumentParser:
+def scene_parser(description: str | None, number: str | int = "+") -> argparse.ArgumentParser:
     """The same with a device, and scenes' folders: a number of them as argparse has it."""
     parser = plain_parser(description)
     parser.add_argument(

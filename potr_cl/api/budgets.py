@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +17,6 @@ from potr_cl.api.inputs import (
     ColourSource,
     SceneSource,
     bytes_of_source,
-    cameras_of,
-    chosen_views,
     colour_of,
     encoded_bytes,
     holds_potr,
@@ -26,7 +24,7 @@ from potr_cl.api.inputs import (
     rules_of,
     scene_of,
 )
-from potr_cl.api.views import Viewpoints, describe_views, warn_of_frame
+from potr_cl.api.views import ViewChoices, Viewpoints, describe_views, warn_of_frame
 from potr_cl.codec.decoder import decode, open_file
 from potr_cl.codec.levels import splats_of_levels
 from potr_cl.errors import UsageError
@@ -44,6 +42,9 @@ from potr_cl.quality.judging import Judging, Looks
 from potr_cl.raster.rules import RULES, RasterRules
 from potr_cl.report.labels import U8, comparison_picture
 from potr_cl.workers.host import DevicesSource, open_workers
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 _AGAINST = "b_against_a"
 
@@ -186,12 +187,6 @@ def compare_budgets(
     budgets: int | Sequence[int],
     cameras: CamerasSource | None = None,
     *,
-    views: Sequence[str | int] | str | int | None = None,
-    split: str | None = None,
-    virtual_views: int | None = None,
-    turntable: int | None = None,
-    up: str | Sequence[float] | None = None,
-    size: int | None = None,
     output: str | os.PathLike[str] | None = None,
     device: DevicesSource = None,
     rules: RasterRules | str = "inria",
@@ -199,6 +194,7 @@ def compare_budgets(
     trust: bool = False,
     antialiased: bool | None = None,
     progress: Callable[[str, float], None] | None = None,
+    **views: Unpack[ViewChoices],
 ) -> BudgetComparison:
     """Compare what a viewer would show of scenes in levels of detail, as the command ``compare --budget`` does.
 
@@ -207,8 +203,7 @@ def compare_budgets(
         scenes: to judge, one or several: streamed SOG, whose leaves have levels of their own; .potr files, of which a
             view shows one level; or scenes of a single level.
         budgets: how many splats may be shown.
-        cameras, views, split, virtual_views, turntable, up, size, device, rules, background, trust, antialiased: as of
-            :func:`potr_cl.compare`.
+        cameras, device, rules, background, trust, antialiased, views: as of :func:`potr_cl.compare`.
         output: a PNG file to write: the worst view of A, of what is shown, and their difference, labelled.
         progress: called with what is done and the part of it that is done.
 
@@ -219,15 +214,13 @@ def compare_budgets(
     wanted = sorted({budgets} if isinstance(budgets, int) else set(budgets), reverse=True)
     if not files or not wanted or wanted[-1] < 1:
         raise UsageError("--budget compares one scene or more, for numbers of splats of 1 or more")
-    points = Viewpoints(virtual_views, turntable, up, size)
-    given = cameras_of(cameras)
-    if given is not None:
-        points.refuse_with_cameras()
+    points = Viewpoints(**views)
+    given = points.given(cameras)
     looks = Looks(colour_of(background), rules_of(rules), remember=True)
     levels, scene = [levelled(file, trust) for file in files], scene_of(a, trust, antialiased)
     with open_workers(device) as workers:
         there = given or points.judging(scene, workers.device)
-        chosen = chosen_views(there, views, split)
+        chosen = points.chosen(there)
         if given is not None:
             warn_of_frame(a, scene, chosen)
         with Judging(workers.device, scene, chosen, looks, workers.pool, anyway=True) as judging:

@@ -14,8 +14,6 @@ from potr_cl.api.inputs import (
     ColourSource,
     SceneSource,
     bytes_of_source,
-    cameras_of,
-    chosen_views,
     coded_scene,
     colour_of,
     drawable_of,
@@ -25,7 +23,7 @@ from potr_cl.api.inputs import (
     scene_of,
 )
 from potr_cl.api.pictures import png_bytes
-from potr_cl.api.views import Viewpoints, describe_views, warn_of_frame
+from potr_cl.api.views import ViewChoices, Viewpoints, describe_views, warn_of_frame
 from potr_cl.errors import UsageError
 from potr_cl.formats.images import Colour, write_png
 from potr_cl.host.atomic_write import replacing
@@ -53,6 +51,8 @@ from potr_cl.report.labels import U8, comparison_picture, shrunk
 from potr_cl.workers.host import ClusterSource, DevicesSource, Workers, open_workers
 
 if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
     from potr_cl.outputs.output import CodedScene
     from potr_cl.viewer.server import Viewer
 
@@ -165,12 +165,6 @@ def compare(
     *,
     truth: str | os.PathLike[str] | None = None,
     lpips: bool = False,
-    views: Sequence[str | int] | str | int | None = None,
-    split: str | None = None,
-    virtual_views: int | None = None,
-    turntable: int | None = None,
-    up: str | Sequence[float] | None = None,
-    size: int | None = None,
     output: str | os.PathLike[str] | None = None,
     device: DevicesSource = None,
     cluster: ClusterSource = None,
@@ -179,6 +173,7 @@ def compare(
     trust: bool = False,
     antialiased: bool | None = None,
     progress: Callable[[str, float], None] | None = None,
+    **views: Unpack[ViewChoices],
 ) -> SceneComparison:
     """Render two scenes from the same views and compare, as the command ``compare`` does.
 
@@ -188,9 +183,6 @@ def compare(
         cameras: or their file; None: views are placed around A.
         truth: a folder of photographs named after the views: A and B are judged by them too.
         lpips: whether to tell LPIPS too, which needs the extra ``lpips``.
-        views: names or indices of views.
-        split: "train", "test" or "all"; by default the test views, or all if there are none.
-        virtual_views, turntable, up, size: of the views that are placed, see :func:`potr_cl.render`.
         output: a PNG file to write: the worst view of A, of B, and their difference, labelled.
         device: to render on, or what it is called. Several share the views out: a list, "all", or "0,1".
         cluster: a Dask cluster whose workers share the views out: its scheduler's address, or a client. With
@@ -199,6 +191,9 @@ def compare(
         background: R, G, B from 0 to 1, or a colour's name.
         trust, antialiased: as of :func:`potr_cl.load_scene`.
         progress: called with what is done and the part of it that is done.
+        views: ``views``, names or indices of views; ``split``, "train", "test" or "all", by default the test views, or
+            all if there are none; ``virtual_views``, ``turntable``, ``up`` and ``size`` of the views that are placed,
+            see :func:`potr_cl.render`.
 
     Raises:
         UsageError: an option is out of range or contradicts another, or a photograph is missing.
@@ -206,18 +201,16 @@ def compare(
         DeviceError: a view does not fit the device, or the device failed.
     """
     colour, wanted = colour_of(background), rules_of(rules)
-    points = Viewpoints(virtual_views, turntable, up, size)
-    given = cameras_of(cameras)
-    if given is not None:
-        points.refuse_with_cameras()
-    elif truth is not None:
+    points = Viewpoints(**views)
+    given = points.given(cameras)
+    if given is None and truth is not None:
         raise UsageError("--truth needs --cameras, the views that the photographs show")
     # Views are placed in a scene that the host has.
     source_a = a if given is not None else scene_of(a, trust, antialiased)
     with contextlib.ExitStack() as stack:
         workers = stack.enter_context(open_workers(device, cluster))
         there = given or points.judging(scene_of(source_a), workers.device)
-        chosen = chosen_views(there, views, split)
+        chosen = points.chosen(there)
         coded = [coded_for(workers, each, trust) if antialiased is None else None for each in (source_a, b)]
         drawables = []
         for source, shown, read in zip((a, b), (source_a, b), coded, strict=True):

@@ -12,7 +12,7 @@ from concurrent.futures import Future
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, overload
+from typing import TYPE_CHECKING, NamedTuple, overload
 
 import numpy as np
 
@@ -21,8 +21,6 @@ from potr_cl.api.inputs import (
     ColourSource,
     DeviceSource,
     SceneSource,
-    cameras_of,
-    chosen_views,
     colour_of,
     device_of,
     drawable_of,
@@ -30,7 +28,7 @@ from potr_cl.api.inputs import (
     rules_of,
     scene_of,
 )
-from potr_cl.api.views import Viewpoints, describe_views, warn_of_frame
+from potr_cl.api.views import ViewChoices, Viewpoints, describe_views, warn_of_frame
 from potr_cl.errors import DataError, DeviceError
 from potr_cl.formats.images import Colour, to_8_bits, write_png
 from potr_cl.host.atomic_write import make_folder, replacing
@@ -44,6 +42,9 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import RasterRules
 from potr_cl.report.labels import U8, contact_sheet
 from potr_cl.views.pictures import rasterizer_for
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 _log = logging.getLogger("potr_cl")
 
@@ -165,15 +166,10 @@ def render(
     rules: RasterRules | str = "inria",
     background: ColourSource = "black",
     *,
-    views: Sequence[str | int] | str | int | None = None,
-    split: str | None = None,
-    virtual_views: int | None = None,
-    turntable: int | None = None,
-    up: str | Sequence[float] | None = None,
-    size: int | None = None,
     output: str | os.PathLike[str] | None = None,
     trust: bool = False,
     antialiased: bool | None = None,
+    **views: Unpack[ViewChoices],
 ) -> Renderings: ...
 def render(
     scene: SceneSource,
@@ -182,15 +178,10 @@ def render(
     rules: RasterRules | str = "inria",
     background: ColourSource = "black",
     *,
-    views: Sequence[str | int] | str | int | None = None,
-    split: str | None = None,
-    virtual_views: int | None = None,
-    turntable: int | None = None,
-    up: str | Sequence[float] | None = None,
-    size: int | None = None,
     output: str | os.PathLike[str] | None = None,
     trust: bool = False,
     antialiased: bool | None = None,
+    **views: Unpack[ViewChoices],
 ) -> Rendering | Renderings:
     """Render a scene, as the command ``render`` does.
 
@@ -203,14 +194,12 @@ def render(
         device: to render on, or what it is called; the one that should be fastest by default.
         rules: of the rasterizer to follow: inria, the original's, or gsplat.
         background: R, G, B from 0 to 1, or a colour's name.
-        views: names or indices of the views to render; all by default.
-        split: render only "train" or "test" views.
-        virtual_views: how many views to place without cameras; 8 by default.
-        turntable: so many views from a circle around the scene instead.
-        up: which way is up in placed views: "x", "y", "z", "-x", "-y", "-z", three numbers; by default a guess.
-        size: pixels along a side of the pictures of placed views; 800 by default.
         output: a folder to write the pictures to as well, as PNG files named after their views.
         trust, antialiased: as of :func:`potr_cl.load_scene`.
+        views: ``views``, names or indices of the views to render, all by default; ``split``, only "train" or "test"
+            views. Without cameras ``virtual_views``, how many views to place, 8 by default; ``turntable``, so many
+            from a circle around the scene instead; ``up``, which way is up in them: "x", "y", "z", "-x", "-y", "-z",
+            three numbers, by default a guess; ``size``, pixels along a side of their pictures, 800 by default.
 
     Returns:
         A :class:`Rendering`, the image and the transmittance, for one camera; else :class:`Renderings`.
@@ -221,7 +210,7 @@ def render(
         DeviceError: a view does not fit the device, or the device failed.
     """
     colour, wanted = colour_of(background), rules_of(rules)
-    points = Viewpoints(virtual_views, turntable, up, size)
+    points = Viewpoints(**views)
     if isinstance(cameras, Camera):
         opened = device_of(device)
         with (
@@ -229,7 +218,7 @@ def render(
             Rasterizer(opened, drawable, wanted, colour) as rasterizer,
         ):
             return Rendering(*rasterizer.render(cameras))
-    views_of = _Views(scene, cameras, points, views, split, device_of(device), trust, antialiased)
+    views_of = _Views(scene, cameras, points, device_of(device), trust, antialiased)
     if output is not None:
         picture_files(Path(output), views_of.chosen)  # names that cannot be written are reported before the work
     with views_of.rasterizer(wanted, colour) as rasterizer:
@@ -249,8 +238,6 @@ def render_to_files(
     background: ColourSource = "black",
     *,
     points: Viewpoints,
-    views: Sequence[str | int] | None = None,
-    split: str | None = None,
     trust: bool = False,
     antialiased: bool | None = None,
     check: Callable[[Sequence[Camera], Sequence[Path]], None] = lambda cameras, files: None,
@@ -260,7 +247,7 @@ def render_to_files(
 
     Args:
         output: the folder.
-        points: how to look at the scene without cameras.
+        points: which views, and how to look at the scene without cameras.
         check: called with all cameras and the files that will be written, before any is.
         progress: called with what is done and the part of it that is done.
 
@@ -268,7 +255,7 @@ def render_to_files(
         What was done, in a line.
     """
     colour, wanted = colour_of(background), rules_of(rules)
-    of = _Views(scene, cameras, points, views, split, device_of(device), trust, antialiased)
+    of = _Views(scene, cameras, points, device_of(device), trust, antialiased)
     if of.note:
         _log.info("no --cameras given: %s", of.note)
     files = picture_files(output, of.chosen)
@@ -296,21 +283,17 @@ class _Views:
         scene: SceneSource,
         cameras: CamerasSource | None,
         points: Viewpoints,
-        views: Sequence[str | int] | str | int | None,
-        split: str | None,
         device: Device,
         trust: bool,
         antialiased: bool | None,
     ) -> None:
-        given = cameras_of(cameras)
-        if given is not None:
-            points.refuse_with_cameras()
+        given = points.given(cameras)
         self.device, self._trust, self._antialiased = device, trust, antialiased
         # Views are placed in a scene that the host has.
         self._source = scene if given is not None else scene_of(scene, trust, antialiased)
         self.there = given or points.placed(scene_of(self._source), device)
         self.note = "" if given else describe_views(self.there)
-        self.chosen = chosen_views(self.there, views, split or (None if views is not None else "all"))
+        self.chosen = points.chosen(self.there, "all")
 
     @contextmanager
     def rasterizer(self, rules: RasterRules, background: Colour, warn: bool = False) -> Iterator[Renderer]:

@@ -7,10 +7,11 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypedDict
 
 import numpy as np
 
-from potr_cl.api.inputs import SceneSource, name_of, placed_beside_cameras
+from potr_cl.api.inputs import CamerasSource, SceneSource, cameras_of, chosen_views, name_of, placed_beside_cameras
 from potr_cl.errors import UsageError
 from potr_cl.formats.registry import cameras_beside
 from potr_cl.model.agreement import judge_cameras
@@ -31,12 +32,25 @@ from potr_cl.stages.stage import Progress
 _log = logging.getLogger("potr_cl")
 
 
+class ViewChoices(TypedDict, total=False):
+    """Keywords that say which views of a scene to look at: attributes of :class:`Viewpoints`."""
+
+    views: Sequence[str | int] | str | int | None
+    split: str | None
+    virtual_views: int | None
+    turntable: int | None
+    up: str | Sequence[float] | None
+    size: int | None
+
+
 @dataclass(frozen=True)
 class Viewpoints:
-    """How to look at a scene that comes without cameras.
+    """Which views of a scene to look at, and how to look at one that comes without cameras.
 
     Attributes:
-        count: how many views to place; None: 8.
+        views: names or indices of those to take, see :func:`potr_cl.api.inputs.chosen_views`.
+        split: "train", "test" or "all" of them.
+        virtual_views: how many views to place; None: 8.
         turntable: how many views from a circle around the scene to take instead.
         up: which way is up: x, y, z, -x, -y, -z, three numbers, or auto, a guess.
         size: pixels along a side of the square pictures; None: 800.
@@ -45,13 +59,15 @@ class Viewpoints:
         UsageError: these are no directions, or both kinds of views are asked for.
     """
 
-    count: int | None = None
+    views: Sequence[str | int] | str | int | None = None
+    split: str | None = None
+    virtual_views: int | None = None
     turntable: int | None = None
     up: str | Sequence[float] | None = None
     size: int | None = None
 
     def __post_init__(self) -> None:
-        if self.count is not None and self.turntable is not None:
+        if self.virtual_views is not None and self.turntable is not None:
             raise UsageError("give either --virtual-views or --turntable: each says how many views to place")
         _ = self.direction
 
@@ -59,7 +75,7 @@ class Viewpoints:
     def asked_for(self) -> list[str]:
         """What has been said of views to place, as the command line calls it: it contradicts cameras."""
         given = {
-            "--virtual-views": self.count,
+            "--virtual-views": self.virtual_views,
             "--turntable": self.turntable,
             "--up": self.up,
             "--size": self.size,
@@ -96,13 +112,33 @@ class Viewpoints:
         size = SIZE if self.size is None else self.size
         if self.turntable is not None:
             return turntable(scene, self.turntable, size, self.direction, device)
-        return look_around(scene, VIEWS if self.count is None else self.count, size, self.direction, device)
+        count = VIEWS if self.virtual_views is None else self.virtual_views
+        return look_around(scene, count, size, self.direction, device)
 
     def judging(self, scene: Scene, device: Device | None = None) -> list[Camera]:
         """The views to judge by: those of an encode without cameras, so many and so large, unless others are wanted."""
         if self.turntable is not None:
             return self.placed(scene, device)
-        return look_around(scene, self.count, self.size, self.direction, device)
+        return look_around(scene, self.virtual_views, self.size, self.direction, device)
+
+    def chosen(self, cameras: Sequence[Camera], split: str | None = None) -> list[Camera]:
+        """Those of all views that are asked for; if none are, those of ``split``.
+
+        Raises:
+            UsageError: there is no such view, or none is asked for.
+        """
+        return chosen_views(cameras, self.views, self.split or (split if self.views is None else None))
+
+    def given(self, cameras: CamerasSource | None) -> list[Camera] | None:
+        """Cameras that stand for views to be placed, if there are any.
+
+        Raises:
+            UsageError: views are to be placed as well.
+        """
+        given = cameras_of(cameras)
+        if given is not None:
+            self.refuse_with_cameras()
+        return given
 
     def refuse_with_cameras(self) -> None:
         """Say that cameras are given and that views are to be placed contradict each other.

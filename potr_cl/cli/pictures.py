@@ -10,7 +10,7 @@ from pathlib import Path
 from potr_cl.api.budgets import compare_budgets
 from potr_cl.api.comparing import compare, compare_sizes
 from potr_cl.api.pictures import render_to_files
-from potr_cl.api.views import AXES, SIZE, VIEWS, Viewpoints
+from potr_cl.api.views import AXES, SIZE, VIEWS, ViewChoices, Viewpoints
 from potr_cl.cli.guard import ReadCameras, ReadFile, ReadPhotographs, WrittenFolder, check_files, check_photographs
 from potr_cl.cli.options import (
     CAMERAS_HELP,
@@ -55,11 +55,14 @@ def _add_viewpoints(p: argparse.ArgumentParser) -> None:
     )
 
 
-def _viewpoints(args: argparse.Namespace) -> Viewpoints:
-    points = Viewpoints(args.virtual_views, args.turntable, args.up, args.size)
+def _views(args: argparse.Namespace) -> ViewChoices:
+    choices = ViewChoices(
+        views=args.views, split=args.split, virtual_views=args.virtual_views, turntable=args.turntable, up=args.up,
+        size=args.size,
+    )  # fmt: skip
     if args.cameras is not None:
-        points.refuse_with_cameras()
-    return points
+        Viewpoints(**choices).refuse_with_cameras()
+    return choices
 
 
 def _render(args: argparse.Namespace) -> None:
@@ -67,12 +70,12 @@ def _render(args: argparse.Namespace) -> None:
         check_files(args, files)
         check_photographs(args, cameras, files)
 
-    points = _viewpoints(args)
+    views = _views(args)
     cameras = None if args.cameras is None else read_cameras(args)
     with Progress() as progress:
         done = render_to_files(
-            args.scene, args.output, cameras, args.device, args.rules, args.background, points=points, views=args.views,
-            split=args.split, trust=args.trust, antialiased=ANTIALIASED[args.antialiased], check=check,
+            args.scene, args.output, cameras, args.device, args.rules, args.background, points=Viewpoints(**views),
+            trust=args.trust, antialiased=ANTIALIASED[args.antialiased], check=check,
             progress=progress,
         )  # fmt: skip
     say_done(f"{args.output}: {done}")
@@ -99,9 +102,9 @@ def _compare(args: argparse.Namespace) -> None:
         return
     if args.more:
         raise UsageError("several scenes to judge: give --budget too, to compare their levels of detail")
-    points = _viewpoints(args)
+    views = _views(args)
     given = [args.views, args.split, args.output, args.device, args.cluster]
-    pictures_asked_for = any(each is not None for each in given) or points.asked_for
+    pictures_asked_for = any(each is not None for each in given) or Viewpoints(**views).asked_for
     cameras = None if args.cameras is None else read_cameras(args)
     read = {"trust": args.trust, "antialiased": ANTIALIASED[args.antialiased]}
     if cameras is None and args.truth is None and not pictures_asked_for:
@@ -118,10 +121,8 @@ def _compare(args: argparse.Namespace) -> None:
             picture = None if args.output is None else stack.enter_context(replacing(args.output))
             progress = stack.enter_context(Progress())
             comparison = compare(
-                args.a, args.b, cameras, truth=args.truth, lpips=args.lpips, views=args.views, split=args.split,
-                virtual_views=args.virtual_views, turntable=args.turntable, up=args.up, size=args.size,
-                device=args.device, cluster=args.cluster, rules=args.rules, background=args.background,
-                progress=progress, **read,
+                args.a, args.b, cameras, truth=args.truth, lpips=args.lpips, device=args.device,
+                cluster=args.cluster, rules=args.rules, background=args.background, progress=progress, **read, **views,
             )  # fmt: skip
             if picture is not None:
                 comparison.write_picture(picture)
@@ -133,7 +134,7 @@ def _compare(args: argparse.Namespace) -> None:
 
 
 def _compare_budgets(args: argparse.Namespace) -> None:
-    _viewpoints(args)
+    views = _views(args)
     for name in ("truth", "lpips", "cluster"):
         if getattr(args, name):
             raise UsageError(f"--{name} does not go with --budget, which compares with the uncompressed scene, here")
@@ -142,10 +143,9 @@ def _compare_budgets(args: argparse.Namespace) -> None:
         picture = None if args.output is None else stack.enter_context(replacing(args.output))
         progress = stack.enter_context(Progress())
         comparison = compare_budgets(
-            args.a, [args.b, *args.more], args.budget, cameras, views=args.views, split=args.split,
-            virtual_views=args.virtual_views, turntable=args.turntable, up=args.up, size=args.size, device=args.device,
-            rules=args.rules, background=args.background, trust=args.trust,
-            antialiased=ANTIALIASED[args.antialiased], progress=progress,
+            args.a, [args.b, *args.more], args.budget, cameras, device=args.device, rules=args.rules,
+            background=args.background, trust=args.trust, antialiased=ANTIALIASED[args.antialiased], progress=progress,
+            **views,
         )  # fmt: skip
         if picture is not None:
             comparison.write_picture(picture)

@@ -20,6 +20,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
+from potr_cl.levels.budgets import coverage
 from potr_cl.levels.environment import Surroundings
 from potr_cl.levels.plan import scale_of_level
 from potr_cl.model.camera import Camera, resized
@@ -41,8 +42,6 @@ _VIEWS, _PIXELS = 32, 1 << 19
 _ROUND = 1000
 #: Splats by which the size of a pixel in the scene is found.
 _SAMPLE = 1 << 14
-#: The tangent of half the field of view that the engine compares others with.
-_REFERENCE = math.tan(math.radians(22.5))
 #: What a splat without SH coefficients shows.
 _GREY = 0.5
 #: Errors of so many scenes are shared out at once.
@@ -101,7 +100,7 @@ class MeasuredErrors:
             return found
         assert self.device is not None
         views = [_small(view) for view in self.between or self.views]
-        covered = np.array([coverage(view, boxes) for view in views])
+        covered = np.array([seen_coverage(view, boxes) for view in views])
         finest = scenes(0)
         with SharedOut(self.device, finest, views, leaves, len(boxes), self.background, self.memory) as shared:
             parts = shared.of(map(scenes, range(1, levels)))
@@ -145,20 +144,12 @@ def _small(view: Camera) -> Camera:
     return resized(view, max(int(view.width * part), 1), max(int(view.height * part), 1))
 
 
-def coverage(view: Camera, boxes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n,) about which part of the picture boxes (n, 6) cover, 0 to 1, by PlayCanvas' engine; 0 of those behind.
-
-    The engine's rule: (r / (r + d))², with r half the box's diagonal and d its distance, times the tangent of half the
-    vertical field of view over that of 22.5 degrees.
-    """
+def seen_coverage(view: Camera, boxes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n,) what the engine takes boxes (n, 6) to cover of the picture; 0 of those behind, which add nothing to it."""
     low, high = boxes[:, :3], boxes[:, 3:]
-    at = view.centre
-    distances = np.linalg.norm(np.clip(at, low, high) - at, axis=1)
-    radii = np.linalg.norm(high - low, axis=1) / 2
-    distances *= view.height / 2 / view.fy / _REFERENCE
-    depths = (low + high) / 2 @ view.rotation[2] + view.translation[2]
-    parts = np.square(radii / np.maximum(radii + distances, 1e-30))
-    found: NDArray[np.float64] = np.where((depths > 0) | (distances == 0), parts, 0.0)
+    ahead = (low + high) / 2 @ view.rotation[2] + view.translation[2] > 0
+    around = ((low <= view.centre) & (view.centre <= high)).all(axis=1)
+    found: NDArray[np.float64] = np.where(ahead | around, coverage(view, boxes), 0.0)
     return found
 
 

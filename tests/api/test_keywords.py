@@ -24,6 +24,7 @@ import potr_cl
 from potr_cl import Camera, Scene, cli
 from potr_cl.api.choices import EncodeChoices, encode_options
 from potr_cl.api.editing import EditChoices, _CompactKeywords, _PruneKeywords
+from potr_cl.api.views import ViewChoices
 from potr_cl.cli import command_parser
 from potr_cl.formats.scenes import page
 from potr_cl.host import process
@@ -156,6 +157,7 @@ def keywords_of(command: str) -> set[str]:
     signature = inspect.signature(getattr(potr_cl, command)).parameters
     own = {name for name, each in signature.items() if each.kind is not inspect.Parameter.VAR_KEYWORD}
     more = {"Unpack[EncodeChoices]": EncodeChoices, "Unpack[EditChoices]": EditChoices,
+            "Unpack[ViewChoices]": ViewChoices,
             "Unpack[_PruneKeywords]": _PruneKeywords, "Unpack[_CompactKeywords]": _CompactKeywords}  # fmt: skip
     return own.union(*(more[each.annotation].__annotations__ for each in signature.values() if each.name not in own))
 

@@ -17,7 +17,7 @@ import potr_cl
 from potr_cl import Scene, UsageError, cli
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.formats import load_scene
-from potr_cl.levels.errors import MeasuredErrors, SharedOut, coverage, errors_a_coverage, measuring_views
+from potr_cl.levels.errors import MeasuredErrors, SharedOut, errors_a_coverage, measuring_views, seen_coverage
 from potr_cl.model.camera import camera_centres, train_views
 from potr_cl.model.views_between import views_between
 from potr_cl.opencl.device import Device
@@ -222,7 +222,7 @@ def test_an_error_times_what_the_leaf_covers_is_what_it_adds(plush_excerpt, plus
     views = measuring_views(plush_excerpt, views)
     errors = MeasuredErrors(device, views, plush_excerpt, between=views).of_leaves(scenes.__getitem__, 2, leaves, boxes)
     assert errors[0, 0] == 0
-    covered = np.array([coverage(view, boxes)[0] for view in views])
+    covered = np.array([seen_coverage(view, boxes)[0] for view in views])
     each = [mean_squared_errors(device, plush_excerpt, [fewer], [view])[0] for view in views]
     per_coverage = np.array(each) / covered
     per_coverage[per_coverage.argmax()] = np.sort(per_coverage)[-2]
@@ -246,7 +246,8 @@ def test_errors_are_measured_where_no_level_was_made_for(plush_excerpt, plush_ex
 
 def test_coverage_is_that_of_playcanvas_engine(plush_excerpt_cameras):
     """Of a box around the middle of the picture: its radius over that and the distance, squared; for 45 degrees."""
-    view = dataclasses.replace(plush_excerpt_cameras[0], height=200, fy=100 / np.tan(np.radians(22.5)))
+    focal = 100 / np.tan(np.radians(22.5))
+    view = dataclasses.replace(plush_excerpt_cameras[0], width=240, height=200, fx=focal, fy=focal)
     axis = view.rotation[2]
     centre = view.centre + 5 * axis
     box = np.concatenate([centre - 1, centre + 1])
@@ -254,9 +255,11 @@ def test_coverage_is_that_of_playcanvas_engine(plush_excerpt_cameras):
     behind = np.concatenate([view.centre - 5 * axis - 1, view.centre - 5 * axis + 1])
     around = np.concatenate([view.centre - 1, view.centre + 1])
     expected = [3 / (np.sqrt(3) + nearest) ** 2, 0, 1]
-    assert np.allclose(coverage(view, np.array([box, behind, around])), expected)
-    wide = dataclasses.replace(view, fy=100 / np.tan(np.radians(45)))
-    assert coverage(wide, box[None])[0] < expected[0]
+    assert np.allclose(seen_coverage(view, np.array([box, behind, around])), expected)
+    wide = dataclasses.replace(view, fx=100.0, fy=100.0)
+    assert seen_coverage(wide, box[None])[0] < expected[0]
+    upright = dataclasses.replace(view, width=200, height=240)  # the narrower side's field counts
+    assert np.allclose(seen_coverage(upright, box[None]), expected[0])
 
 
 @pytest.fixture(scope="module")

@@ -1,26 +1,22 @@
-"""Speed, memory and size of the codec alone: every splat and every colour is kept.
+"""Speed and memory of the codec alone, every splat and every colour kept: stages and peak, a process each.
 
-    python -m tools.bench.codec [--part PART …] [--splats N] [--json FILE]
+    python -m tools.bench.codec [--splats N] [--json FILE]
 
-Parts (default: both): encode (stages and peak memory, each in a process of its own), sizes (bytes a splat of every
-section, lego and plush). tools.bench.decode measures how fast files decode.
+tools.bench.decode measures how fast files decode; ``potr-cl info`` says how large each section is.
 """
 
 from __future__ import annotations
 
 import time
-from pathlib import Path
 
 from potr_cl.codec.container import EntropyCoder
-from potr_cl.codec.decoder import open_file
 from potr_cl.codec.quantize import Preset
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.report.file import file_report
 from tools.make.large_scene import cameras_beside, default_scene, large_scene
-from tools.results import Cell, Column, Results
-from tools.workloads import SCENES, growth, in_process, plain_parser, read
+from tools.results import Cell, Results
+from tools.workloads import growth, in_process, plain_parser
 
 
 def as_it_is(preset: Preset, coder: EntropyCoder | None = None) -> EncodeOptions:
@@ -46,45 +42,16 @@ def _encode(splats: int, with_views: bool, level: int) -> list[Cell]:
     return [*rows, 1 + peak / scene.nbytes]
 
 
-def encodes(results: Results, splats: int) -> None:
-    table = results.table(
-        "encode", f"Encode without pruning, {splats} splats of SH degree 3",
+def main() -> None:
+    parser = plain_parser(__doc__)
+    parser.add_argument("--splats", type=int, default=10**6, metavar="N")
+    args = parser.parse_args()
+    table = Results(None, args.json).table(
+        "encode", f"Encode without pruning, {args.splats} splats of SH degree 3",
         "zstd level; cameras; octree|s|.2f; quantise and code|s|.2f; all|s|.2f; size|MB|.1f; peak / arrays||.2f",
     )  # fmt: skip
     for level, views in ((9, True), (9, False), (19, True)):
-        table.add(level, "yes" if views else "no", *in_process(_encode, splats, views, level))
-
-
-def sizes(results: Results, _: int) -> None:
-    coders = {f"zstd {level}": EntropyCoder("zstd", level) for level in (9, 19, 22)}
-    for folder in filter(Path.exists, (SCENES / "lego", SCENES / "plush")):
-        scene, cameras = read(folder)
-        reports = {}
-        for name, coder in {**coders, "best": None}.items():
-            encoded = encode(scene, cameras, as_it_is("paper" if coder else "best", coder))
-            reports[name] = file_report(open_file(b"".join(encoded.pieces)))
-        table = results.table(
-            folder.name, f"Bytes a splat, {folder.name}, {len(scene)} splats, q = 0.5, nothing pruned",
-            "section; serialised||.2f", *(Column(name, format=".2f") for name in reports),
-        )  # fmt: skip
-        serialised = {name: each["serialised_bytes"] for name, each in reports["zstd 9"]["sections"].items()}
-        for section, raw in serialised.items():
-            coded = [report["sections"][section]["bytes"] / len(scene) for report in reports.values()]
-            table.add(section, raw / len(scene), *coded)
-        table.add("all", sum(serialised.values()) / len(scene), *(r["bytes_a_splat"] for r in reports.values()))
-
-
-PARTS = {"encode": encodes, "sizes": sizes}
-
-
-def main() -> None:
-    parser = plain_parser(__doc__)
-    parser.add_argument("--part", action="append", choices=list(PARTS), dest="parts")
-    parser.add_argument("--splats", type=int, default=10**6, metavar="N")
-    args = parser.parse_args()
-    results = Results(None, args.json)
-    for part in args.parts or PARTS:
-        PARTS[part](results, args.splats)
+        table.add(level, "yes" if views else "no", *in_process(_encode, args.splats, views, level))
 
 
 if __name__ == "__main__":

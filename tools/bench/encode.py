@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import decode
 from potr_cl.codec.encoder import code_scene
-from potr_cl.model.camera import Camera, camera_centres, test_views, train_views
+from potr_cl.model.camera import Camera, camera_centres, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import DeviceInfo, Family, choose_device, list_devices
@@ -100,21 +100,20 @@ class Workload:
     """A scene on a device, and how much of it is enough.
 
     Attributes:
-        train, test: views. some: of those, the ones that kernels are measured on.
+        train: views. some: of those, the ones that kernels are measured on.
         repeats: of every measurement; the best counts.
     """
 
     info: DeviceInfo
     scene: Scene
     train: list[Camera]
-    test: list[Camera]
     quick: bool
 
     @staticmethod
     def of(info: DeviceInfo, folder: Path, quick: bool) -> Workload:
         scene, cameras = read(folder)
         cameras = [scaled(camera, 0.5) for camera in cameras] if quick else cameras
-        return Workload(info, scene, train_views(cameras), test_views(cameras), quick)
+        return Workload(info, scene, train_views(cameras), quick)
 
     @property
     def some(self) -> list[Camera]:

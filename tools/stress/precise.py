@@ -135,7 +135,7 @@ class Composited:
     alpha: F64
 
 
-def composite(raw: F64, colours: F64, rules: RasterRules, background: F64 | None = None) -> Composited:
+def composite(raw: F64, colours: F64, rules: RasterRules) -> Composited:
     """Front to back; ``raw`` (K, P) is 0 where a splat is in no list of the pixel's tile."""
     transmittance = np.ones(raw.shape[1])
     alive = np.ones(raw.shape[1], bool)
@@ -152,8 +152,6 @@ def composite(raw: F64, colours: F64, rules: RasterRules, background: F64 | None
         used[k] = np.where(touched & alive, alpha, 0)
         image += (transmittance * used[k])[:, None] * colours[k]
         transmittance = transmittance * (1 - used[k])
-    if background is not None:
-        image += transmittance[:, None] * background
     return Composited(image, transmittance, margin, used)
 
 

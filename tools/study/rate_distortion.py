@@ -4,14 +4,17 @@
     python -m tools.study.rate_distortion report OUT.json … [--json FILE] [options]
 
 A SCENE is a folder with point_cloud.ply, cameras.json and, if it has any, photographs in images. A series is a curve:
-the name it gets and the options of EncodeOptions in which it differs from the defaults, those of a stage with its name,
-as in exact:preset=best,prune.tolerance=0; photos=True stands for --photos with the folder images. ``measure`` writes
-its results after every encode and goes on where an existing file stops; with --seconds it begins no encode after that
-many. Several files of ``measure`` become one curve: where a run was cut short, or another
-commit went on. --series takes some of their series alone,
-in that order. ``report`` prints the tables of docs/benchmarks, and keeps them with --json: the curves, the uncompressed
-scenes, and the seconds of each stage at quality 0.5. With --against it prints instead how many bytes more or fewer each
-series takes at the PSNR that the series NAME has at quality Q, by interpolation, and how long its encodes take.
+the name it gets and the options of EncodeOptions in which it differs from the defaults, those of a stage with its
+name, as in exact:preset=best,prune.tolerance=0; photos=True stands for --photos with the folder images. ``measure``
+writes its results after every encode and goes on where an existing file stops; with --seconds it begins no encode
+after that many. Several files of ``measure`` become one curve: where a run was cut short, or another commit went on.
+--series takes some of their series alone, in that order. ``report`` prints the tables of docs/benchmarks, and keeps
+them with --json: the curves, the uncompressed scenes, and the seconds of each stage at quality 0.5. With --against it
+prints instead how many bytes more or fewer each series takes at the PSNR that the series NAME has at quality Q, by
+interpolation, and how long its encodes take.
+
+What the joint re-fit brings, for one: ``--series paper:preset=paper "as they were:preset=paper,compact=False"
+joint:preset=paper,compact=False,refit.steps=24,refit.drop=1e-9``, then ``report --against paper``.
 """
 
 from __future__ import annotations
