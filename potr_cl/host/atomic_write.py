@@ -8,7 +8,7 @@ import os
 import secrets
 import stat
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO
 
@@ -79,6 +79,26 @@ def write_pieces(path: str | os.PathLike[str], pieces: Iterable[bytes | memoryvi
     with replacing(path) as file:
         for piece in pieces:
             file.write(piece)
+
+
+def write_files(folder: Path, contents: Mapping[str, bytes]) -> None:
+    """Write files of a folder, by names that may have folders of their own: none appears before all are whole.
+
+    Raises:
+        WriteError: the system failed to write, or cannot make a folder.
+    """
+    temporary = folder / f".{secrets.token_hex(6)}.tmp"
+    with removed_at_end(temporary):
+        try:
+            for name, content in contents.items():
+                (temporary / name).parent.mkdir(parents=True, exist_ok=True)
+                (temporary / name).write_bytes(content)
+            for name in contents:
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                _rename(temporary / name, folder / name)
+        except OSError as error:
+            why = error.strerror or str(error)
+            raise WriteError(f"cannot write to the folder '{folder}': {why}", os.fspath(folder)) from error
 
 
 def check_place(path: str | os.PathLike[str]) -> None:

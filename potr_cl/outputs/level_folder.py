@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import BinaryIO, ClassVar
 
 from potr_cl.errors import UsageError
-from potr_cl.host.atomic_write import replacing
+from potr_cl.host.atomic_write import write_files
 from potr_cl.model.scene import Scene
 from potr_cl.outputs.lod_tree import Limits
 from potr_cl.outputs.output import Output
@@ -60,16 +60,11 @@ class LevelFolder(Output):
         """The files of the folder; the description last.
 
         Raises:
-            UsageError: one cannot be written.
+            WriteError: one cannot be written; those of an earlier scene are there still.
         """
         contents = _contents(b"".join(pieces))
         description = contents.pop(self.suffix)
-        for name, content in contents.items():
-            beside = path.parent / name
-            for folder in reversed(beside.relative_to(path.parent).parents):
-                _make(path.parent / folder)
-            with replacing(beside) as target:
-                target.write(content)
+        write_files(path.parent, contents)
         file.write(description)
 
     def read(self, data: bytes, trust: bool = False) -> Scene:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import errno
+import gzip
 import json
+import shutil
+import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,12 +16,15 @@ import pytest
 
 from potr_cl import DataError, Scene, UsageError, cli
 from potr_cl.codec.quantize import HyperParameters
+from potr_cl.errors import WriteError
 from potr_cl.formats import load_scene
 from potr_cl.formats.registry import bytes_of_scene
+from potr_cl.outputs.level_folder import archive
 from potr_cl.outputs.lod_tree import extents_of
 from potr_cl.outputs.output import Request
 from potr_cl.outputs.spz import Gltf
 from potr_cl.outputs.tiles import Tiles
+from tests.cases.gltf import glb
 from tests.reference.scenes import random_scene
 
 COUNTS = (3000, 1500, 400)
@@ -71,6 +78,49 @@ def test_tiles_hold_every_level_as_it_was_encoded(made: tuple[list[Scene], Path]
             counts[level] += len(scene)
     assert counts == list(COUNTS)
     assert found == [rows_of(scene) for scene in levels]
+
+
+def test_a_folder_is_replaced_whole_or_not_at_all(
+    made: tuple[list[Scene], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, path = made
+    shutil.copytree(path.parent, tmp_path / "city")
+    there = {file: file.read_bytes() for file in (tmp_path / "city").rglob("*") if file.is_file()}
+    contents = {str(file.relative_to(tmp_path / "city")): b"other" for file in there}
+    left, write = [2], Path.write_bytes
+
+    def full(self: Path, data: bytes) -> int:
+        left[0] -= 1
+        if left[0] < 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(self, data)
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with (tmp_path / "new").open("wb") as file, pytest.raises(WriteError, match="No space left"):
+        Tiles().write([archive(contents)], file, tmp_path / "city" / "tileset.json")
+    assert {file: file.read_bytes() for file in (tmp_path / "city").rglob("*") if file.is_file()} == there
+
+
+def test_many_tiles_that_claim_much(tmp_path: Path) -> None:
+    """Each might hold so many splats by itself."""
+    scene = random_scene(1, 0).subset(np.zeros(40_000, np.int64))
+    asked = Request(HyperParameters.from_quality(0.5, "best"))
+    tile = b"".join(Gltf(version=3).file(scene, None, asked).pieces)
+    end = 20 + int.from_bytes(tile[12:16], "little")
+    description = json.loads(tile[20:end])
+    splats = struct.pack("<4sIIBBBB", b"NGSP", 3, len(scene), 0, 12, 0, 0) + bytes(20 * len(scene))
+    packed = gzip.compress(splats, mtime=0)
+    for each in (*description["buffers"], *description["bufferViews"]):
+        each["byteLength"] = len(packed)
+    tile = glb(description, packed)
+    tiles = [{"content": {"uri": f"{name}.glb"}} for name in "ab"]
+    for each in tiles:
+        (tmp_path / each["content"]["uri"]).write_bytes(tile)
+    assert len(load_scene(tmp_path / "a.glb")) == 40_000
+    (tmp_path / "tileset.json").write_text(json.dumps({"root": {"refine": "ADD", "children": tiles}}))
+    with pytest.raises(DataError, match=r"80000 splats in \d+ bytes .*--trust"):
+        load_scene(tmp_path)
+    assert len(load_scene(tmp_path, trust=True)) == 80_000
 
 
 def test_finer_tiles_replace_coarser_ones(made: tuple[list[Scene], Path]) -> None:

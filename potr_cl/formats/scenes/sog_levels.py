@@ -38,7 +38,7 @@ from potr_cl.model.scene import Scene
 _log = logging.getLogger("potr_cl")
 
 DESCRIPTION = "lod-meta.json"
-_MOST_LEVELS = 1000
+_MOST_LEVELS = 64
 #: First splat and number of splats.
 _Range = tuple[int, int]
 #: A file's number, and the range.
@@ -102,12 +102,14 @@ class StreamedScene:
         self.counts = np.array([[part[2] if part else 0 for part in own] for own in self._parts], np.int64)
         with reading(description):
             bounds = [node["bound"] for node, _ in leaves]
-            self.boxes = np.array([[*bound["min"], *bound["max"]] for bound in bounds], np.float64).reshape(-1, 6)
+            sides = np.array([[*bound["min"], *bound["max"]] for bound in bounds], np.float64)
+            self.boxes = sides.reshape(len(leaves), 6)
             told = [node.get("errors") for node, _ in leaves]
             self.errors = np.array(told, np.float64) if self._meta.has_errors else None
         if not np.isfinite(self.boxes).all() or (self.boxes[:, :3] > self.boxes[:, 3:]).any():
             raise DataError(f"'{path}' is damaged: a box is invalid")
-        if self.errors is not None and not (self.errors.shape == self.counts.shape and (self.errors >= 0).all()):
+        errors = self.errors
+        if errors is not None and not (errors.shape == self.counts.shape and ((errors >= 0) & (errors < np.inf)).all()):
             raise DataError(f"'{path}' is damaged: errors of levels are invalid")
         self._kept: OrderedDict[Path, Scene] = OrderedDict()
 

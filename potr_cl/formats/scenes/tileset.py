@@ -18,7 +18,7 @@ import numpy as np
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes import gltf
-from potr_cl.formats.scenes.scene_files import cleaned, file_in_folder, joined, opened, related, shown
+from potr_cl.formats.scenes.scene_files import check_splats, cleaned, file_in_folder, joined, opened, related, shown
 from potr_cl.model.scene import Scene
 
 _log = logging.getLogger("potr_cl")
@@ -29,7 +29,13 @@ DESCRIPTION = "tileset.json"
 def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
     """Read the finest tiles; see :class:`potr_cl.formats.declaration.SceneLoader`."""
     names = list(dict.fromkeys(_contents(file_in_folder(path, DESCRIPTION) or Path(path), finest=True)))
-    return cleaned(path, joined([gltf.load(name, trust) for name in names]))
+    scenes: list[Scene] = []
+    nbytes = 0
+    for name in names:  # each by itself may hold some splats for nothing
+        scenes.append(gltf.load(name, trust))
+        nbytes += sum(file.stat().st_size for file in gltf.files(name))
+        check_splats(path, sum(map(len, scenes)), nbytes, trust)
+    return cleaned(path, joined(scenes))
 
 
 def files(path: Path) -> list[Path]:
