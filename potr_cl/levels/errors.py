@@ -20,6 +20,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
+from potr_cl.host.threads import Ahead
 from potr_cl.levels.budgets import coverage
 from potr_cl.levels.environment import Surroundings
 from potr_cl.levels.plan import scale_of_level
@@ -212,12 +213,13 @@ class SharedOut:
                     self._pictures, differences, self._rendered(scene), strict=True
                 ):
                     difference[:, :, channel] = np.square(picture.clip(0, 1) - own).mean(axis=2)
-            parts = [self._of_view(number, difference) for number, difference in enumerate(differences)]
-            found.append(np.array(parts)[:, :, : len(some)])
+            views = ((difference, self._of_splats(number, difference)) for number, difference in enumerate(differences))
+            with Ahead(self._of_leaves, views) as parts:
+                found.append(np.array([each for _, each in parts])[:, :, : len(some)])
         return np.concatenate(found, axis=2)
 
-    def _of_view(self, number: int, difference: FloatArray) -> NDArray[np.float64]:
-        """(leaves, 3) the parts of three pictures' squared differences (H, W, 3)."""
+    def _of_splats(self, number: int, difference: FloatArray) -> FloatArray:
+        """(N, 3) what splats of the finest level have in three pictures' squared differences (H, W, 3)."""
         # Of a grey scene in front of black; what the picture should show is darker where the error is larger.
         largest = np.maximum(difference.max(axis=(0, 1)), np.float32(1e-30))
         target = _Picture(self._device, self._covered[number] - difference / largest)
@@ -225,8 +227,13 @@ class SharedOut:
         coefficients.zero(self._sums)
         with OwnViews(self._sweep, self._rasterizer, coefficients, [view], memory=self._memory) as own:
             ColourMap(coefficients, own).gradient(self._black, target, self._sums)
-            of_splats = np.maximum(coefficients.read_sh(self._sums)[:, 0].astype(np.float64), 0)
-        parts = np.stack([np.bincount(self._leaves, each, self._count + 1)[:-1] for each in of_splats.T], axis=1)
+            return coefficients.read_sh(self._sums)[:, 0]
+
+    def _of_leaves(self, of_view: tuple[FloatArray, FloatArray]) -> NDArray[np.float64]:
+        """(leaves, 3) the parts of three pictures' squared differences (H, W, 3), of which splats have (N, 3)."""
+        difference, of_splats = of_view
+        columns = np.maximum(of_splats, 0).T
+        parts = np.stack([np.bincount(self._leaves, each, self._count + 1)[:-1] for each in columns], axis=1)
         whole = difference.mean(axis=(0, 1), dtype=np.float64)
         shared: NDArray[np.float64] = parts * (whole / np.maximum(parts.sum(axis=0), 1e-300))
         return shared

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.model.spherical_harmonics import rotation_matrices
 
@@ -80,27 +81,39 @@ def lod_tree(scenes: Sequence[Scene], limits: Limits, near: Sequence[NDArray[np.
         sides = centres.max(axis=0).astype(np.float64) - centres.min(axis=0)
         wide = sides.max() > limits.extent and len(numbers) > limits.fewest
         if len(numbers) > 1 and (len(numbers) > limits.splats or wide):
-            order = numbers[np.argsort(centres[:, int(sides.argmax())], kind="stable")]
-            children = node(order[: len(order) // 2]), node(order[len(order) // 2 :])
+            lower = _lower_half(centres[:, int(sides.argmax())])
+            children = node(numbers[lower]), node(numbers[~lower])
             low = np.minimum(children[0].low, children[1].low)
             return Node(low, np.maximum(children[0].high, children[1].high), children)
-        own = np.sort(numbers)
-        cuts = np.searchsorted(own, ends)
-        rows = tuple(own[a:b] - first for a, b, first in zip(cuts, cuts[1:], ends, strict=False))
+        cuts = np.searchsorted(numbers, ends)
+        rows = tuple(numbers[a:b] - first for a, b, first in zip(cuts, cuts[1:], ends, strict=False))
         exact = centres.astype(np.float64)
         return Node((exact - extents[numbers]).min(axis=0), (exact + extents[numbers]).max(axis=0), (), rows)
 
     return node(np.arange(len(means)) if near is None else np.flatnonzero(np.concatenate(near)))
 
 
+def _lower_half(values: FloatArray) -> NDArray[np.bool_]:
+    """(n,) which are the n // 2 lowest; of equal ones the first."""
+    half = len(values) // 2
+    middle = np.partition(values, half)[half]
+    lower: NDArray[np.bool_] = values < middle
+    lower[np.flatnonzero(values == middle)[: half - np.count_nonzero(lower)]] = True
+    return lower
+
+
 def extents_of(scene: Scene) -> FloatArray:
     """(N, 3) float32: how far each splat's ellipsoid at one standard deviation reaches along the world's axes."""
     found = np.empty((len(scene), 3), np.float32)
-    for start in range(0, len(scene), _BLOCK):
+
+    def find(start: int) -> None:
         some = slice(start, start + _BLOCK)
         axes = rotation_matrices(scene.quaternions[some].astype(np.float64))
         reach = axes * np.exp(scene.log_scales[some].astype(np.float64))[:, None, :]
         found[some] = np.sqrt(np.square(reach).sum(axis=2))
+
+    with thread_pool() as pool:
+        list(pool.map(find, range(0, len(scene), _BLOCK)))
     return found
 
 

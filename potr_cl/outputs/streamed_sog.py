@@ -20,6 +20,7 @@ from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes import sog_levels
 from potr_cl.formats.scenes.sog_images import DESCRIPTION as SOG_DESCRIPTION
 from potr_cl.formats.scenes.sog_levels import DESCRIPTION
+from potr_cl.host.threads import Ahead
 from potr_cl.model.scene import Scene, joined
 from potr_cl.outputs.level_folder import LevelFolder, archive
 from potr_cl.outputs.lod_tree import Node, lod_tree
@@ -70,17 +71,20 @@ class StreamedSog(LevelFolder, Sog):
         places: list[dict[str, dict[str, int]]] = [{} for _ in leaves]
         for level, data in enumerate(files):
             chunks = SogChunks(data)
+            parts: dict[str, NDArray[np.int64]] = {}
             for number, chunk in enumerate(_in_chunks([leaf.rows[level] for leaf in leaves], count)):
                 name, offset = f"{level}_{number}", 0
                 for leaf in chunk:
                     rows = leaves[leaf].rows[level]
                     places[leaf][str(level)] = {"file": len(filenames), "offset": offset, "count": len(rows)}
                     offset += len(rows)
-                own = chunks.folder(np.concatenate([leaves[leaf].rows[level] for leaf in chunk]))
-                folder |= {f"{name}/{file}": content for file, content in own.items()}
+                parts[name] = np.concatenate([leaves[leaf].rows[level] for leaf in chunk])
                 filenames.append(f"{name}/{SOG_DESCRIPTION}")
             if len(sky) and not level:
-                folder |= {f"{_ENVIRONMENT}/{file}": content for file, content in chunks.folder(sky).items()}
+                parts[_ENVIRONMENT] = sky
+            with Ahead(chunks.folder, parts.values()) as made:
+                for name, (_, own) in zip(parts, made, strict=True):
+                    folder |= {f"{name}/{file}": content for file, content in own.items()}
         told = iter(zip(places, lost.tolist(), strict=True))
 
         def of_leaf(_: Node) -> dict[str, Any]:
