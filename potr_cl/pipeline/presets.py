@@ -26,10 +26,10 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
     ),
     "smallest": (
         Between(),
-        Prune(iterations=64),
+        Prune(iterations=32),
         Fit(steps="auto"),
         Compact(on=False),
-        Refit(steps=8, at=(0.5, 0.75)),
+        Refit(steps=8, at=(0.5,)),
         Code(),
     ),
     "fast": (
@@ -42,7 +42,7 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
     ),
     "paper": (
         Between(views=0, weigh=False),
-        Prune(),
+        Prune(tolerance=0.01),
         Fit(),
         Compact(),
         Refit(steps=0),
@@ -53,7 +53,7 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
 #: What each preset is for, in a line.
 PURPOSE: dict[Preset, str] = {
     "best": "small files, quickly",
-    "smallest": "smaller still: more iterations, and a fit of all parameters; takes several times as long",
+    "smallest": "smaller still: a fit of all parameters; takes several times as long",
     "fast": "fewer iterations and steps: faster, a little larger at equal quality",
     "paper": "the method of the paper: colours compacted splat by splat, zstd",
 }

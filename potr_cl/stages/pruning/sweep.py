@@ -52,7 +52,7 @@ class SweepOptions:
         UsageError: a value is out of range.
     """
 
-    tolerance: float = 0.01
+    tolerance: float = 0.02
     turns: int = 1
     memory: int | None = None
     transmittance_threshold: float | None = 1e-8

@@ -151,7 +151,7 @@ class Round:
 
 
 #: The constant coefficients of the last turn stay as they are: they are rounded as the file is made.
-ROUNDS = (Round(others=1, constant=1, steps=3), Round(others=3, constant=2, steps=2))
+ROUNDS = (Round(others=1, constant=1, steps=3), Round(others=3, constant=2, steps=1))
 
 
 @dataclass(frozen=True)

@@ -74,9 +74,9 @@ class ViewErrors(Owner):
 
 #: Bytes a splat and view of a sweep's own buffers: the colours' change and the sums.
 _CHANGE, _TOTALS = 16, 32
-#: Views are divided into so many parts, every second one in each, where each has as many as are enough: with 62 in
-#: each, steps by one part lost 0.01 dB on a captured scene, and 0.03 on its pictures a third as wide.
-_PARTS, ENOUGH = 2, 80
+#: Views are divided into so many parts, every second one in each, where each has as many as are enough: with 50 in
+#: each, steps by one part cost 0.06 % of the bytes at equal PSNR on a synthetic scene, with 63 0.4 % on a real one.
+_PARTS, ENOUGH = 2, 50
 
 
 @dataclass(frozen=True)
