@@ -1,0 +1,113 @@
+"""Run time against error: each knob that trades one for the other, turned alone, in whole encodes.
+
+    python -m tools.study.time_error SCENE … [--device NAME] [--knobs NAME …] [--json FILE]
+
+Error is the bytes that a file takes more or fewer than one of its preset's defaults with the same PSNR on the test
+views, in percent, the mean of two qualities; what the defaults take there is read off their own curve. Time is that of
+an encode, without judging, in that of the defaults: by the clock on a GPU, by the processor's time on a CPU, which
+others may use. Every encode but the first of a scene's preset is of a process that has encoded before.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from potr_cl.codec.decoder import open_file
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import choose_device
+from potr_cl.pipeline.encode import encode
+from tools.results import Results
+from tools.study.evaluation import EvaluatedScene
+from tools.study.rate_distortion import encode_options
+from tools.workloads import scene_parser
+
+#: What is turned, by name: the preset, the option, and its values.
+KNOBS: dict[str, tuple[str, str, tuple[Any, ...]]] = {
+    "pruning iterations": ("best", "prune.iterations", (12, 24, 96)),
+    "part of a tile that may be gone before it is measured again": ("best", "prune.tolerance", (0.0, 0.01, 0.04, 0.08)),
+    "views between, for each given one": ("best", "between.views", (0, 0.25, 1)),
+    "steps of the re-fit": ("best", "refit.steps", (2, 4, 12, 16)),
+    "re-fits while pruning": ("best", "refit.at", ((0.5,), (0.5, 0.75))),
+    "smallest: steps of the fit": ("smallest", "fit.steps", (300, 600, 2600)),
+    "smallest: views between of the fit, for each given one": ("smallest", "fit.between", (0.5, 1.0)),
+    "smallest: re-fits while pruning": ("smallest", "refit.at", ((), (0.5, 0.75))),
+}
+#: The qualities in which knobs are turned, and the others of the defaults' curve.
+QUALITIES, AROUND = (0.3, 0.5), (0.2, 0.25, 0.35, 0.4, 0.45, 0.55)
+
+
+class Encodes:
+    """Encodes of one scene on one device."""
+
+    def __init__(self, evaluator: EvaluatedScene, device: Device) -> None:
+        self._evaluator, self._device = evaluator, device
+        self._clock = time.process_time if device.info.family == "cpu" else time.perf_counter
+
+    def one(self, preset: str, q: float, changes: dict[str, Any]) -> tuple[float, float, float]:
+        """Seconds, bytes and PSNR."""
+        options = encode_options({"preset": preset, "q": q, **changes})
+        began = self._clock()
+        encoded = encode(self._evaluator.source, self._evaluator.cameras, options, device=self._device)
+        seconds = self._clock() - began
+        psnr = self._evaluator(open_file(b"".join(encoded.pieces)).scene())["psnr"]
+        return seconds, float(encoded.nbytes), float(psnr or np.inf)
+
+
+def gap(curve: Sequence[tuple[float, float, float]], point: tuple[float, float, float]) -> float:
+    """Bytes of a point more than of a curve at its PSNR, in percent; both are (seconds, bytes, PSNR).
+
+    Beyond the curve's ends it goes on straight, bytes as logarithms.
+    """
+    ordered = sorted(curve, key=lambda each: each[2])
+    psnr, size = np.array([each[2] for each in ordered]), np.log([each[1] for each in ordered])
+    at = min(max(int(np.searchsorted(psnr, point[2])), 1), len(psnr) - 1)
+    slope = (size[at] - size[at - 1]) / (psnr[at] - psnr[at - 1])
+    return float(100 * np.expm1(np.log(point[1]) - size[at] - slope * (point[2] - psnr[at])))
+
+
+def study(results: Results, folder: Path, device: Device, knobs: Sequence[str], qualities: Sequence[float]) -> None:
+    """The table of a scene."""
+    with EvaluatedScene(folder, device) as evaluator:
+        encodes, curves = Encodes(evaluator, device), dict[str, dict[float, tuple[float, float, float]]]()
+        table = results.table(
+            evaluator.name, f"Run time against error, {evaluator.name}",
+            "knob; value; time, in that of the default||.2f; bytes at equal PSNR|%|+.2f; an encode|s|.2f",
+        )  # fmt: skip
+        for name in knobs:
+            preset, option, values = KNOBS[name]
+            if preset not in curves:
+                encodes.one(preset, qualities[-1], {})
+                curves[preset] = {q: encodes.one(preset, q, {}) for q in (*qualities, *AROUND)}
+                seconds = [curves[preset][q][0] for q in qualities]
+                table.add(f"all of {preset}", "default", 1.0, 0.0, float(np.mean(seconds)))
+            curve = curves[preset]
+            for value in values:
+                turned = {q: encodes.one(preset, q, {option: value}) for q in qualities}
+                times = [turned[q][0] / curve[q][0] for q in qualities]
+                gaps = [gap(list(curve.values()), turned[q]) for q in qualities]
+                seconds = [turned[q][0] for q in qualities]
+                table.add(name, _said(value), *map(float, map(np.mean, (times, gaps, seconds))))
+
+
+def _said(value: Any) -> str:
+    return (", ".join(map(str, value)) or "none") if isinstance(value, tuple) else f"{value:g}"
+
+
+def main() -> None:
+    parser = scene_parser(__doc__)
+    parser.add_argument("--knobs", nargs="+", choices=KNOBS, default=list(KNOBS))
+    parser.add_argument("--qualities", nargs="+", type=float, default=list(QUALITIES), metavar="Q")
+    args = parser.parse_args()
+    device = Device(choose_device(args.device))
+    results = Results(device.info, args.json)
+    for folder in args.scenes:
+        study(results, folder, device, args.knobs, args.qualities)
+
+
+if __name__ == "__main__":
+    main()
