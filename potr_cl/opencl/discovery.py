@@ -68,6 +68,11 @@ class DeviceInfo:
         """Whether the device's memory is the host's: a CPU, or a GPU beside one."""
         return self.kind == "cpu" or self.integrated
 
+    @property
+    def indexes_in_memory(self) -> bool:
+        """Whether private arrays that are indexed at run time lie in its memory: on AMD's GPUs, far from registers."""
+        return self.kind == "gpu" and any(name in self.handle.vendor for name in ("AMD", "Advanced Micro Devices"))
+
     def __str__(self) -> str:
         return f"'{self.name}' ({self.platform})"
 

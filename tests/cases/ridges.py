@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from unittest.mock import patch
+
 import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.model.scene import Scene
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import DeviceInfo
 from potr_cl.stages.compaction.ridge import CompactionOptions
 from potr_cl.stages.compaction.view_weights import ViewWeights
+from tests.devices import KERNELS, open_device
 from tests.reference.ridge import (
     YCOCG,
     objective,
@@ -15,8 +22,21 @@ from tests.reference.ridge import (
     weighted_basis,
 )
 
+#: Those of :data:`tests.devices.KERNELS`, and GPUs' where several work-items share a splat.
+COMPACTING = [*KERNELS, "gpu, a splat shared"]
+
 #: Colour error, in colour units, that is a matter of rounding: 1/2000 of a step of 8 bits.
 ROUNDING = 2e-6
+
+
+@contextmanager
+def compacting_device(kernels: str) -> Iterator[Device]:
+    """The device of one of :data:`COMPACTING`, which has to have all its memory back in the end."""
+    family, _, shared = kernels.partition(", ")
+    device = open_device(family)
+    with patch.object(DeviceInfo, "indexes_in_memory", bool(shared)):
+        yield device
+    assert device.allocated == 0, "a compactor did not give all its memory back"
 
 
 def dense_weights(dense: NDArray[np.floating]) -> ViewWeights:

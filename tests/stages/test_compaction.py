@@ -12,8 +12,15 @@ from potr_cl.errors import DeviceError, UsageError
 from potr_cl.opencl.device import Device
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor
 from potr_cl.stages.compaction.view_weights import ViewWeights
-from tests.cases.ridges import channels, check_optimal, dense_weights, on_a_sphere, sparse_weights
-from tests.devices import KERNELS, open_device
+from tests.cases.ridges import (
+    COMPACTING,
+    channels,
+    check_optimal,
+    compacting_device,
+    dense_weights,
+    on_a_sphere,
+    sparse_weights,
+)
 from tests.reference.ridge import (
     Ridges,
     compact_channel,
@@ -27,11 +34,10 @@ from tests.reference.ridge import (
 from tests.reference.scenes import random_scene
 
 
-@pytest.fixture(scope="module", params=KERNELS)
+@pytest.fixture(scope="module", params=COMPACTING)
 def device(request: pytest.FixtureRequest) -> Iterator[Device]:
-    device = open_device(request.param)
-    yield device
-    assert device.allocated == 0, "a compactor did not give all its memory back"
+    with compacting_device(request.param) as device:
+        yield device
 
 
 @pytest.mark.parametrize(

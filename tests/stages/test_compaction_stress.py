@@ -14,19 +14,25 @@ from numpy.typing import NDArray
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor
-from tests.cases.ridges import channels, check_optimal, dense_weights, on_a_sphere, sparse_weights
-from tests.devices import KERNELS, open_device
+from tests.cases.ridges import (
+    COMPACTING,
+    channels,
+    check_optimal,
+    compacting_device,
+    dense_weights,
+    on_a_sphere,
+    sparse_weights,
+)
 from tests.reference.ridge import (
     weighted_basis,
 )
 from tests.reference.scenes import random_scene
 
 
-@pytest.fixture(scope="module", params=KERNELS)
+@pytest.fixture(scope="module", params=COMPACTING)
 def device(request: pytest.FixtureRequest) -> Iterator[Device]:
-    device = open_device(request.param)
-    yield device
-    assert device.allocated == 0, "a compactor did not give all its memory back"
+    with compacting_device(request.param) as device:
+        yield device
 
 
 def clustered(views: int, spread: float, seed: int) -> NDArray[np.float64]:

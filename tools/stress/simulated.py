@@ -43,7 +43,7 @@ from potr_cl.model.scene import Scene
 from potr_cl.ondevice.decode import decode_to_device
 from potr_cl.opencl import device as opencl_device
 from potr_cl.opencl.device import Device
-from potr_cl.opencl.discovery import list_devices
+from potr_cl.opencl.discovery import DeviceInfo, list_devices
 from potr_cl.opencl.kernel import Kernel
 from potr_cl.opencl.memory import Memory
 from potr_cl.outputs.output import ColourGrid
@@ -118,8 +118,9 @@ def all_stages(device: Device) -> None:
     """Whole encodes: pruning that a GPU steers, the fit with its roundings, compaction and judging."""
     changes = {"prune": {"iterations": 3}, "fit": {"steps": 3}, "compact": True, "refit": False}
     options = EncodeOptions.for_preset("smallest", between=False, cameras_anyway=True, **changes)
-    for degree in (1, 3):
-        encode(random_splats(60, degree, seed=2), _views(5), options, device=device)
+    for degree, in_memory in ((1, False), (2, True), (3, False)):
+        with patch.object(DeviceInfo, "indexes_in_memory", in_memory):
+            encode(random_splats(60, degree, seed=2), _views(5), options, device=device)
 
 
 def several_batches(device: Device) -> None:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from potr_cl.errors import UsageError
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
+from potr_cl.opencl.kernel import Kernel
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.stages.compaction.view_weights import ViewWeights
 
@@ -219,16 +220,7 @@ class Compactor:
         if count == 1:
             return scene
         gpu = self.device.family == "gpu"
-        # A CPU's work-groups have one work-item: these kernels keep kilobytes of private memory each.
-        lanes, group = (1, 64) if gpu else (self.device.vector_width, 1)
-        kernel = self.device.kernel(
-            "compact/ridge.cl",
-            "compact",
-            ORTHOGONAL=int(options.precision == "orthogonal"),
-            LANES=lanes,
-            SH_COUNT=count,
-            BLOCK=4 if gpu else 8,  # rows of the basis matrix that are reduced at a time
-        )
+        kernel, group, together = self._kernel(count, options.precision)
 
         share = camera_centres.shape[1] if camera_centres.ndim == 3 else 1
         camera_centres = camera_centres.reshape(-1, 3)
@@ -269,7 +261,7 @@ class Compactor:
                         scale_factor=options.sf_sh if options.two_pass else 0,
                         ycocg=options.colour_model == "ycocg",
                     )
-                    groups = -(-seen // (lanes * group))
+                    groups = -(-seen // together)
                     kernel.launch((groups * group,), (group,), slot.queue)
                 slot.download(result[start:stop])
             for slot in slots:
@@ -277,6 +269,23 @@ class Compactor:
         # These came back as they were.
         result[np.diff(offsets) == 0, 1:] = 0
         return replace(scene, sh=result)
+
+    def _kernel(self, count: int, precision: Precision) -> tuple[Kernel, int, int]:
+        """The kernel for so many coefficients, work-items of its groups, and the splats that these do together."""
+        gpu = self.device.family == "gpu"
+        if gpu and precision == "orthogonal" and self.device.info.indexes_in_memory:
+            return self.device.kernel("compact/ridge_shared.cl", "compact", SH_COUNT=count), 64, 4
+        # A CPU's work-groups have one work-item: these kernels keep kilobytes of private memory each.
+        lanes, group = (1, 64) if gpu else (self.device.vector_width, 1)
+        kernel = self.device.kernel(
+            "compact/ridge.cl",
+            "compact",
+            ORTHOGONAL=int(precision == "orthogonal"),
+            LANES=lanes,
+            SH_COUNT=count,
+            BLOCK=4 if gpu else 8,  # rows of the basis matrix that are reduced at a time
+        )
+        return kernel, group, lanes * group
 
     def _batches(self, offsets: NDArray[np.int64], sh_count: int) -> list[tuple[int, int]]:
         """Runs of splats of which two fit the memory budget, and one each of the device's buffers."""
