@@ -64,9 +64,8 @@ class Tiles(LevelFolder, Gltf):
                 if not len(rows):
                     continue
                 name = f"{level}/{number}.glb"
-                folder[name] = b"".join(
-                    gltf_file.binary(scenes[level].subset(rows), spz.part(packed[level], rows))
-                )  # fmt: skip
+                tile_file = gltf_file.binary(scenes[level].subset(rows), spz.part(packed[level], rows))
+                folder[name] = b"".join(tile_file)
                 children = {"children": [tile]} if tile else {}
                 tile = {**_tile(leaf, lost[level] if tile else 0.0), "content": {"uri": name}, **children}
             return tile

@@ -140,7 +140,7 @@ def problems(results: Results) -> list[str]:
     return found + [f"{plot.path}: drawn of other figures, run python -m tools.make.benchmarks" for plot in stale]
 
 
-_GPU, _CPU = "NVIDIA H200, 32 processors", "Intel's CPU runtime, 2 processors"
+_GPU, _CPU = "NVIDIA H200, 16 processors", "Intel's CPU runtime, 2 processors"
 #: Scenes as README's table calls them.
 _NAMES = {"lego": "lego (NeRF-Synthetic)", "plush": "plush (captured)"}
 
@@ -160,7 +160,7 @@ def figures_table() -> str:
                 f"{file['size']:.2f} MB",
                 f"{file['times smaller']:.0f} × smaller",
                 f"{file['PSNR against uncompressed']:.1f} dB",
-                f"{file['lost']:.2f} dB of {uncompressed['PSNR against photographs']:.2f}",
+                f"{round(file['lost'], 2) + 0.0:.2f} dB of {uncompressed['PSNR against photographs']:.2f}",
                 *(_encode_time(results["whole_commands/commands"], scene, preset, device) for device in (_GPU, _CPU)),
             ]
             lines.append(f"| {' | '.join(cells)} |")
@@ -190,23 +190,17 @@ _SHAPES = ["s", "D", "^", "v", "P", "X", "<", "*", ">"]
 
 @dataclasses.dataclass(frozen=True)
 class Plot:
-    """PSNR by size, a panel a scene; keeps a digest of the figures that it was drawn of, so that others are noticed.
+    """A picture of two panels; keeps a digest of the figures that it was drawn of, so that others are noticed.
 
     Attributes:
         name: of the file, without its suffix.
         title: the question that it answers.
-        of: file of results that the curves are in.
-        series: that get a line each.
-        against: "uncompressed" or "photographs".
-        formats: whether other formats get a point each.
+        of: file of results that it is drawn of.
     """
 
     name: str
     title: str
     of: str
-    series: tuple[str, ...]
-    against: str
-    formats: bool = True
 
     @property
     def path(self) -> Path:
@@ -215,7 +209,11 @@ class Plot:
     @property
     def results(self) -> list[str]:
         """Names of the results that it is drawn of."""
-        return [f"{self.of}/{name}" for name in (*SCENES, "uncompressed")] + ["other_formats/sizes"] * self.formats
+        raise NotImplementedError
+
+    def panels(self, results: Results, axes: Sequence[Any]) -> None:
+        """Draw what is in them."""
+        raise NotImplementedError
 
     def digest(self, results: Results) -> str:
         """Of the figures that it is drawn of."""
@@ -231,16 +229,73 @@ class Plot:
 
         with pyplot.rc_context({"font.size": 10, "axes.grid": True, "grid.alpha": 0.3, "lines.markersize": 5}):
             figure, axes = pyplot.subplots(1, 2, figsize=(10, 5))
-            for scene, axis in zip(SCENES, axes, strict=True):
-                self._curves(results, scene, axis)
-            axes[0].set_ylabel(f"PSNR against the {self.against}{' renders' * (self.against == 'uncompressed')}, dB")
+            self.panels(results, axes)
             figure.suptitle(self.title, fontsize=12)
             handles, labels = axes[0].get_legend_handles_labels()
-            rows = -(-len(labels) // 4)
+            columns = 4 if max(map(len, labels)) < 30 else 2
+            rows = -(-len(labels) // columns)
             figure.tight_layout(rect=(0, 0.015 + 0.045 * rows, 1, 1))
-            figure.legend(handles, labels, loc="lower center", ncols=4, fontsize=9)
+            figure.legend(handles, labels, loc="lower center", ncols=columns, fontsize=9)
             figure.savefig(self.path, dpi=120, metadata={"Results": self.digest(results), "Software": None})
             pyplot.close(figure)
+
+
+@dataclasses.dataclass(frozen=True)
+class Knobs(Plot):
+    """Bytes at equal PSNR by time, a line a knob through the defaults at (1, 0).
+
+    Attributes:
+        panels_of: names of the results, a panel each, with its title.
+    """
+
+    panels_of: tuple[tuple[str, str], ...]
+
+    @property
+    def results(self) -> list[str]:
+        return [f"{self.of}/{name}" for name, _ in self.panels_of]
+
+    def panels(self, results: Results, axes: Sequence[Any]) -> None:
+        for name, (_, title), axis in zip(self.results, self.panels_of, axes, strict=True):
+            rows = results[name].records()
+            knobs = dict.fromkeys(row["knob"] for row in rows if row["value"] != "default")
+            for knob, style in zip(knobs, [*_STYLES, *({**each, "mfc": "w"} for each in _STYLES)], strict=False):
+                turned = [row for row in rows if row["knob"] == knob]
+                points = sorted([(1.0, 0.0), *((row[_TIME], row["bytes at equal PSNR"]) for row in turned)])
+                axis.plot(*zip(*points, strict=True), label=knob, lw=1, **style)
+            axis.plot([1], [0], marker="*", ms=14, color="k", ls="", label="default")
+            axis.set(title=title, xlabel="time, in that of the default", xscale="log", ylim=(-3, 10))
+            ticks = (0.6, 0.8, 1, 1.3, 1.6)
+            axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+            axis.minorticks_off()
+        axes[0].set_ylabel("bytes at equal PSNR, %")
+
+
+#: The column of a knob's time.
+_TIME = "time, in that of the default"
+
+
+@dataclasses.dataclass(frozen=True)
+class Curves(Plot):
+    """PSNR by size, a panel a scene.
+
+    Attributes:
+        series: that get a line each.
+        against: "uncompressed" or "photographs".
+        formats: whether other formats get a point each.
+    """
+
+    series: tuple[str, ...]
+    against: str
+    formats: bool = True
+
+    @property
+    def results(self) -> list[str]:
+        return [f"{self.of}/{name}" for name in (*SCENES, "uncompressed")] + ["other_formats/sizes"] * self.formats
+
+    def panels(self, results: Results, axes: Sequence[Any]) -> None:
+        for scene, axis in zip(SCENES, axes, strict=True):
+            self._curves(results, scene, axis)
+        axes[0].set_ylabel(f"PSNR against the {self.against}{' renders' * (self.against == 'uncompressed')}, dB")
 
     def _curves(self, results: Results, scene: str, axis: Any) -> None:
         """A line for each series, and a point for each other format."""
@@ -278,14 +333,18 @@ def kept_digest(plot: Plot) -> str:
 _PRESETS = ("best", "fast", "paper", "smallest")
 _FITTED = ("paper", "best", "smallest", "smallest with photographs")
 _NEAR = "How near does a file of a size come to the {}?"
-PLOTS = (
+PLOTS: tuple[Plot, ...] = (
     *(
-        Plot(f"rate_distortion_{to}", _NEAR.format(called), "rate_distortion", _PRESETS, to)
+        Curves(f"rate_distortion_{to}", _NEAR.format(called), "rate_distortion", _PRESETS, to)
         for to, called in (("uncompressed", "uncompressed scene"), ("photographs", "photographs"))
     ),
-    Plot(
+    Curves(
         "photographs", "What does a fit to photographs bring, on photographs that nobody has looked at?",
         "photographs", _FITTED, "photographs", formats=False,
+    ),
+    Knobs(
+        "time_error", "What does each knob cost and bring?", "time_error",
+        (("lego_h200", "lego, on a GPU"), ("plush_h200", "plush, on a GPU")),
     ),
 )  # fmt: skip
 
