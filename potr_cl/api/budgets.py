@@ -40,6 +40,7 @@ from potr_cl.quality.compare import mean_view
 from potr_cl.quality.figures import ViewFigures
 from potr_cl.quality.judging import Judging, Looks
 from potr_cl.raster.rules import RULES, RasterRules
+from potr_cl.report.budgets import budgets_page
 from potr_cl.report.labels import U8, comparison_picture
 from potr_cl.workers.host import DevicesSource, open_workers
 
@@ -156,6 +157,10 @@ class BudgetComparison:
     def write_picture(self, file: Any) -> None:
         """Write the picture of the worst view as PNG to an open binary file."""
         write_png(file, self.picture, plain(self.caption))
+
+    def write_page(self, file: Any) -> None:
+        """Write a web page with the curves of PSNR by splats shown to an open binary file."""
+        file.write(budgets_page(self.report(), self.picture, plain(self.caption)).encode())
 
     def __repr__(self) -> str:
         budgets = sorted({each.budget for each in self.shown})

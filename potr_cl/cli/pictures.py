@@ -21,7 +21,7 @@ from potr_cl.cli.options import (
     add_view_options,
     read_cameras,
 )
-from potr_cl.cli.outputs import WrittenPicture
+from potr_cl.cli.outputs import WrittenPage, WrittenPicture
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
 from potr_cl.cli.scenes import ANTIALIASED, add_antialiased_option, add_trust_option
@@ -102,6 +102,8 @@ def _compare(args: argparse.Namespace) -> None:
         return
     if args.more:
         raise UsageError("several scenes to judge: give --budget too, to compare their levels of detail")
+    if args.curve is not None:
+        raise UsageError("--curve is of levels of detail: give --budget too, or leave it out")
     views = _views(args)
     given = [args.views, args.split, args.output, args.device, args.cluster]
     pictures_asked_for = any(each is not None for each in given) or Viewpoints(**views).asked_for
@@ -140,7 +142,9 @@ def _compare_budgets(args: argparse.Namespace) -> None:
             raise UsageError(f"--{name} does not go with --budget, which compares with the uncompressed scene, here")
     cameras = None if args.cameras is None else read_cameras(args)
     with ExitStack() as stack:
-        picture = None if args.output is None else stack.enter_context(replacing(args.output))
+        picture, page = (
+            None if path is None else stack.enter_context(replacing(path)) for path in (args.output, args.curve)
+        )
         progress = stack.enter_context(Progress())
         comparison = compare_budgets(
             args.a, [args.b, *args.more], args.budget, cameras, device=args.device, rules=args.rules,
@@ -150,6 +154,8 @@ def _compare_budgets(args: argparse.Namespace) -> None:
         if picture is not None:
             comparison.write_picture(picture)
             comparison.notes.append(f"{args.output}: {comparison.caption}")
+        if page is not None:
+            comparison.write_page(page)
     _tell(args, comparison.report(), str(comparison))
 
 
@@ -176,6 +182,9 @@ def add_compare(commands: Commands) -> None:
         nargs="+",
         metavar="N",
         help="judge levels of detail: render what PlayCanvas' engine would show of B for a budget of N splats",
+    )
+    p.add_argument(
+        "--curve", type=WrittenPage, metavar="OUT.html", help="with --budget: a page with PSNR by splats shown"
     )
     p.add_argument("--cameras", type=ReadCameras, metavar="PATH", help=f"{CAMERAS_HELP}; without it, views are placed")
     p.add_argument(

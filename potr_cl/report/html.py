@@ -6,22 +6,17 @@ same encode apart from the times.
 
 from __future__ import annotations
 
-import base64
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from potr_cl.formats.images import to_8_bits
 from potr_cl.model.scene import FloatArray
-from potr_cl.plain_text import plain
 from potr_cl.quality.compare import difference_map
 from potr_cl.report.labels import BEFORE_AND_AFTER, difference_label, view_label
+from potr_cl.report.parts import chart, data_uri, section, table, text
 from potr_cl.report.style import ACCENT, PAGE, SERIES, STAGE
 from potr_cl.report.summary import decibels
 
@@ -31,8 +26,6 @@ _PICTURES = (
     "differ: black not at all, then red, yellow and white. Most differences are too small to be seen, so they are "
     "multiplied by the number below the picture.</p>\n"
 )
-#: Pixels along a side of a WebP picture.
-_WIDEST_WEBP = 16383
 
 
 @dataclass(frozen=True)
@@ -82,26 +75,17 @@ def html_report(report: dict[str, Any], pictures: Sequence[PicturePair]) -> str:
     source = report["source"]
     sections = [
         _headline(report),
-        _section("Pictures", _PICTURES + "".join(map(_pair, pictures))) if pictures else "",
-        _section("Where the bytes are", _sizes(report)),
-        _section("Quality by view", _quality(report["quality"])),
-        _section("Photographs", _photographs(report["photographs"])) if report.get("photographs") else "",
-        _section("Pruning", _pruning(report)) if report["pruning"] is not None else "",
-        _section("Search", _search(report["search"])) if report.get("search") is not None else "",
-        _section("Settings", _settings(report)),
-        _section("Command, time, device, versions", _circumstances(report)),
+        section("Pictures", _PICTURES + "".join(map(_pair, pictures))) if pictures else "",
+        section("Where the bytes are", _sizes(report)),
+        section("Quality by view", _quality(report["quality"])),
+        section("Photographs", _photographs(report["photographs"])) if report.get("photographs") else "",
+        section("Pruning", _pruning(report)) if report["pruning"] is not None else "",
+        section("Search", _search(report["search"])) if report.get("search") is not None else "",
+        section("Settings", _settings(report)),
+        section("Command, time, device, versions", _circumstances(report)),
     ]
-    title = f"{_text(source['file'])} → {_text(report['file'])}"
+    title = f"{text(source['file'])} → {text(report['file'])}"
     return PAGE.substitute(title=title, accent=ACCENT, stage=STAGE, body="\n".join(filter(None, sections)))
-
-
-def _text(text: object) -> str:
-    """As HTML, and on one line without characters that do not print: names come from files that others wrote."""
-    return escape(plain(text))
-
-
-def _section(title: str, content: str) -> str:
-    return f"<section><h2>{_text(title)}</h2>\n{content}\n</section>"
 
 
 def _headline(report: dict[str, Any]) -> str:
@@ -117,8 +101,8 @@ def _headline(report: dict[str, Any]) -> str:
             (decibels(quality["psnr"]), "mean PSNR against the uncompressed scene"),
             (f"{quality['ssim']:.4f}", "mean SSIM"),
         ]
-    cards = "".join(f"<div><b>{_text(value)}</b><span>{_text(name)}</span></div>" for value, name in facts)
-    names = f"{_text(source['file'])} → {_text(report['file'])}"
+    cards = "".join(f"<div><b>{text(value)}</b><span>{text(name)}</span></div>" for value, name in facts)
+    names = f"{text(source['file'])} → {text(report['file'])}"
     return f'<header><h1>{names}</h1><div class="cards">{cards}</div></header>'
 
 
@@ -132,40 +116,33 @@ def _sizes(report: dict[str, Any]) -> str:
     left = 0.0
     for colour, (name, nbytes) in zip(SERIES, report["properties"].items(), strict=False):
         width = 100 * nbytes / total
-        tip = f"<title>{_text(name)}: {nbytes:,} bytes</title>"
+        tip = f"<title>{text(name)}: {nbytes:,} bytes</title>"
         bar.append(f'<rect x="{left:.3f}" width="{width:.3f}" height="6" fill="{colour}">{tip}</rect>')
-        swatch = f'<i style="background:{colour}"></i>{_text(name)}'
+        swatch = f'<i style="background:{colour}"></i>{text(name)}'
         rows.append([swatch, f"{nbytes:,}", f"{nbytes / splats:.2f}", f"{width:.1f} %"])
         left += width
     rows.append(["all", f"{total:,}", f"{total / splats:.2f}", "100 %"])
     svg = f'<svg class="bar" viewBox="0 0 100 6" preserveAspectRatio="none" role="img">{"".join(bar)}</svg>'
-    return svg + _table(["property", "bytes", "bytes per splat", "share"], rows)
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table of cells that are HTML already."""
-    top = "".join(f"<th>{_text(cell)}</th>" for cell in head)
-    lines = "\n".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
-    return f'<div class="wide"><table><thead><tr>{top}</tr></thead><tbody>\n{lines}\n</tbody></table></div>'
+    return svg + table(["property", "bytes", "bytes per splat", "share"], rows)
 
 
 def _pair(pair: PicturePair) -> str:
     heat, factor = difference_map(pair.before, pair.after)
     height, width = pair.before.shape[:2]
-    name = _text(pair.view)
-    before, after = (_text(label) for label in BEFORE_AND_AFTER)
+    name = text(pair.view)
+    before, after = (text(label) for label in BEFORE_AND_AFTER)
     size = f'width="{width}" height="{height}"'
     return (
-        f"<h3>{_text(pair.title)}: {_text(view_label(pair.view, pair.psnr))}</h3>\n"
+        f"<h3>{text(pair.title)}: {text(view_label(pair.view, pair.psnr))}</h3>\n"
         '<div class="pair"><figure><div class="slider">\n'
-        f'<img {size} src="{_data_uri(pair.before)}" alt="{name}, {before}">\n'
-        f'<img {size} class="after" src="{_data_uri(pair.after)}" alt="{name}, {after}">\n'
+        f'<img {size} src="{data_uri(pair.before)}" alt="{name}, {before}">\n'
+        f'<img {size} class="after" src="{data_uri(pair.after)}" alt="{name}, {after}">\n'
         '<input type="range" min="0" max="100" value="50" step="any" aria-label="'
         f'{before} to the left, {after} to the right" '
         "oninput=\"this.parentNode.style.setProperty('--at', this.value + '%')\"></div>\n"
         f"<figcaption>{before} | {after}</figcaption></figure>\n"
-        f'<figure><img {size} src="{_data_uri(heat)}" alt="{name}, difference">\n'
-        f"<figcaption>{_text(difference_label(factor))}: white is {round(255 / factor)} of 255 or more</figcaption>"
+        f'<figure><img {size} src="{data_uri(heat)}" alt="{name}, difference">\n'
+        f"<figcaption>{text(difference_label(factor))}: white is {round(255 / factor)} of 255 or more</figcaption>"
         f"</figure>{_photograph(pair, name, size)}</div>"
     )
 
@@ -173,25 +150,13 @@ def _pair(pair: PicturePair) -> str:
 def _photograph(pair: PicturePair, name: str, size: str) -> str:
     if pair.photograph is None:
         return ""
-    shown = f'<img {size} src="{_data_uri(pair.photograph)}" alt="{name}, photograph">'
+    shown = f'<img {size} src="{data_uri(pair.photograph)}" alt="{name}, photograph">'
     return f"\n<figure>{shown}\n<figcaption>photograph</figcaption></figure>"
-
-
-def _data_uri(picture: FloatArray) -> str:
-    """The picture without loss: what is to be compared may differ by little."""
-    from PIL import Image, features  # most encodes make no page
-
-    pixels: NDArray[np.uint8] = to_8_bits(picture)
-    fits = max(pixels.shape[:2]) <= _WIDEST_WEBP and features.check("webp")
-    kind, options = ("webp", {"lossless": True, "method": 2}) if fits else ("png", {})
-    file = io.BytesIO()
-    Image.fromarray(pixels).save(file, format=kind, **options)
-    return f"data:image/{kind};base64,{base64.b64encode(file.getvalue()).decode('ascii')}"
 
 
 def _quality(quality: dict[str, Any] | str) -> str:
     if isinstance(quality, str):
-        return f"<p>{_text(quality)}</p>"
+        return f"<p>{text(quality)}</p>"
     views = quality["views"]
     most = max((view["psnr"] for view in views if view["psnr"] is not None), default=1.0)
     rows = []
@@ -199,29 +164,29 @@ def _quality(quality: dict[str, Any] | str) -> str:
         length = 100.0 if view["psnr"] is None else 100 * max(view["psnr"], 0) / max(most, 1e-9)
         worst = " (worst)" if view["name"] == quality["worst"]["name"] else ""
         bar = f'<span class="meter" style="width:{length:.1f}%"></span>'
-        rows.append([_text(view["name"]) + worst, decibels(view["psnr"]), bar, f"{view['ssim']:.4f}"])
+        rows.append([text(view["name"]) + worst, decibels(view["psnr"]), bar, f"{view['ssim']:.4f}"])
     rows.append(["<b>mean</b>", f"<b>{decibels(quality['psnr'])}</b>", "", f"<b>{quality['ssim']:.4f}</b>"])
-    said = f"<p>Against {_text(quality['against'])}, judged by {_text(quality['judged_by'])}.</p>"
+    said = f"<p>Against {text(quality['against'])}, judged by {text(quality['judged_by'])}.</p>"
     training = quality.get("training")
     if training is not None and training["said"] is not None:
-        said += f"<p>{_text(training['said'][0].upper() + training['said'][1:])}.</p>"
-    return said + _table(["view", "PSNR", "", "SSIM"], rows)
+        said += f"<p>{text(training['said'][0].upper() + training['said'][1:])}.</p>"
+    return said + table(["view", "PSNR", "", "SSIM"], rows)
 
 
 def _photographs(photographs: dict[str, Any]) -> str:
     which = "test views, which no stage has looked at" if photographs["kind"] == "test" else "training views"
     said = f"<p>PSNR against photographs of {which}.</p>"
     if photographs["held_out"] is not None:
-        said += f"<p>While encoding: {_text(photographs['held_out']['said'])}.</p>"
+        said += f"<p>While encoding: {text(photographs['held_out']['said'])}.</p>"
     if photographs["missing"] is not None:
-        said += f"<p>{_text(photographs['missing'])}.</p>"
+        said += f"<p>{text(photographs['missing'])}.</p>"
 
     def row(name: str, figures: dict[str, float]) -> list[str]:
         before, after = figures["uncompressed"], figures["file"]
         return [name, f"{before:.2f} dB", f"{after:.2f} dB", f"{before - after:+.2f} dB"]
 
-    rows = [row(_text(view["name"]), view) for view in photographs["views"]]
-    return said + _table(["view", "uncompressed", "from the file", "lost"], [*rows, row("<b>mean</b>", photographs)])
+    rows = [row(text(view["name"]), view) for view in photographs["views"]]
+    return said + table(["view", "uncompressed", "from the file", "lost"], [*rows, row("<b>mean</b>", photographs)])
 
 
 def _pruning(report: dict[str, Any]) -> str:
@@ -234,59 +199,17 @@ def _pruning(report: dict[str, Any]) -> str:
     return (
         f"<p>{left[0] - left[-1]:,} of {left[0]:,} splats removed in {len(history)} iterations.</p>\n"
         '<div class="charts">'
-        + _chart("splats left", [("", left)], first=0)
-        + _chart(
+        + chart("splats left", [("", list(enumerate(left)))])
+        + chart(
             "mean squared error",
-            [("estimated growth so far", growth), ("largest ΔMSE of a removed splat", largest)],
+            [
+                ("estimated growth so far", list(enumerate(growth, 1))),
+                ("largest ΔMSE of a removed splat", list(enumerate(largest, 1))),
+            ],
             logarithmic=True,
         )
         + "</div>"
     )
-
-
-def _chart(title: str, series: Sequence[tuple[str, Sequence[float]]], logarithmic: bool = False, first: int = 1) -> str:
-    """Lines over the iterations, which count from ``first``; a logarithmic chart leaves out what is not above 0."""
-    width, height, margin_left, margin = 420, 240, 64, 28
-    points = [
-        (name, [(first + k, float(v)) for k, v in enumerate(values) if v > 0 or not logarithmic])
-        for name, values in series
-    ]
-    every = [value for _, line in points for _, value in line]
-    if not every:
-        return ""
-    scale = math.log10 if logarithmic else float
-    low, high = (scale(min(every)), scale(max(every))) if logarithmic else (0.0, max(every))
-    if high - low < 1e-12:
-        low, high = low - 1, high + 1
-    last = max(first + len(values) - 1 for _, values in series)
-
-    def x(iteration: float) -> float:
-        return margin_left + (width - margin_left - 10) * (iteration - first) / max(last - first, 1)
-
-    def y(value: float) -> float:
-        return height - margin - (height - 2 * margin) * (scale(value) - low) / (high - low)
-
-    parts = [f'<text x="{margin_left}" y="16" class="title">{_text(title)}</text>']
-    for k in range(5):
-        level = low + (high - low) * k / 4
-        value = 10**level if logarithmic else level
-        label = f"{value:.1e}" if logarithmic else f"{value:,.0f}"
-        at = y(value)
-        parts.append(
-            f'<line x1="{margin_left}" x2="{width - 10}" y1="{at:.1f}" y2="{at:.1f}" class="grid"/>'
-            f'<text x="{margin_left - 6}" y="{at + 4:.1f}" text-anchor="end">{label}</text>'
-        )
-    for iteration in sorted({first, round((first + last) / 2), last}):
-        at = x(iteration)
-        parts.append(f'<text x="{at:.1f}" y="{height - 8}" text-anchor="middle">{iteration}</text>')
-    for (name, line), colour in zip(points, SERIES[::2], strict=False):
-        path = " ".join(f"{x(iteration):.1f},{y(value):.1f}" for iteration, value in line)
-        parts.append(f'<polyline points="{path}" stroke="{colour}" class="line"/>')
-        if name:
-            place = height - margin - 8 - 14 * [label for label, _ in points].index(name)
-            style = f'text-anchor="end" style="fill:{colour}"'
-            parts.append(f'<text x="{width - 14}" y="{place}" {style}>{_text(name)}</text>')
-    return f'<svg viewBox="0 0 {width} {height}" role="img">{"".join(parts)}</svg>'
 
 
 def _search(search: dict[str, Any]) -> str:
@@ -297,13 +220,13 @@ def _search(search: dict[str, Any]) -> str:
         "steps": "other quantiser steps",
         "colours": "other precision of colours",
     }
-    rows = [[kinds[step["kind"]], f"{step['q']:g}", _text(step["said"])] for step in search["tries"]]
-    said = f"<p>Asked for: {_text(search['target'])}. Reached: {_text(search['reached'])}.</p>"
-    return said + _table(["step", "q", "result"], rows)
+    rows = [[kinds[step["kind"]], f"{step['q']:g}", text(step["said"])] for step in search["tries"]]
+    said = f"<p>Asked for: {text(search['target'])}. Reached: {text(search['reached'])}.</p>"
+    return said + table(["step", "q", "result"], rows)
 
 
 def _settings(report: dict[str, Any]) -> str:
-    rows = [[_text(name), f"{value:.6g}"] for name, value in report["parameters"].items()]
+    rows = [[text(name), f"{value:.6g}"] for name, value in report["parameters"].items()]
     others = {
         name: value
         if not isinstance(value, dict)
@@ -314,26 +237,26 @@ def _settings(report: dict[str, Any]) -> str:
     }
     return (
         '<div class="columns">'
-        + _table(["parameter", "value"], rows)
-        + _table(["option", "value"], [[_text(name), _value(value)] for name, value in others.items()])
+        + table(["parameter", "value"], rows)
+        + table(["option", "value"], [[text(name), _value(value)] for name, value in others.items()])
         + "</div>"
     )
 
 
 def _value(value: Any) -> str:
     if isinstance(value, dict):
-        return "<br>".join(f"{_text(str(name))}: {_value(entry)}" for name, entry in value.items())
+        return "<br>".join(f"{text(str(name))}: {_value(entry)}" for name, entry in value.items())
     if isinstance(value, list | tuple):
         return ", ".join(_value(entry) for entry in value)
-    return "–" if value is None else _text(f"{value:.6g}" if isinstance(value, float) else str(value))
+    return "–" if value is None else text(f"{value:.6g}" if isinstance(value, float) else str(value))
 
 
 def _circumstances(report: dict[str, Any]) -> str:
-    command = f"<p><code>{_text(report['command'])}</code></p>" if report.get("command") else ""
-    times = [[_text(stage), f"{seconds:.1f} s"] for stage, seconds in report["seconds"].items()]
+    command = f"<p><code>{text(report['command'])}</code></p>" if report.get("command") else ""
+    times = [[text(stage), f"{seconds:.1f} s"] for stage, seconds in report["seconds"].items()]
     facts = dict(report["versions"])
     if report["device"] is not None:
         device = report["device"]
         facts = {"device": device["name"], "platform": f"{device['platform']}, {device['version']}"} | facts
-    rows = [[_text(name), _text(value)] for name, value in facts.items()]
-    return command + f'<div class="columns">{_table(["stage", "time"], times)}{_table(["", ""], rows)}</div>'
+    rows = [[text(name), text(value)] for name, value in facts.items()]
+    return command + f'<div class="columns">{table(["stage", "time"], times)}{table(["", ""], rows)}</div>'

@@ -48,6 +48,7 @@ COMMAND_LINE_ONLY = {
     "--to": "for standard output and folders of scenes",
     "--skip-existing": "for folders of scenes",
     "--budget": "compare_budgets compares levels of detail, compare one scene",
+    "--curve": "compare_budgets(...).write_page",
     "--ladder": "encode_ladder makes several files, encode one",
     "--cluster": "a keyword too; tests/workers/test_cluster.py compares them, with a cluster",
     "--no-quality": "judge=False, which is the default in Python unless there is a report",

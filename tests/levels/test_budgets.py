@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 from dataclasses import dataclass, replace
@@ -214,7 +215,7 @@ def test_the_command_compares_what_is_shown(
 ) -> None:
     scene, cameras = data / "plush_excerpt.ply", data / "plush_excerpt_cameras.json"
     words = ["compare", scene, *files, "--cameras", cameras, "--budget", "900", "350", "--views", "0", "3", "--json"]
-    report = json.loads(run(capsys, *words, "-o", tmp_path / "worst.png"))
+    report = json.loads(run(capsys, *words, "-o", tmp_path / "worst.png", "--curve", tmp_path / "curve.html"))
     assert [file["splats"] for file in report["files"]] == [list(LEVELS)] * 2
     rows = {(row["budget"], Path(row["file"]).name, row["levels_by"]): row for row in report["budgets"]}
     assert set(rows) == {
@@ -234,6 +235,9 @@ def test_the_command_compares_what_is_shown(
     assert (row["name"], row["splats"]) == (view.name, len(shown))
     assert row["psnr"] == pytest.approx(-10 * np.log10(np.square(own - whole).mean()), abs=0.01)
     assert (tmp_path / "worst.png").stat().st_size > 1000
+    page = (tmp_path / "curve.html").read_text()
+    assert len(re.findall(r'<polyline points="\S+ \S+"', page)) == 3  # a line a choice, a point a budget
+    assert f"<td>{rows[900, 'a.potr', 'distance']['psnr']:.2f} dB</td>" in page
     text = run(capsys, *words[:-1])
     assert "levels by" in text
     assert f"{rows[350, 'a.potr', 'distance']['psnr']:.2f}" in text
@@ -242,6 +246,7 @@ def test_the_command_compares_what_is_shown(
 def test_wrong_requests_are_told(files: tuple[Path, Path], data: Path, capsys: Any) -> None:
     scene = data / "plush_excerpt.ply"
     fails(capsys, ["compare", scene, *files], 2, "give --budget")
+    fails(capsys, ["compare", scene, files[0], "--curve", "a.html"], 2, "give --budget")
     fails(capsys, ["compare", scene, *files, "--budget", "0"], 2, "1 or more")
     fails(capsys, ["compare", scene, *files, "--budget", "5", "--lpips"], 2, "--lpips does not go with --budget")
     with pytest.raises(potr_cl.UsageError, match="1 or more"):
