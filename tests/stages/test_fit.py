@@ -11,6 +11,7 @@ import pytest
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import resized
+from potr_cl.model.views_between import views_between
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fit import Fit
 from potr_cl.stages.fitting.fit import FitOptions, batches, fit_scene, held_out_error
@@ -19,6 +20,7 @@ from potr_cl.stages.held_out import share_out
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.stage import Results, State, Workbench
 from potr_cl.views.targets import RenderedTargets
+from tests.cases.surfaces import sphere
 from tests.devices import FAMILIES, KERNELS, open_device
 from tests.reference.refit_cases import Pictures
 from tests.reference.scenes import ring_of_cameras, visible_scene
@@ -388,6 +390,19 @@ def test_views_between_are_its_own(family_device, plush_excerpt, small_views):
         assert state.views == tuple(small_views)
         assert state.added == 0
     assert not np.array_equal(states[0].scene.means, states[1].scene.means)
+
+
+@pytest.mark.one_family
+def test_views_between_are_added_to_the_given_ones(family_device):
+    """In place of fewer that a stage has added before, and not where there are as many already."""
+    source, given = sphere(1000, 1.0, 0.05), tuple(ring_of_cameras(6, size=40))
+    one = tuple(views_between(source, given, 1))
+    before = dataclasses.replace(State.of(source, (*given, *one)), added=len(one))
+    after = Fit(between=2)._looking_between(before, bench_of(family_device))
+    two = tuple(views_between(source, given, 2))
+    assert [view.name for view in after.views] == [view.name for view in (*given, *two)]
+    assert after.added == len(two) > len(one) == 6
+    assert Fit(between=1)._looking_between(before, bench_of(family_device)) is before
 
 
 @pytest.mark.one_family
