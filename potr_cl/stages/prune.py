@@ -171,7 +171,7 @@ class Prune(Stage):
         # A copy of a large scene without them would take as much memory as the scene.
         if (
             visibility is not None
-            and not bench.pool
+            and (bench.pool is None or bench.pool.in_process)
             and not bench.interludes
             and bench.parameters.delta_mse_max < LARGEST_LIMIT
         ):

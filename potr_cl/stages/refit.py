@@ -157,7 +157,8 @@ class Refit(Stage):
             help_from = None
             if bench.pool is not None:
                 goal = bench.shared_source(state) if state.truth is None else state.truth
-                help_from = HelpFrom(bench.pool, goal if ahead is None else ahead)
+                visibility = state.visibility if bench.pool.in_process and state.truth is None else None
+                help_from = HelpFrom(bench.pool, goal if ahead is None else ahead, visibility)
             # With photographs nobody helps: these lie where the master reads them.
             fits: list[tuple[Sequence[Camera], Targets, HelpFrom | None]] = [(state.views, pictures, help_from)]
             if folder is not None:

@@ -95,7 +95,10 @@ class HelpFrom:
         pool: the workers.
         source: the scene whose pictures are the targets, perhaps kept on devices, or with pictures of it there; or who
             does which views, and has what these see of it.
+        visibility: what the views may draw of the source, where it is the same for all workers, and where no view sees
+            much of it.
     """
 
     pool: Pool
     source: Scene | ResidentScene | PicturesAhead | ViewShares
+    visibility: Visibility | None = None

@@ -32,7 +32,7 @@ from potr_cl.opencl.ferry import Cargo, Ferry
 from potr_cl.opencl.memory import Memory, Owner, Scratch
 from potr_cl.raster.picked_splats import IndexSubsets
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.resident import ResidentScene
+from potr_cl.raster.resident import ResidentScene, whole_on_device
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
 from potr_cl.views.budget import ViewCache, target_bytes
 from potr_cl.views.pictures import SeenRasterizer
@@ -93,8 +93,10 @@ def targets_of(
     background: tuple[float, float, float],
     visibility: Visibility | None = None,
 ) -> Iterator[RenderedTargets]:
-    """A scene's pictures; by what views may draw, where that is known and the scene lies on a GPU: the same bits."""
+    """A scene's pictures; by what views may draw, where that is known and the scene fits a GPU: the same bits."""
     with ExitStack() as stack:
+        if visibility is not None and device.family == "gpu":
+            scene = stack.enter_context(whole_on_device(device, scene))
         if visibility is not None and isinstance(scene, SceneBuffers) and device.family == "gpu":
             seen = stack.enter_context(SeenRasterizer(device, scene, visibility.groups, background=background))
             yield RenderedTargets(seen, cameras, seen.picks(stack.enter_context(Memory(device)), visibility.seen))

@@ -24,8 +24,13 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner, Scratch
 from potr_cl.opencl.relay import Lent, Relay
-from potr_cl.raster.resident import ResidentScene, ResidentSubset, SceneSubset, scene_on, whole_on_device
-from potr_cl.raster.scene_buffers import SceneBuffers
+from potr_cl.raster.resident import (
+    DeviceScene,
+    SceneHandle,
+    scene_on,
+    whole_on_device,
+)
+from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
 from potr_cl.stages.pruning.buffers import Bits
 from potr_cl.stages.pruning.exchange import AddedChanges, AlivePacking, ChangedTotals, Changes
 from potr_cl.stages.pruning.removal import F64, Indices, RemovalSweep, add_totals, planned_sweep
@@ -45,7 +50,7 @@ class RemovalPart(Part):
     Args:
         device: to compute on.
         memory: bytes of its memory that the views may take; None: the default.
-        scene: the uncompressed scene, perhaps kept on devices; or of it what these views may draw
+        scene: the uncompressed scene, perhaps on devices; or of it what these views may draw
             (:mod:`potr_cl.views.shares`).
         cameras: all views.
         options: speed/accuracy trade-offs.
@@ -58,7 +63,7 @@ class RemovalPart(Part):
         self,
         device: Device,
         memory: int | None,
-        scene: Scene | ResidentScene | ResidentSubset | SceneSubset,
+        scene: Scene | SceneHandle,
         cameras: Sequence[Camera],
         options: SweepOptions,
         background: tuple[float, float, float],
@@ -273,30 +278,38 @@ def measurement(
             scene = None
             if visibility is not None:
                 scene = state.scene if seen is None else state.scene.subset(seen)
-                drawable = stack.enter_context(whole_on_device(device, bench.drawable(scene)))
+                whole = stack.enter_context(whole_on_device(device, bench.drawable(scene)))
             else:
-                drawable = stack.enter_context(scene_on(device, bench.scene_of(state, seen)))
-            given_all = (device, drawable, views, options, bench.background, visibility, None, progress, scene, spared)
+                whole = stack.enter_context(scene_on(device, bench.scene_of(state, seen)))
+            given_all = (device, whole, views, options, bench.background, visibility, None, progress, scene, spared)
             yield stack.enter_context(planned_sweep(*given_all))
             return
         given: list[tuple[Any, ...]] = []
+        drawable: Drawable | None = None
         if dealt is not None:
             share = dealt.dealt
             for part in dealt.shares:
                 subset = stack.enter_context(pool.shared(part.subset))
                 given.append((subset, views, options, bench.background, part.numbers, part.visibility))
         else:
-            sent = stack.enter_context(bench.shared(pool, state, seen))
-            visibility = visibility if pool.in_process else None
+            if pool.in_process:
+                placed: Scene | SceneHandle = bench.scene_of(state, seen)
+                drawable = stack.enter_context(scene_on(device, placed))
+                if visibility is not None:
+                    drawable = stack.enter_context(whole_on_device(device, drawable))
+                if isinstance(drawable, SceneBuffers) and isinstance(placed, Scene):
+                    # Others copy it from there: to make it ready on the host once more would take longer.
+                    placed = DeviceScene(drawable)
+                sent = stack.enter_context(pool.shared(placed))
+            else:
+                sent, visibility = stack.enter_context(bench.shared(pool, state, seen)), None
             given = [(sent, views, options, bench.background, numbers, visibility) for numbers in share.others]
         parts = stack.enter_context(Parts(pool, RemovalPart, given, options.memory, share.names))
         numbers = None if dealt is None else [each.splats for each in dealt.shares]
         helpers = stack.enter_context(RemovalHelpers(device, splats, parts, pool, numbers))
-        if share.own:
-            drawable = stack.enter_context(scene_on(device, bench.scene_of(state, seen)))
-            # Only what lies on the device already is looked at in parts.
-            own_visibility = visibility if isinstance(drawable, SceneBuffers) else None
-            own = (device, drawable, views, options, bench.background, own_visibility, share.own, progress)
+        if drawable is not None and share.own:
+            scene = drawable if isinstance(drawable, Scene) else None
+            own = (device, drawable, views, options, bench.background, visibility, share.own, progress, scene, spared)
             sweep = stack.enter_context(planned_sweep(*own, helpers=helpers))
         else:
             source = NoSplats(device, splats)

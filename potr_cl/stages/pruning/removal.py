@@ -111,7 +111,7 @@ class RemovalSweep(Owner):
             self._own = self.totals
             if helpers is not None:
                 self.device.fill(self.totals, np.int64(0))
-                if plan.groups:
+                if plan.groups or spared is not None:
                     self._own = self._memory.allocate(16 * source.stride, "the removal effects")
             self._begin_totals()
             self._survivors = owned.enter_context(

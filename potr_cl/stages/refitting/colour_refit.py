@@ -77,7 +77,8 @@ class ColourRefit(Owner):
                 share = source.dealt if isinstance(source, ViewShares) else colour_shares(pool, len(cameras))
                 if share.others:
                     own = share.own
-                    others = owned.enter_context(colour_parts(pool, share, scene, background, source, cameras, memory))
+                    given = (pool, share, scene, background, help_from, cameras, memory)
+                    others = owned.enter_context(colour_parts(*given))
             sweep = RefitSweep(device)
             layout = Layout(len(scene), stride_of(len(scene)), scene.sh.shape[1], sweep.lanes)
             # The vectors come first: prepared views can do with less memory, and only take longer then.

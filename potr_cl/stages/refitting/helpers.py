@@ -21,7 +21,7 @@ from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.opencl.narrow import Narrowed
 from potr_cl.opencl.relay import Lent
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.resident import ResidentScene, SceneSubset, scene_on, whole_on_device
+from potr_cl.raster.resident import ResidentScene, SceneSubset, scene_on
 from potr_cl.raster.scene_buffers import stride_of
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.exchange import DrawnRows, Exchange, SentVector
@@ -30,7 +30,7 @@ from potr_cl.stages.refitting.refit_options import AnyScene, arrived, colourless
 from potr_cl.stages.refitting.sliced_arrays import Layout
 from potr_cl.stages.refitting.view_kernels import RefitSweep
 from potr_cl.views.reached import reached_splats
-from potr_cl.views.shares import ViewShares
+from potr_cl.views.shares import HelpFrom, ViewShares
 from potr_cl.views.targets import PicturesAhead, Targets, targets_of
 from potr_cl.views.visibility import Visibility
 from potr_cl.workers.parts import Each, Parts, Pending
@@ -102,8 +102,6 @@ class ColourPart(Part):
             self._coefficients.zero(self._x)
             ahead, kept = (source, source.source) if isinstance(source, PicturesAhead) else (None, source)
             pictured = owned.enter_context(scene_on(device, kept))
-            if visibility is not None:
-                pictured = owned.enter_context(whole_on_device(device, pictured))
             of_source = owned.enter_context(targets_of(device, pictured, cameras, background, visibility))
             here = arrived(scene)
             rasterizer = owned.enter_context(Rasterizer(device, colourless(here)))
@@ -329,7 +327,7 @@ def colour_parts(
     share: Shares,
     scene: AnyScene,
     background: tuple[float, float, float],
-    source: Scene | ResidentScene | PicturesAhead | ViewShares,
+    help_from: HelpFrom,
     cameras: Sequence[Camera],
     memory: int | None,
 ) -> Iterator[Parts]:
@@ -340,11 +338,11 @@ def colour_parts(
         share: who does which views.
         scene: whose colours are re-fitted.
         background: of the rasterizer.
-        source: the scene whose pictures are the targets, perhaps kept on devices, with pictures of it there, or what
-            the views see of it.
+        help_from: with the scene whose pictures are the targets.
         cameras: all views.
         memory: bytes of a device's memory that prepared views and targets may take; None: the default.
     """
+    source = help_from.source
     sh_count = scene.sh.shape[1]
     if not pool.in_process:  # nobody needs the other colours, and they would travel
         here = arrived(scene)
@@ -355,7 +353,7 @@ def colour_parts(
         if isinstance(source, ViewShares):
             pictured = [(stack.enter_context(pool.shared(each.subset)), each.visibility) for each in source.shares]
         else:
-            pictured = [(stack.enter_context(pool.shared(source)), None)] * len(share.others)
+            pictured = [(stack.enter_context(pool.shared(source)), help_from.visibility)] * len(share.others)
         given = [
             (shape, sh_count, background, own, cameras, numbers, visibility)
             for (own, visibility), numbers in zip(pictured, share.others, strict=True)
