@@ -6,7 +6,7 @@ The bytes do not depend on the number of threads, nor on how many blocks are cod
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from threading import Lock
@@ -30,7 +30,7 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 
 #: Threads that a block keeps busy: with more of them, further blocks are coded beside it, up to so many.
-_THREADS_A_BLOCK, _SIDE_BY_SIDE = 4, 4
+_THREADS_A_BLOCK, _SIDE_BY_SIDE = 4, 8
 
 
 @dataclass(frozen=True)
@@ -122,19 +122,19 @@ def code_levels(
         As :func:`code_scene`.
     """
     coder, threads = entropy or EntropyCoder(), threads or os.cpu_count() or 1
-    work = [
-        (level, error, *part)
-        for level, error, parts in ((k, each.error, _parts(each)) for k, each in enumerate(levels))
-        for part in parts
-    ]
+    work = [(number, level, *block) for number, level in enumerate(levels) for block in _blocks(level)]
     # The coarsest comes first in a file.
     work.sort(key=lambda each: -each[0])
     side_by_side = max(min(threads // _THREADS_A_BLOCK, _SIDE_BY_SIDE, len(work)), 1)
     report = _Progress(progress, len(work))
 
-    def code(each: tuple[int, float, Scene, Geometry]) -> tuple[Block, list[CodedSection]]:
+    def code(
+        each: tuple[int, Level, NDArray[np.int64] | None, Geometry],
+    ) -> tuple[Block, list[CodedSection]]:
+        number, level, rows, geometry = each
+        scene = level.scene if rows is None else level.scene.subset(rows)
         with thread_pool(-(-threads // side_by_side)) as pool:
-            coded = _coded(*each, coder, pool)
+            coded = _coded(number, level.error, scene, geometry, coder, pool)
         report.one_more()
         return coded
 
@@ -151,12 +151,12 @@ def code_levels(
     return Coded(container.assemble(blocks, own), levels[0].geometry.order)
 
 
-def _parts(level: Level) -> list[tuple[Scene, Geometry]]:
-    """The scene and the geometry of each block."""
+def _blocks(level: Level) -> Iterable[tuple[NDArray[np.int64] | None, Geometry]]:
+    """Each block's splats in the scene (None: all), and its geometry."""
     geometry = level.geometry
     if isinstance(geometry, GeometryOfBlocks):
-        return [(level.scene.subset(rows), block) for rows, block in zip(geometry.rows, geometry.blocks, strict=True)]
-    return [(level.scene, geometry)]
+        return zip(geometry.rows, geometry.blocks, strict=True)
+    return [(None, geometry)]
 
 
 def _coded(
