@@ -137,10 +137,16 @@ def default_memory(device: Device) -> int:
     return int(device.info.memory * (_SHARE_OF_HOST if device.info.shares_host_memory else _SHARE_OF_ALL))
 
 
-def free_memory(device: Device) -> float:
-    """Bytes that the views may take beside what is there: two fifths of what is free, or a quarter of the host's."""
+def free_memory(device: Device, later: int = 0) -> float:
+    """Bytes that the views may take beside what is there: two fifths of what is free, or a quarter of the host's.
+
+    Args:
+        device: that they are prepared on.
+        later: bytes that others will take, which the views leave free.
+    """
     free = device.info.memory - device.allocated
-    return free * (_SHARE_OF_FREE_HOST if device.info.shares_host_memory else _SHARE_OF_FREE)
+    share = _SHARE_OF_FREE_HOST if device.info.shares_host_memory else _SHARE_OF_FREE
+    return max(min(free * share, free - later), 0)
 
 
 def target_bytes(camera: Camera) -> int:

@@ -66,6 +66,8 @@ PLANS = {
     "own splats, slices": Plan(SLICES, picked=True),
     "two devices": Plan(workers=2),
     "two devices, own splats": Plan(workers=2, picked=True),
+    "two devices, slices": Plan(SLICES, 0, workers=2),
+    "three devices, own splats, slices": Plan(SLICES, 3, picked=True, workers=3),
     "a cluster of three": Plan(workers=4, elsewhere=True),
     "a cluster of three, own splats, no view kept": Plan(workers=4, elsewhere=True, picked=True, memory=0),
 }

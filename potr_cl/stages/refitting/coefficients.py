@@ -280,6 +280,7 @@ def residency_of(
     memory: int | None,
     slices: int | None = None,
     reach: Reach | None = None,
+    shared: bool = False,
 ) -> Residency:
     """Where a re-fit's vectors lie.
 
@@ -296,6 +297,7 @@ def residency_of(
         memory: bytes of the device's memory that the user would have taken; None: as much as there is.
         slices: splats of a slice, if the vectors are to lie on the host in any case.
         reach: of the views, if each has splats of its own.
+        shared: whether other devices do some of the views: packed coefficients and sums of theirs take three vectors.
     """
     vector, triangle = 12 * sh_count, sh_count * (sh_count + 1) // 2
     one_piece = splats * (_VECTORS * vector + 2 * vector + 12 * triangle)
@@ -312,7 +314,7 @@ def residency_of(
     # A place for a vector that views are looked at with, the sums, and some vectors.
     of_host = device.info.kind == "cpu" or device.info.integrated
     if slices is None and reach is not None:
-        own = splats * (2 * vector + _LYING) + _LAUNCHED * reach.most + reach.total
+        own = splats * ((5 if shared else 2) * vector + _LYING) + _LAUNCHED * reach.most + reach.total
         left = total - own - some * of_slice - 8 * triangle * min(blocks, splats)
         share = _OF_HOST * total - own if of_host else left - _LEAST_VIEWS * total
         resident = min(int(max(share, 0) / max(splats * vector, 1)), _MOST)
@@ -321,7 +323,9 @@ def residency_of(
             resident, others = max(resident - 1, _FEWEST), 1
         return Residency(max(int(left - (resident + others) * splats * vector), 0), some, blocks, resident)
     room = int(((_OF_HOST if of_host else _OF_VECTORS) * total / max(splats, 1) - _SWEEP) / vector) - 3
-    besides = splats * (3 * vector + _SWEEP) + some * of_slice + 8 * triangle * min(blocks, splats)
+    if shared:
+        room -= 3
+    besides = splats * ((6 if shared else 3) * vector + _SWEEP) + some * of_slice + 8 * triangle * min(blocks, splats)
     # Of few splats a slice, which has so many at least, takes more than its share.
     room = min(room, int((total - besides) / max(splats * vector, 1)))
     resident = min(max(room, _FEWEST), _MOST) if slices is None else _FEWEST

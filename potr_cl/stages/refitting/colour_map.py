@@ -65,7 +65,7 @@ class ColourMap:
             on_device = coefficients.on_device(x)
             if self._helpers is not None:
                 own.prepare(targets)  # it waits for this device, from which the others then read x
-                self._helpers.begin_gradient(on_device, blocks is not None, constant)
+                self._helpers.begin_gradient(on_device, ranges[0] if ranges else None, constant)
             own.add_up(Look(on_device, targets, constant=constant, blocks=sums))
             errors = {} if self._helpers is None else self._helpers.add(own.sums, sums)
             errors |= own.found_errors()
@@ -76,7 +76,11 @@ class ColourMap:
         for splats in ranges[1:]:
             with Memory(coefficients.device) as memory:
                 sums = self._block_sums(memory, splats)
+                if self._helpers is not None:
+                    self._helpers.begin_blocks(splats)
                 own.add_up(Look(blocks=sums, first_block=splats.start))
+                if self._helpers is not None:
+                    self._helpers.add_blocks(sums)
                 assert blocks is not None
                 blocks.set_fixed(splats, sums, unit)
                 coefficients.device.finish()
@@ -109,8 +113,7 @@ class ColourMap:
             unit = 1 / largest
             on_device = coefficients.on_device(direction)
             if self._helpers is not None:
-                assert isinstance(at, cl.Buffer), "several devices have their vectors on the master's device"
-                self._helpers.begin_normal(on_device, at, unit, constant, part)
+                self._helpers.begin_normal(on_device, coefficients.on_device(at, 1), unit, constant, part)
             own.add_up(Look(on_device, None, at, unit, constant, part))
             if self._helpers is not None:
                 self._helpers.add(own.sums, None)

@@ -83,7 +83,9 @@ class ColourRefit(Owner):
             layout = Layout(len(scene), stride_of(len(scene)), scene.sh.shape[1], sweep.lanes)
             # The vectors come first: prepared views can do with less memory, and only take longer then.
             size = layout.splats, layout.sh_count
-            place = Residency(memory) if others is not None else residency_of(device, *size, memory, slices)
+            # What travels to other computers and back travels in one piece.
+            far = others is not None and help_from is not None and not help_from.pool.in_process
+            place = Residency(memory) if far else residency_of(device, *size, memory, slices, shared=others is not None)
 
             def looked_at(room: int | None) -> tuple[Rasterizer, Reach | None]:
                 rasterizer = owned.enter_context(Rasterizer(device, colourless(arrived(scene))))
@@ -94,7 +96,7 @@ class ColourRefit(Owner):
                 looked = looked_at(memory)
                 scene = arrived(scene)
                 if looked[1] is not None:
-                    place = residency_of(device, *size, memory, slices, looked[1])
+                    place = residency_of(device, *size, memory, slices, looked[1], others is not None)
             self.coefficients = owned.enter_context(Coefficients(device, layout, place.slice, place.resident))
             blocks = SplatBlocks(self.coefficients, place.blocks)
             self.solver = ColourSolver(self.coefficients, blocks)
@@ -107,7 +109,17 @@ class ColourRefit(Owner):
                 helpers = owned.enter_context(ColourHelpers(self.coefficients, others, pool.in_process))
             rasterizer, reach = looked or looked_at(place.views)
             views = owned.enter_context(
-                OwnViews(sweep, rasterizer, self.coefficients, cameras, background, place.views, own, reach)
+                OwnViews(
+                    sweep,
+                    rasterizer,
+                    self.coefficients,
+                    cameras,
+                    background,
+                    place.views,
+                    own,
+                    reach,
+                    shared=others is not None,
+                )
             )
             self.colour_map = ColourMap(self.coefficients, views, helpers)
             if others is not None:

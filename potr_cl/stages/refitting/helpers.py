@@ -44,7 +44,7 @@ class Gradient:
     Attributes:
         errors: the squared error by W of each view, by number.
         sums: (active coefficients,) int64.
-        blocks: (M (M + 1) / 2, stride) int64, the sums of the splats' own blocks, where they are lent.
+        blocks: (M (M + 1) / 2, n) int64, the sums of the splats' own blocks, where they are lent.
         drawn: (N / 8, rounded up) uint8, a bit for each splat that the views draw, the lowest first, if that is asked:
             whatever the others' colours are, the sums are the same, and theirs are 0.
     """
@@ -107,7 +107,9 @@ class ColourPart(Part):
             rasterizer = owned.enter_context(Rasterizer(device, colourless(here)))
             self._reach = reach = reached_splats(rasterizer, cameras, numbers, memory)
             self._views = owned.enter_context(
-                OwnViews(sweep, rasterizer, self._coefficients, cameras, background, memory, numbers, reach=reach)
+                OwnViews(
+                    sweep, rasterizer, self._coefficients, cameras, background, memory, numbers, reach, shared=True
+                )
             )
             self._targets: Targets = of_source
             if ahead is not None:
@@ -118,41 +120,61 @@ class ColourPart(Part):
             self._owned = owned.pop_all()
 
     def gradient(
-        self, x: SentVector, flags: NDArray[np.uint32] | Lent, blocks: bool, constant: bool, tell_drawn: bool = False
+        self,
+        x: SentVector,
+        flags: NDArray[np.uint32] | Lent,
+        blocks: range | None,
+        constant: bool,
+        tell_drawn: bool = False,
     ) -> Gradient:
         """What these views add to :meth:`~potr_cl.stages.refitting.colour_map.ColourMap.gradient`.
 
         Args:
             x: the coefficients. If they are lent, the sums are lent too, and the blocks with them.
             flags: (2, N) uint32, which of them are active.
-            blocks: whether the splats' own blocks are wanted; see :meth:`block_rows`.
+            blocks: the splats whose own blocks are wanted; see :meth:`block_rows`.
             constant: whether only the constant coefficients are active.
             tell_drawn: whether it is asked which splats the views draw.
         """
-        self._forget_blocks()
         layout = self._coefficients.layout
         self._exchange.take_flags(flags)
         self._exchange.take_vector(self._x, x)
-        if blocks:
-            self._block_sums = self._blocks.allocate(
-                8 * layout.triangle * layout.stride, "the splats' normal equations"
-            )
-            self._coefficients.zero(self._block_sums)
+        first_block = self._begin_blocks(blocks)
         drawn = None
         with Memory(self._device) as memory:
             marks = None
             if tell_drawn and self._reach is None:
                 marks = memory.allocate(layout.stride, "the splats that views draw")
                 self._device.fill(marks, np.uint8(0))
-            look = Look(self._x, self._targets, constant=constant, blocks=self._block_sums, drawn=marks)
+            look = Look(
+                self._x, self._targets, constant=constant, blocks=self._block_sums, first_block=first_block, drawn=marks
+            )
             self._views.add_up(look)
             if tell_drawn:
                 drawn = self._drawn(marks)
-        lent = None
-        if self._block_sums is not None and self._exchange.lends:
-            lent = Lent(self._device, self._block_sums, self._block_sums.size)
+        lent = self._lent_blocks() if self._block_sums is not None and self._exchange.lends else None
         sums = self._exchange.send_sums(self._views.sums)
         return Gradient(self._views.found_errors(), sums, lent, drawn)
+
+    def lend_blocks(self, splats: range) -> Lent:
+        """(M (M + 1) / 2, n) int64, the sums of some splats' own blocks, for others of this process."""
+        first_block = self._begin_blocks(splats)
+        self._views.add_up(Look(blocks=self._block_sums, first_block=first_block))
+        return self._lent_blocks()
+
+    def _begin_blocks(self, splats: range | None) -> int:
+        """Have zeros for some splats' blocks, and for no others; the number of the first of these splats."""
+        self._forget_blocks()
+        if splats is None:
+            return 0
+        nbytes = 8 * self._coefficients.layout.triangle * len(splats)
+        self._block_sums = self._blocks.allocate(nbytes, "the splats' normal equations")
+        self._coefficients.zero(self._block_sums)
+        return splats.start
+
+    def _lent_blocks(self) -> Lent:
+        assert self._block_sums is not None
+        return Lent(self._device, self._block_sums, self._block_sums.size)
 
     def leave_out(self, drawn: NDArray[np.uint8]) -> None:
         """Have no coefficient active of splats that these views do not draw.
@@ -174,7 +196,7 @@ class ColourPart(Part):
         return np.packbits(found, bitorder="little")
 
     def block_rows(self, first: int, rows: int) -> Narrowed:
-        """Some rows of the sums of the splats' own blocks after a gradient; valid until the next call.
+        """Some rows of the sums of all splats' own blocks after a gradient; valid until the next call.
 
         Returns:
             (rows, stride) int64, of packed upper triangles.
@@ -236,8 +258,8 @@ class ColourHelpers(Owner):
         self._ask_drawn = not in_process and len(others) > 1
         self._drawn: DrawnRows | None = None
 
-    def begin_gradient(self, x: cl.Buffer, blocks: bool, constant: bool) -> None:
-        """Have them begin with a gradient at x."""
+    def begin_gradient(self, x: cl.Buffer, blocks: range | None, constant: bool) -> None:
+        """Have them begin with a gradient at x, and with the own blocks of some splats."""
         flags: Lent | Each | NDArray[np.uint32]
         flags = (
             self._exchange.send_flags() if self._drawn is None else Each(self._drawn.take_flags(self._exchange.flags()))
@@ -255,12 +277,24 @@ class ColourHelpers(Owner):
         packed = self._exchange.send_floats(direction) if self._drawn is None else Each(self._drawn.floats(direction))
         self._pending = self._others.begin("normal", packed, unit, constant, part, logged=False)
 
-    def add(self, sums: cl.Buffer, blocks: cl.Buffer | None) -> dict[int, float]:
-        """Add what they found to sums on the master's device."""
+    def begin_blocks(self, splats: range) -> None:
+        """Have them begin with the own blocks of other splats than in the gradient before; only in this process."""
+        self._pending = self._others.begin("lend_blocks", splats, logged=False)
+
+    def add_blocks(self, blocks: cl.Buffer) -> None:
+        """Add those blocks to sums on the master's device."""
+        for found in self._found():
+            self._exchange.add_lent(blocks, found)
+
+    def _found(self) -> list[Any]:
         pending, self._pending = self._pending, None
         assert pending is not None, "nothing was begun"
+        return pending.results()
+
+    def add(self, sums: cl.Buffer, blocks: cl.Buffer | None) -> dict[int, float]:
+        """Add what they found to sums on the master's device."""
         errors: dict[int, float] = {}
-        results: list[Any] = pending.results()
+        results = self._found()
         for place, result in enumerate(results):
             errors |= result.errors if isinstance(result, Gradient) else {}
             found = result.sums if isinstance(result, Gradient) else result

@@ -74,6 +74,9 @@ class ViewErrors(Owner):
 
 #: Bytes a splat and view of a sweep's own buffers: the colours' change and the sums.
 _CHANGE, _TOTALS = 16, 32
+#: Vectors' bytes that are taken later, beside the sums of the splats' own blocks: the sums over views, and what the
+#: solution was before it was rounded; and of packed coefficients that go to other devices and come from them.
+_LATER, _EXCHANGED = 3, 3
 #: Views are divided into so many parts, every second one in each, where each has as many as are enough: with 50 in
 #: each, steps by one part cost 0.06 % of the bytes at equal PSNR on a synthetic scene, with 63 0.4 % on a real one.
 _PARTS, ENOUGH = 2, 50
@@ -118,6 +121,7 @@ class OwnViews(Owner):
             what is free, or a quarter where that is the host's memory.
         numbers: of the views that are done here, ascending; None: all.
         reach: of these, where each has splats of its own; None: they share all splats.
+        shared: whether other devices do other views, so that vectors and sums go from one to the other.
 
     Attributes:
         count: of all views.
@@ -137,6 +141,7 @@ class OwnViews(Owner):
         memory: int | None = None,
         numbers: Sequence[int] | None = None,
         reach: Reach | None = None,
+        shared: bool = False,
     ) -> None:
         self._device = device = coefficients.device
         layout = coefficients.layout
@@ -154,7 +159,8 @@ class OwnViews(Owner):
         parts = [list(some) for _, some in itertools.groupby(order, lambda each: each % self.parts)]
         # To render a picture takes many times as long as to project a view, and it takes less room.
         pictures = sum(target_bytes(cameras[number]) for number in own_numbers)
-        room = free_memory(device) if memory is None else memory
+        later = layout.stride * (8 * layout.triangle + 4 * layout.columns * (_LATER + _EXCHANGED * shared))
+        room = free_memory(device, later) if memory is None else memory
         with ExitStack() as owned:
             self._cache = owned.enter_context(ViewCache(device, room, pictures))
             self._memory = owned.enter_context(Memory(device))
