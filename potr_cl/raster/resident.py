@@ -136,12 +136,14 @@ _WHOLE = 3
 class ResidentScene(Owner, SceneHandle):
     """Uploads a scene once for several rasterizers, where the device has much more memory than it takes.
 
+    It is on its way when this is made; who asks for it waits.
+
     Args:
         device: to keep it on.
         scene: whose arrays do not change meanwhile.
         memory: bytes that the user would have taken; None: as much as there is. Where a device's memory is the host's,
             a scene that is a large part of it is not kept: it is there already.
-        others: devices of this process that it is brought to as well, without waiting for it.
+        others: devices of this process that it is brought to as well.
 
     Attributes:
         groups: of the scene's splats, once somebody has found that views see little of it.
@@ -149,19 +151,18 @@ class ResidentScene(Owner, SceneHandle):
 
     def __init__(self, device: Device, scene: Scene, memory: int | None = None, others: Sequence[Device] = ()) -> None:
         self._device, self._scene, self._budget = device, scene, memory
-        self._buffers: SceneBuffers | None = None
-        self._buffers = self._placed(device)
-        self._elsewhere: dict[Device, Future[SceneBuffers | None]] = {}
+        self._on: dict[Device, Future[SceneBuffers | None]] = {}
         self._lock = threading.Lock()
         self.groups: SplatGroups | None = None
-        for other in others:
-            self.bring_to(other)
+        for each in (device, *others):
+            self.bring_to(each)
 
     def _placed(self, device: Device) -> SceneBuffers | None:
         if _PART * self._scene.nbytes <= _allowed(device, self._budget):
+            # To make a scene ready on the host takes many times as long as to copy it from device to device.
+            first = None if device is self._device else self._on[self._device].result()
             with suppress(DeviceMemoryError):
-                # To make a scene ready on the host takes many times as long as to copy it from device to device.
-                return uploaded(device, self._scene) if self._buffers is None else copied(device, self._buffers)
+                return uploaded(device, self._scene) if first is None else copied(device, first)
         return None
 
     def is_large_for(self, device: Device, scene: Scene | None = None) -> bool:
@@ -179,21 +180,19 @@ class ResidentScene(Owner, SceneHandle):
 
     def drawable(self, device: Device, scene: Scene) -> Drawable:
         """What to give to a rasterizer for a scene: what is kept, if it is this scene and on this device."""
-        if self._buffers is not None and self.is_of(scene) and device is self._device:
-            return self._buffers
-        return scene
+        return self.found_on(device) if self.is_of(scene) and device is self._device else scene
 
     def bring_to(self, device: Device) -> Future[SceneBuffers | None]:
-        """Begin to bring it to another device as well, to be kept there too, and do not wait for it."""
+        """Begin to bring it to a device, to be kept there, and do not wait for it."""
         with self._lock:
-            if device not in self._elsewhere:
+            if device not in self._on:
                 # In a thread of its own: what this thread takes may belong to something that fails.
-                self._elsewhere[device] = in_background(self._placed, device)
-            return self._elsewhere[device]
+                self._on[device] = in_background(self._placed, device)
+            return self._on[device]
 
     def found_on(self, device: Device) -> Drawable:
         """What to give to a rasterizer for the scene, on this device or another one."""
-        buffers = self._buffers if device is self._device else self.bring_to(device).result()
+        buffers = self.bring_to(device).result()
         return self._scene if buffers is None else buffers
 
     @contextmanager
@@ -201,14 +200,12 @@ class ResidentScene(Owner, SceneHandle):
         yield self.found_on(device)
 
     def close(self) -> None:
-        kept = [self._buffers]
-        for future in self._elsewhere.values():
+        for future in self._on.values():
             with suppress(DeviceError):
-                kept.append(future.result())
-        for buffers in kept:
-            if buffers is not None:
-                buffers.close()
-        self._buffers, self._elsewhere = None, {}
+                buffers = future.result()
+                if buffers is not None:
+                    buffers.close()
+        self._on = {}
 
 
 def large_for(device: Device, nbytes: int, memory: int | None) -> bool:

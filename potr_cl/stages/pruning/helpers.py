@@ -87,23 +87,29 @@ class RemovalPart(Part):
         """Whether the device can list stale tiles itself."""
         return self._sweep.steering is not None
 
-    def changes(self) -> Changes:
+    def changes(self, again: bool | None = None) -> Changes:
         """By how much the totals of the splats that are left have changed since the last call; all, at the first.
 
         See :mod:`potr_cl.stages.pruning.exchange`; valid until the next call.
+
+        Args:
+            again: as of :meth:`RemovalSweep.measure_on_device`.
         """
         sweep = self._sweep
         if self._changed is None:
             self._changed = self._owned.enter_context(ChangedTotals(self._device, sweep.splats, sweep.marks))
-        sweep.measure_on_device()
+        sweep.measure_on_device(again=again)
         return self._changed.take(sweep.totals)
 
-    def lend_totals(self) -> Lent:
+    def lend_totals(self, again: bool | None = None) -> Lent:
         """The totals, for others of this process to read from the device until the next command.
 
         Those of all splats, or of those that are left, as :class:`AlivePacking` has them.
+
+        Args:
+            again: as of :meth:`RemovalSweep.measure_on_device`.
         """
-        self._sweep.measure_on_device()
+        self._sweep.measure_on_device(again=again)
         return self._alive.lend(self._sweep.totals)
 
     def remove_marked(self, splats: Bits) -> None:
@@ -184,9 +190,9 @@ class RemovalHelpers(Owner):
         """Whether all of them can list stale tiles themselves."""
         return all(self._others.ask(place, "can_steer") for place in range(len(self._others)))
 
-    def begin(self) -> Pending:
-        """Have them measure; :meth:`take` follows."""
-        return self._others.begin("changes" if self._relay is None else "lend_totals")
+    def begin(self, again: bool | None = None) -> Pending:
+        """Have them measure, streamed views ``again`` or if they have lost enough (None); :meth:`take` follows."""
+        return self._others.begin("changes" if self._relay is None else "lend_totals", again)
 
     def take(self, pending: Pending, totals: cl.Buffer) -> None:
         """Have as totals, (N, 2) int64 that nobody else changes, the sum of what they have measured."""

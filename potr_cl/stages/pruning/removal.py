@@ -180,21 +180,29 @@ class RemovalSweep(Owner):
 
     # ------------------------------------------------------------------------------ for a controller on the device
 
-    def measure_on_device(self, alone: bool = False) -> None:
-        """Bring :attr:`totals` up to date; ``alone``: only what is measured here."""
+    def measure_on_device(self, alone: bool = False, again: bool | None = None) -> None:
+        """Bring :attr:`totals` up to date.
+
+        Args:
+            alone: only what is measured here.
+            again: whether streamed views are measured again; None: if they have lost enough.
+        """
         streamed, resident, helpers = self._streamed, self._resident, None if alone else self._helpers
-        pending = None if helpers is None else helpers.begin()
+        if self._engine.streamed:
+            again = streamed.are_stale() if again is None or not streamed.known else again
+        # All devices measure theirs in the same iterations: they would wait for each other in each.
+        pending = None if helpers is None else helpers.begin(again if self._engine.streamed else None)
         if self._engine.plan.groups:
             resident.list_stale()
             resident.sweep()
             if self._local:
-                if streamed.are_stale():
+                if self._engine.streamed and again:
                     streamed.measure()
                 self._begin_totals()
                 for ledger in self._local:
                     ledger.add_to(self._own)
                 self._streamed_added = False
-            elif streamed.are_stale():
+            elif self._engine.streamed and again:
                 if self._streamed_added:
                     add_totals(self.device, self._own, streamed.totals, self.splats, "subtract_totals")
                 self._streamed_added = False

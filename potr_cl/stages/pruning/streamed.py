@@ -39,6 +39,7 @@ class StreamedSweep(Owner):
     Attributes:
         totals: (N, 2) int64, their part of the totals.
         tiles_swept: so far.
+        known: whether the totals are right but for what was removed since.
     """
 
     def __init__(
@@ -47,8 +48,7 @@ class StreamedSweep(Owner):
         self._engine, self._survivors, self._options, self._fixed_point = engine, survivors, options, fixed_point
         self._device = device = engine.device
         self.tiles_swept = 0
-        #: Whether the totals are right but for what was removed since.
-        self._known = False
+        self.known = False
         self._on_host: dict[_Set, FloatArray] = {}
         self._on_device: dict[_Set, cl.Buffer] = {}
         #: Whether all have been measured, so that pictures are compared with.
@@ -81,13 +81,13 @@ class StreamedSweep(Owner):
 
     def forget(self) -> None:
         """Have the next measurement measure all of them."""
-        self._known = False
+        self.known = False
 
     def are_stale(self) -> bool:
         """Whether they have lost more than they may since they were measured: a part of their area, on average."""
         views = len(self.numbers)
         limit = self._engine.plan.patience * self._options.tolerance
-        if not self._known or limit <= 0:
+        if not self.known or limit <= 0:
             return bool(views)
         device, splats, words = self._device, self._engine.source.splats, self._words_lost
         device.fill(words, np.int64(0))
@@ -123,7 +123,7 @@ class StreamedSweep(Owner):
                     ledger.add_to(self.totals)
                     device.finish()
         engine.source.forget_scratch()
-        self._known = self._measured = True
+        self.known = self._measured = True
 
     @contextmanager
     def swept(self, number: int) -> Iterator[tuple[Subset, PreparedSet] | None]:
