@@ -13,7 +13,7 @@ bench.fit              how fast are the fit's steps?
 bench.decode           how fast does a file decode, by compiled code, NumPy or OpenCL, and in how much memory?
 bench.codec            speed and memory of the codec alone
 bench.paired           are whole encodes faster or slower than those of another checkout?
-bench.scaling          time and memory against splats, views and workers: with which exponents?
+bench.scaling          how do time and memory of whole commands grow with splats, views and devices?
 bench.levels           how close are levels of detail where they are shown, and do leaves' errors foretell pictures'?
 bench.web              how fast is the browser's decoder against native C, and in how much memory?
 =====================  =================================================================================================

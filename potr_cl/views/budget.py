@@ -115,6 +115,8 @@ class ViewCache(Owner):
 _SHARE_OF_ALL, _SHARE_OF_HOST = 0.5, 0.3
 #: The same of what is free, of views that share the device with other large things: a re-fit's vectors.
 _SHARE_OF_FREE, _SHARE_OF_FREE_HOST = 0.4, 0.25
+#: What others take later is known within this.
+_SPARE = 1.1
 #: Bytes that a view whose splats are named by their numbers is expected to take, for each splat: shape, colour, number,
 #: and two and a half tile intersections. A third of the views has fewer intersections.
 _NAMED, _LEAST = 87, 2 / 3
@@ -146,7 +148,7 @@ def free_memory(device: Device, later: int = 0) -> float:
     """
     free = device.info.memory - device.allocated
     share = _SHARE_OF_FREE_HOST if device.info.shares_host_memory else _SHARE_OF_FREE
-    return max(min(free * share, free - later), 0)
+    return max(min(free * share, free - _SPARE * later), 0)
 
 
 def target_bytes(camera: Camera) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import importlib
 import itertools
@@ -19,7 +18,7 @@ from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor
 from tests.cases.ridges import channels, dense_weights, on_a_sphere, sparse_weights
 from tools.bench import encode, scaling
 from tools.bench.encode import STAGES, Row, on_front
-from tools.bench.scaling import exponents, points
+from tools.bench.scaling import exponents, foretold
 from tools.stress.solvers import ridge_errors
 from tools.workloads import excerpt
 
@@ -119,30 +118,35 @@ def test_frames_and_decodes(tables, folder, monkeypatch):
         assert all(row[3] > 0.5 for row in found["memory"])
 
 
-def test_one_number_at_a_time():
-    found = points([10, 20, 40], [3, 5], [1, 2])
-    assert found == [(10, 3, 1), (20, 3, 1), (20, 5, 1), (20, 3, 2), (40, 3, 1)]
-
-
 def test_the_exponents():
     measured = [
-        {"splats": n, "views": v, "workers": w, "time": 3e-6 * n**1.2 * v**0.5 / w}
+        {"splats": n, "views": v, "devices": w, "time": 3e-6 * n**1.2 * v**0.5 / w}
         for n, v, w in itertools.product((100, 400), (5, 20), (1, 4))
     ]
     found, deviation = exponents(measured, "time")
-    assert found == pytest.approx({"splats": 1.2, "views": 0.5, "workers": -1})
+    assert found == pytest.approx({"splats": 1.2, "views": 0.5, "devices": -1})
     assert deviation < 1e-9
-    alone, _ = exponents([row for row in measured if row["workers"] == 1], "time")
+    alone, _ = exponents([row for row in measured if row["devices"] == 1], "time")
     assert list(alone) == ["splats", "views"]
 
 
+def test_what_more_devices_will_take():
+    """Of what the model says: 5 s by one, 12 s shared out, and 2 s for what each further device sends."""
+    measured = {n: (5 + 12 / n + 2 * (n - 1), 80e9 * (n - 1)) for n in (1, 2)}
+    assert foretold(measured, 4) == pytest.approx(5 + 3 + 6)
+    assert foretold({1: (9.0, 0.0), 2: (11.0, 0.0)}, 8) == 9.0  # what two take longer is no less for eight
+
+
 @pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="the host's peak is Linux's figure")
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows does not say what memory a child has taken")
 def test_encodes_of_cities(tables, folder):
-    words = ["--splats", 2000, 4000, "--views", 4, "--workers", 1, 2, "--size", "64x48", "--iterations", 2]
-    found = tables("scaling", folder, *words)
-    assert [row[0] for row in found["points"]] == [2000, 2000, 4000]
-    assert all(row[3] > 0 and row[7] > 0 and row[8] > 0 for row in found["points"])
+    options = "--encode=--iterations 2 --preset fast"
+    found = tables("scaling", folder, "--cities", "2000x4", "4000x4", "3000x5", "3000x4", "--size", "64x48", options)
+    assert [row[:3] for row in found["points"]] == [[2000, 4, 1], [4000, 4, 1], [3000, 5, 1], [3000, 4, 1]]
+    names = [column.split("|")[0] for column in scaling._COLUMNS.split("; ")]
+    for row in found["points"]:
+        figures = dict(zip(names, row, strict=True))
+        assert sum(figures[part] for part in scaling.PARTS) == pytest.approx(figures["all"])
+        assert all(figures[name] > 0 for name in ("pruning", "re-fit", "judging", "host peak", "PSNR"))
+        assert figures["splats left"] < figures["splats"]
     assert {row[0] for row in found["exponents"]} == set(scaling.FIGURES)
-    late = argparse.Namespace(size="64x48", limit=-1.0)
-    assert not list(scaling.measured_in_turn(points([2000], [4], [1]), [str(folder)], late))
