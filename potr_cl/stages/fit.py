@@ -193,7 +193,8 @@ class Fit(Stage):
             targets: Targets | TargetPictures = rendered
             if bench.memory is None:  # else pruning needs all that is allowed, between two fits
                 targets = stack.enter_context(kept_pictures(bench.opened, seen.views, rendered))
-            found = self._cycles(seen, bench, targets, asked, _help_from(bench, state))
+            help_from = _help_from(bench, state)
+            found = self._cycles(seen, bench, targets, asked, help_from)
             found = dataclasses.replace(found, views=state.views, added=state.added)
             if bench.photographs is not None and self.photograph_steps != 0 and not asked:
                 found = self._to_photographs(found, bench, asked)
@@ -204,7 +205,9 @@ class Fit(Stage):
             if found.truth is not None:
                 rasterizer = stack.enter_context(Rasterizer(bench.opened, found.truth, background=bench.background))
                 targets = RenderedTargets(rasterizer, seen.views)
-            looking = Looking(seen.views, seen.added, targets, rasterizer, _help_from(bench, found))
+            if found.goal is not state.goal:
+                help_from = _help_from(bench, found)
+            looking = Looking(seen.views, seen.added, targets, rasterizer, help_from)
             return self._settled(found, bench, looking, asked)
 
     def _looking_between(self, state: State, bench: Workbench) -> State:

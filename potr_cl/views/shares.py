@@ -87,7 +87,7 @@ class ViewShares:
         return ViewShares(views, tuple(shares), tuple(busy))
 
 
-@dataclass(frozen=True)
+@dataclass
 class HelpFrom:
     """Workers that do some of the views.
 
@@ -97,8 +97,10 @@ class HelpFrom:
             does which views, and has what these see of it.
         visibility: what the views may draw of the source, where it is the same for all workers, and where no view sees
             much of it.
+        slower: whether a work took longer with them than without, so that the next ones of the kind do without.
     """
 
     pool: Pool
     source: Scene | ResidentScene | PicturesAhead | ViewShares
     visibility: Visibility | None = None
+    slower: bool = False

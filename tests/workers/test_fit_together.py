@@ -92,6 +92,20 @@ def test_steps_are_taken_as_is_faster(family, alone, faster, monkeypatch, steps)
     assert [device.allocated for device in devices] == [0] * 2
 
 
+@pytest.mark.one_family
+def test_after_a_fit_that_help_made_slower_others_go_alone(family, alone, monkeypatch, steps):
+    monkeypatch.setattr(together, "_TRIED", 2)
+    times = itertools.accumulate([0, 2, 1])
+    monkeypatch.setattr(together.time, "perf_counter", lambda: next(times))
+    devices = [open_device(family) for _ in range(2)]
+    with HostPool(devices) as pool, Rasterizer(devices[0], SOURCE) as rasterizer:
+        help_from, targets = HelpFrom(pool, SOURCE), RenderedTargets(rasterizer, VIEWS)
+        for taken in (4, 4):
+            found = fit_scene(devices[0], START, VIEWS, targets, OPTIONS, help_from=help_from)
+            assert same(found, alone)
+            assert len(steps) == taken
+
+
 @pytest.mark.slow
 @pytest.mark.one_family
 @pytest.mark.parametrize(

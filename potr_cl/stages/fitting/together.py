@@ -179,11 +179,12 @@ class SharedFit:
     Args:
         descent: the first device's.
         helping: the others, each a :class:`FitPart`.
-        takes_part: whether the first device does views too.
+        help_from: where they are from, which is told if they make it slower; None: there are none.
     """
 
-    def __init__(self, descent: DeviceFit, helping: Helping, takes_part: bool) -> None:
-        self._descent, self._helping, self._takes_part = descent, helping, takes_part
+    def __init__(self, descent: DeviceFit, helping: Helping, help_from: HelpFrom | None) -> None:
+        self._descent, self._helping, self._help_from = descent, helping, help_from
+        self._takes_part = help_from is not None and help_from.pool.takes_part
         self._before: tuple[Batch, Sums] | None = None
         self._steps = 0
         self._since, self._seconds = 0.0, list[float]()
@@ -233,6 +234,8 @@ class SharedFit:
         self._since = now
         if len(self._seconds) == 3 and self._seconds[1] > self._seconds[2]:
             self._helping.close()
+            if self._help_from is not None:
+                self._help_from.slower = True
 
 
 @contextmanager
@@ -248,7 +251,9 @@ def together(
         memory: bytes of a device's memory that target pictures may take; None: a quarter of what is free.
         batch: views of a step: there is no use for more workers.
     """
-    pool = None if help_from is None or help_from.pool.first is not descent.device else help_from.pool
+    if help_from is not None and (help_from.slower or help_from.pool.first is not descent.device):
+        help_from = None
+    pool = None if help_from is None else help_from.pool
     with Helping(descent.device, "fit") as helping:
 
         def opened(stack: ExitStack) -> Parts | None:
@@ -264,4 +269,4 @@ def together(
 
         if pool is not None:
             helping.open(opened)
-        yield SharedFit(descent, helping, pool is not None and pool.takes_part)
+        yield SharedFit(descent, helping, help_from)
