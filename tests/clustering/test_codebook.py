@@ -1,9 +1,10 @@
-"""Few numbers for many."""
+"""Few numbers for many, and points along Hilbert's curve."""
 
 import numpy as np
 import pytest
 
 from potr_cl.clustering.codebook import codebook, nearest
+from potr_cl.clustering.curve import along_curve
 
 
 def test_few_numbers_stay_as_they_are():
@@ -42,3 +43,17 @@ def test_nearest_is_nearest():
     values = generator.normal(size=(40, 3)).astype(np.float32)
     found = nearest(values, book)
     assert np.array_equal(found, np.abs(values[..., None].astype(np.float64) - book).argmin(axis=-1))
+
+
+def test_the_curve_goes_from_each_point_of_a_grid_to_the_next():
+    side = 8
+    grid = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.uint16)
+    order = along_curve(grid)
+    assert np.array_equal(np.sort(order), np.arange(side**3))
+    assert (np.abs(np.diff(grid[order].astype(int), axis=0)).sum(axis=1) == 1).all()
+
+
+def test_along_the_curve_all_bits_count_and_equal_points_keep_their_order():
+    grid = np.array([[65535, 0, 0], [0, 0, 0], [65535, 0, 1], [0, 0, 0], [0, 0, 1]], np.uint16)
+    assert along_curve(grid)[:2].tolist() == [1, 3]
+    assert along_curve(grid)[2] == 4

@@ -27,7 +27,7 @@ def distances(points, weights, centres):
     return np.einsum("nkgc,nkgc,ng->nk", apart, apart, weights.astype(np.float64))
 
 
-@pytest.mark.parametrize("groups", [3, 8, 15])
+@pytest.mark.parametrize("groups", [3, 15])
 def test_the_best_centre_is_found(device, groups):
     points, weights = some(333, groups)
     centres = some(77, groups, seed=2)[0]
@@ -89,22 +89,15 @@ def distances_to_own(points, weights, centres, labels):
     return float((weights[:, :, None] * np.square(points - centres[labels])).sum())
 
 
-def test_the_same_bits_every_time(device):
-    points, weights = some(3000, 8)
-    first, second = (cluster(device, points, weights, 600, rate) for rate in (None, None))
-    assert first.centres.tobytes() == second.centres.tobytes()
-    assert np.array_equal(first.labels, second.labels)
-
-
-def test_what_labels_and_entries_take_decides_how_many_there_are(device):
+def test_what_labels_and_entries_take_decides_how_many_there_are_with_the_same_bits_every_time(device):
     points, weights = some(2000, 3)
-    counts = []
-    for bits in (1.0, 100.0, 1e5):
-        found = cluster(device, points, weights * np.float32(30), 600, Rate(bits))
-        assert not found.centres[0].any()
-        counts.append(len(np.unique(found.labels)))
-    assert counts[0] > counts[1] > counts[2]
+    found = [cluster(device, points, weights * np.float32(30), 600, Rate(bits)) for bits in (1.0, 100.0, 100.0, 1e5)]
+    assert not any(each.centres[0].any() for each in found)
+    counts = [len(np.unique(each.labels)) for each in found]
+    assert counts[0] > counts[1] > counts[3]
     assert counts[1] >= 20
+    assert found[1].centres.tobytes() == found[2].centres.tobytes()
+    assert np.array_equal(found[1].labels, found[2].labels)
 
 
 def test_points_that_weigh_nothing_take_the_cheapest_label(device):
@@ -116,27 +109,21 @@ def test_points_that_weigh_nothing_take_the_cheapest_label(device):
     assert counts[0] == 600
 
 
-@pytest.mark.parametrize("count", [1, 2, 5])
-def test_hardly_any_points(device, count):
-    points, weights = some(count, 15)
-    for rate in (None, Rate(1e-3)):
-        found = cluster(device, points, weights * np.float32(1e6), 100, rate)
-        assert found.labels.shape == (count,)
-        if rate is None:
-            assert found.centres[found.labels] == pytest.approx(points, abs=1e-5)
-
-
-def test_equal_points_are_one_cluster(device):
-    points = np.ones((1000, 3, 3), np.float32)
-    found = cluster(device, points, np.ones((1000, 3), np.float32), 10)
-    assert found.centres[found.labels] == pytest.approx(points)
+def test_hardly_any_points_and_equal_ones(device):
+    for count, most in ((1, 100), (5, 100), (1000, 10)):
+        points, weights = some(min(count, 5), 15)
+        if count > 5:
+            points, weights = np.ones((count, 3, 3), np.float32), np.ones((count, 3), np.float32)
+        found = cluster(device, points, weights * np.float32(1e6), most)
+        assert found.centres[found.labels] == pytest.approx(points, abs=1e-5)
+        assert cluster(device, points, weights * np.float32(1e6), most, Rate(1e-3)).labels.shape == (count,)
 
 
 def test_the_best_of_given_centres(device):
-    points, weights = some(3000, 3)
-    centres = points[::3] + np.float32(0.01)
+    points, weights = some(1200, 3)
+    centres = points[::2] + np.float32(0.01)
     labels = assigned(device, points, weights, centres)
     expected = distances(points, weights, centres)
-    found = expected[np.arange(3000), labels]
+    found = expected[np.arange(1200), labels]
     assert np.mean(found <= expected.min(axis=1) + 1e-4) > 0.9
     assert found.mean() < 1.05 * expected.min(axis=1).mean()

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import itertools
 import json
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +12,7 @@ import numpy as np
 import pytest
 
 import potr_cl
-from potr_cl import Scene, UsageError, cli
+from potr_cl import UsageError, cli
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.formats import load_scene
 from potr_cl.levels.errors import MeasuredErrors, SharedOut, errors_a_coverage, measuring_views, seen_coverage
@@ -26,10 +24,11 @@ from potr_cl.outputs.output import Request
 from potr_cl.outputs.sog import Sog
 from potr_cl.outputs.streamed_sog import StreamedSog
 from potr_cl.raster.rasterizer import Rasterizer
+from tests.cases.scenes import rows_of
+from tests.reference.raster import rotation_matrices
 from tests.reference.scenes import random_scene
 
 COUNTS = (3000, 1500, 400)
-FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
 
 
 class Told:
@@ -63,33 +62,42 @@ def files() -> list[bytes]:
     return [b"".join(Sog().file(scene.subset(np.arange(n)), None, request).pieces) for n in COUNTS]
 
 
-@pytest.fixture(scope="module")
-def folder(files, tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("city") / "lod-meta.json"
+def written(files: list[bytes], errors: Told, path: Path) -> tuple[Path, dict[str, Any]]:
+    """The description of the levels in a folder, as it is and as what it says."""
     output = StreamedSog(lod_chunk_count=1)
     with path.open("wb") as file:
-        output.write(output.levelled(files, Told()), file, path)
-    return path
+        output.write(output.levelled(files, errors), file, path)
+    return path, json.loads(path.read_text())
+
+
+@pytest.fixture(scope="module")
+def folder(files, tmp_path_factory) -> tuple[Path, dict[str, Any]]:
+    return written(files, Told(), tmp_path_factory.mktemp("city") / "lod-meta.json")
 
 
 def leaves_of(node: dict[str, Any]) -> list[dict[str, Any]]:
     return [leaf for child in node["children"] for leaf in leaves_of(child)] if "children" in node else [node]
 
 
-def rows_of(scene: Scene) -> set[bytes]:
-    flat = [getattr(scene, field).reshape(len(scene), -1) for field in FIELDS]
-    return {row.tobytes() for row in np.concatenate(flat, axis=1)}
+def test_every_level_is_read_as_it_was_encoded_and_lies_within_the_bounds(files, folder):
+    path, meta = folder
 
+    def check(node: dict[str, Any]) -> None:
+        for child in node.get("children", []):
+            assert all(np.array(child["bound"]["min"]) >= node["bound"]["min"])
+            assert all(np.array(child["bound"]["max"]) <= node["bound"]["max"])
+            check(child)
 
-def test_every_level_is_read_as_it_was_encoded(files, folder):
-    for level, data in enumerate(files):
-        before, after = Sog().read(data), load_scene(f"{folder}#{level}")
-        assert len(after) == COUNTS[level]
-        assert rows_of(after) == rows_of(before)
+    check(meta["tree"])
+    levels = [load_scene(f"{path}#{level}") for level in range(3)]
+    assert [rows_of(scene) for scene in levels] == [rows_of(Sog().read(data)) for data in files]
+    ends = np.concatenate([[scene.means + s * extents_of(scene) for s in (-1, 1)] for scene in levels], axis=1)
+    assert np.allclose(ends[0].min(axis=0), meta["tree"]["bound"]["min"], rtol=1e-5)
+    assert np.allclose(ends[1].max(axis=0), meta["tree"]["bound"]["max"], rtol=1e-5)
 
 
 def test_the_description(folder):
-    meta = json.loads(folder.read_text())
+    path, meta = folder
     assert (meta["version"], meta["lodLevels"], meta["counts"]) == (1, 3, list(COUNTS))
     assert meta["count"] == sum(COUNTS)
     assert meta["lodErrors"] is True
@@ -100,44 +108,25 @@ def test_the_description(folder):
         assert sum(part["count"] for part in leaf["lods"].values()) <= 1024
         assert leaf["errors"] == pytest.approx([0, number / 3, 2 * number / 3])
     # The runs of each file follow one another and cover it, and a file is of one level.
-    runs: dict[int, list[tuple[int, int, str]]] = {}
-    for leaf in leaves:
-        for level, part in leaf["lods"].items():
-            runs.setdefault(part["file"], []).append((part["offset"], part["count"], level))
+    runs = sorted(
+        (part["file"], part["offset"], part["count"], level) for leaf in leaves for level, part in leaf["lods"].items()
+    )
     for number, name in enumerate(meta["filenames"]):
-        chunk = json.loads((folder.parent / name).read_text())
-        ends = list(itertools.accumulate(count for _, count, _ in sorted(runs[number])))
-        assert [offset for offset, _, _ in sorted(runs[number])] == [0, *ends[:-1]]
+        chunk, own = json.loads((path.parent / name).read_text()), [run for run in runs if run[0] == number]
+        ends = list(itertools.accumulate(count for _, _, count, _ in own))
+        assert [offset for _, offset, _, _ in own] == [0, *ends[:-1]]
         assert chunk["count"] == ends[-1]
-        assert {level for _, _, level in runs[number]} == {name[0]}
+        assert {level for *_, level in own} == {name[0]}
         assert chunk["shN"]["count"] <= chunk["count"]
-
-
-def test_bounds_hold_the_ellipsoids(folder):
-    def check(node: dict[str, Any]) -> None:
-        for child in node.get("children", []):
-            assert all(np.array(child["bound"]["min"]) >= node["bound"]["min"])
-            assert all(np.array(child["bound"]["max"]) <= node["bound"]["max"])
-            check(child)
-
-    meta = json.loads(folder.read_text())
-    check(meta["tree"])
-    levels = [load_scene(f"{folder}#{level}") for level in range(3)]
-    ends = np.concatenate([[scene.means + s * extents_of(scene) for s in (-1, 1)] for scene in levels], axis=1)
-    bound = meta["tree"]["bound"]
-    assert np.allclose(ends[0].min(axis=0), bound["min"], rtol=1e-5)
-    assert np.allclose(ends[1].max(axis=0), bound["max"], rtol=1e-5)
 
 
 def test_an_ellipsoid_reaches_as_far_as_its_points():
     scene = random_scene(5, 0)
     points = np.random.default_rng(3).normal(size=(200_000, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
-    for k in range(len(scene)):
-        w, *xyz = scene.quaternions[k].astype(np.float64)
-        scaled, axis = points * np.exp(scene.log_scales[k]), np.array(xyz)
-        turned = scaled + 2 * np.cross(axis, np.cross(axis, scaled) + w * scaled)
-        assert np.allclose(turned.max(axis=0), extents_of(scene)[k], rtol=1e-3)
+    scene.quaternions[:] /= np.linalg.norm(scene.quaternions, axis=1, keepdims=True)
+    axes = rotation_matrices(scene.quaternions.astype(np.float64)) * np.exp(scene.log_scales)[:, None]
+    assert np.allclose((points @ axes.transpose(0, 2, 1)).max(axis=1), extents_of(scene), rtol=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -179,12 +168,7 @@ def test_what_is_far_is_the_environment_once(files, tmp_path):
             shown.extend(scenes(level) for level in range(levels))
             return np.zeros((len(boxes), levels))
 
-    output = StreamedSog(lod_chunk_count=1)
-    pieces = output.levelled(files, Errors(far))
-    path = tmp_path / "lod-meta.json"
-    with path.open("wb") as file:
-        output.write(pieces, file, path)
-    meta = json.loads(path.read_text())
+    path, meta = written(files, Errors(far), tmp_path / "lod-meta.json")
     assert meta["environment"] == "env/meta.json"
     sky = levels[0].means[levels[0].means[:, 0] > far]
     assert json.loads((tmp_path / "env" / "meta.json").read_text())["count"] == len(sky) > 0
@@ -193,17 +177,14 @@ def test_what_is_far_is_the_environment_once(files, tmp_path):
         assert meta["counts"][level] == len(near)
         for found in (load_scene(f"{path}#{level}"), own):
             assert np.array_equal(np.sort(found.means, axis=0), np.sort(np.concatenate([near, sky]), axis=0))
-    without = json.loads(zipfile.ZipFile(io.BytesIO(output.levelled(files, Told())[0])).read("lod-meta.json"))
-    assert "environment" not in without
 
 
 def test_errors_of_leaves_add_up_and_say_where(plush_excerpt, plush_excerpt_cameras, device):
     """Of a scene whose left half has lost its colours: the error is there, and all of it."""
     views = train_views(plush_excerpt_cameras)
     left = plush_excerpt.means[:, 0] < np.median(plush_excerpt.means[:, 0])
-    sh = plush_excerpt.sh.copy()
-    sh[left, 0] += 0.3
-    other = Scene(*(getattr(plush_excerpt, field) for field in FIELDS[:4]), sh)
+    other = dataclasses.replace(plush_excerpt, sh=plush_excerpt.sh.copy())
+    other.sh[left, 0] += 0.3
     with SharedOut(device, plush_excerpt, views, left.astype(np.int64), 2) as shared:
         parts = shared.of([other, plush_excerpt])
     assert not parts[:, :, 1].any()
@@ -214,12 +195,11 @@ def test_errors_of_leaves_add_up_and_say_where(plush_excerpt, plush_excerpt_came
 
 
 def test_an_error_times_what_the_leaf_covers_is_what_it_adds(plush_excerpt, plush_excerpt_cameras, device):
-    views = train_views(plush_excerpt_cameras)
-    fewer = plush_excerpt.subset(np.arange(0, len(plush_excerpt), 2))
+    fewer = plush_excerpt[::2]
     scenes = [plush_excerpt, fewer]
     boxes = np.concatenate([plush_excerpt.means.min(axis=0), plush_excerpt.means.max(axis=0)])[None]
     leaves = np.zeros(len(plush_excerpt), np.int64)
-    views = measuring_views(plush_excerpt, views)
+    views = measuring_views(plush_excerpt, train_views(plush_excerpt_cameras))
     errors = MeasuredErrors(device, views, plush_excerpt, between=views).of_leaves(scenes.__getitem__, 2, leaves, boxes)
     assert errors[0, 0] == 0
     covered = np.array([seen_coverage(view, boxes)[0] for view in views])
@@ -262,55 +242,37 @@ def test_coverage_is_that_of_playcanvas_engine(plush_excerpt_cameras):
     assert np.allclose(seen_coverage(upright, box[None]), expected[0])
 
 
-@pytest.fixture(scope="module")
-def encoded(data, tmp_path_factory):
-    """By the command line, into a folder that is not there yet."""
-    path = tmp_path_factory.mktemp("made") / "city" / "lod-meta.json"
-    words = f"--cameras {data}/plush_excerpt_cameras.json --levels 3 --lod-chunk-count 1 --iterations 4 --refit 2"
-    assert (
-        cli.main(["encode", f"{data}/plush_excerpt.ply", "-o", str(path), *words.split(), "--views-between", "0"]) == 0
-    )
-    return path
-
-
-def test_the_command_writes_a_folder(encoded, capsys):
-    meta = json.loads(encoded.read_text())
+def test_an_encode_makes_a_folder(plush_excerpt, plush_excerpt_cameras, tmp_path):
+    """Which is not there yet; and from the result another one."""
+    path = tmp_path / "city" / "lod-meta.json"
+    result = potr_cl.encode(
+        plush_excerpt, plush_excerpt_cameras, levels=3, lod_chunk_count=1, iterations=2, refit=1, views_between=0,
+        output=path,
+    )  # fmt: skip
+    meta = json.loads(path.read_text())
     counts = meta["counts"]
     assert counts[1:] == [round(counts[0] / 2), round(counts[0] / 4)]
-    assert [len(load_scene(f"{encoded}#{level}")) for level in range(3)] == counts
+    assert [len(load_scene(f"{path}#{level}")) for level in range(3)] == [len(result.order), *counts[1:]] == counts
     for leaf in leaves_of(meta["tree"]):
         assert leaf["errors"][0] == 0 < leaf["errors"][1] <= leaf["errors"][2]
-
-
-def test_python_makes_the_same_files(encoded, plush_excerpt, plush_excerpt_cameras, tmp_path):
-    result = potr_cl.encode(
-        plush_excerpt, plush_excerpt_cameras, levels=3, lod_chunk_count=1, iterations=4, refit=2, views_between=0,
-        output=tmp_path / "lod-meta.json",
-    )  # fmt: skip
-    made = sorted(path for path in tmp_path.rglob("*") if path.is_file())
-    assert [path.relative_to(tmp_path) for path in made] == sorted(
-        path.relative_to(encoded.parent) for path in encoded.parent.rglob("*") if path.is_file()
-    )
-    for path in made:
-        assert path.read_bytes() == (encoded.parent / path.relative_to(tmp_path)).read_bytes(), path
-    assert result.nbytes == sum(path.stat().st_size for path in made) == sum(result.report["properties"].values())
     result.save(tmp_path / "again" / "lod-meta.json")
-    assert len(load_scene(f"{tmp_path / 'again'}#0")) == len(result.order)
+    made, again = (
+        {each.relative_to(folder): each.read_bytes() for each in folder.rglob("*") if each.is_file()}
+        for folder in (path.parent, tmp_path / "again")
+    )
+    assert made == again
+    assert result.nbytes == sum(map(len, made.values())) == sum(result.report["properties"].values())
 
 
 @pytest.mark.parametrize("flag", ["--lod-chunk-count", "--lod-chunk-extent"])
-def test_options_are_checked(flag, data, tmp_path, capsys):
-    scene = f"{data}/plush_excerpt.ply"
-    assert cli.main(["encode", scene, "-o", str(tmp_path / "lod-meta.json"), flag, "0"]) == 2
-    assert f"{flag} is 0, it must be above 0" in capsys.readouterr().err
-    assert cli.main(["encode", scene, "-o", str(tmp_path / "a.potr"), flag, "2"]) == 2
-    assert "to choose" in capsys.readouterr().err
+def test_options_and_the_place_are_checked_before_the_work(flag, data, tmp_path, capsys):
+    for path, words, said in (
+        ("lod-meta.json", (flag, "0"), f"{flag} is 0, it must be above 0"),
+        ("a.potr", (flag, "2"), "to choose"),
+        ("no/city/lod-meta.json", (), "does not exist"),
+    ):
+        assert cli.main(["encode", f"{data}/plush_excerpt.ply", "-o", str(tmp_path / path), *words]) == 2
+        assert said in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
-
-
-def test_a_folder_that_cannot_be_made_is_refused_before_the_work(data, tmp_path, capsys):
-    place = tmp_path / "no" / "city" / "lod-meta.json"
-    assert cli.main(["encode", f"{data}/plush_excerpt.ply", "-o", str(place)]) == 2
-    assert "does not exist" in capsys.readouterr().err
     with pytest.raises(UsageError, match="cannot make the folder"):
-        StreamedSog().place(place)
+        StreamedSog().place(tmp_path / "no" / "city" / "lod-meta.json")

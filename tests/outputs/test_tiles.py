@@ -9,6 +9,7 @@ import shutil
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -25,17 +26,10 @@ from potr_cl.outputs.output import Request
 from potr_cl.outputs.spz import Gltf
 from potr_cl.outputs.tiles import Tiles
 from tests.cases.gltf import glb
+from tests.cases.scenes import rows_of
 from tests.reference.scenes import random_scene
 
 COUNTS = (3000, 1500, 400)
-FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
-
-
-class Told:
-    """Errors that are told, in place of measured ones."""
-
-    def of_level(self, level: int) -> float:
-        return level / 4
 
 
 @pytest.fixture(scope="module", params=[2, 3])
@@ -48,8 +42,9 @@ def made(request: Any, tmp_path_factory: Any) -> tuple[list[Scene], Path]:
         for n in COUNTS
     ]  # fmt: skip
     path = tmp_path_factory.mktemp("city") / "tileset.json"
+    told = SimpleNamespace(of_level=lambda level: level / 4)  # errors, in place of measured ones
     with path.open("wb") as file:
-        output.write(output.levelled(files, Told()), file, path)  # type: ignore[arg-type]
+        output.write(output.levelled(files, told), file, path)  # type: ignore[arg-type]
     return [Gltf().read(data) for data in files], path
 
 
@@ -60,11 +55,6 @@ def tiles_of(path: Path) -> Iterator[tuple[dict[str, Any], dict[str, Any] | None
         tile, above = tiles.pop()
         yield tile, above
         tiles += [(child, tile) for child in tile.get("children", [])]
-
-
-def rows_of(scene: Scene) -> set[bytes]:
-    flat = [getattr(scene, field).reshape(len(scene), -1) for field in FIELDS]
-    return {row.tobytes() for row in np.concatenate(flat, axis=1)}
 
 
 def test_tiles_hold_every_level_as_it_was_encoded(made: tuple[list[Scene], Path]) -> None:
@@ -78,6 +68,8 @@ def test_tiles_hold_every_level_as_it_was_encoded(made: tuple[list[Scene], Path]
             counts[level] += len(scene)
     assert counts == list(COUNTS)
     assert found == [rows_of(scene) for scene in levels]
+    assert rows_of(load_scene(path)) == rows_of(load_scene(path.parent)) == found[0]  # the finest tiles are read
+    assert bytes_of_scene(path) == sum(file.stat().st_size for file in path.parent.rglob("*") if file.is_file())
 
 
 def test_a_folder_is_replaced_whole_or_not_at_all(
@@ -123,7 +115,8 @@ def test_many_tiles_that_claim_much(tmp_path: Path) -> None:
     assert len(load_scene(tmp_path, trust=True)) == 80_000
 
 
-def test_finer_tiles_replace_coarser_ones(made: tuple[list[Scene], Path]) -> None:
+def test_finer_tiles_replace_coarser_ones_and_boxes_hold_the_ellipsoids(made: tuple[list[Scene], Path]) -> None:
+    """In tiles z is up where y is in glTF, whose x, y, z are x, -z, y of tiles."""
     _, path = made
     description = json.loads(path.read_text())
     assert description["asset"]["version"] == "1.1"
@@ -132,37 +125,24 @@ def test_finer_tiles_replace_coarser_ones(made: tuple[list[Scene], Path]) -> Non
     contents = 0
     for tile, above in tiles_of(path):
         children, error = tile.get("children", []), tile["geometricError"]
-        assert above is None or above["geometricError"] >= error
-        if "content" in tile:
-            contents += 1
-            level = int(tile["content"]["uri"][0])
-            assert error == (16 * level / 4 if children else 0)
-            assert all(int(child["content"]["uri"][0]) < level for child in children)
-        else:
-            assert len(children) == 2
-    assert contents > 3 * 4
-
-
-def test_boxes_hold_the_ellipsoids_where_tiles_have_them(made: tuple[list[Scene], Path]) -> None:
-    """In tiles z is up where y is in glTF, whose x, y, z are x, -z, y of tiles."""
-    _, path = made
-    for tile, above in tiles_of(path):
         box = np.array(tile["boundingVolume"]["box"])
         centre, half = box[:3], np.abs(box[3:].reshape(3, 3)).sum(axis=0)
         if above is not None:
+            assert above["geometricError"] >= error
             outer = np.array(above["boundingVolume"]["box"])
             assert (np.abs(centre - outer[:3]) + half <= np.abs(outer[3:].reshape(3, 3)).sum(axis=0) + 1e-9).all()
-        if "content" in tile:
-            scene = load_scene(path.parent / tile["content"]["uri"])
-            places = np.stack([scene.means[:, 0], -scene.means[:, 2], scene.means[:, 1]], axis=1)
-            extents = extents_of(scene)[:, [0, 2, 1]]
-            assert (np.abs(places - centre) + extents <= half * (1 + 1e-6) + 1e-6).all()
-
-
-def test_the_finest_tiles_are_read(made: tuple[list[Scene], Path]) -> None:
-    levels, path = made
-    assert rows_of(load_scene(path)) == rows_of(load_scene(path.parent)) == rows_of(levels[0])
-    assert bytes_of_scene(path) == sum(file.stat().st_size for file in path.parent.rglob("*") if file.is_file())
+        if "content" not in tile:
+            assert len(children) == 2
+            continue
+        contents += 1
+        level = int(tile["content"]["uri"][0])
+        assert error == (16 * level / 4 if children else 0)
+        assert all(int(child["content"]["uri"][0]) < level for child in children)
+        scene = load_scene(path.parent / tile["content"]["uri"])
+        places = np.stack([scene.means[:, 0], -scene.means[:, 2], scene.means[:, 1]], axis=1)
+        extents = extents_of(scene)[:, [0, 2, 1]]
+        assert (np.abs(places - centre) + extents <= half * (1 + 1e-6) + 1e-6).all()
+    assert contents > 3 * 4
 
 
 @pytest.mark.parametrize(
