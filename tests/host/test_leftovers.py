@@ -7,6 +7,7 @@ import tempfile
 
 import pytest
 
+from potr_cl.errors import UsageError
 from potr_cl.host.leftovers import place_for_temporary_files, temporary_folder
 
 
@@ -34,3 +35,12 @@ def test_a_folder_that_is_none_is_passed_over(tmp_path, monkeypatch):
     monkeypatch.setenv("TMPDIR", str(tmp_path / "none"))
     monkeypatch.setenv("TEMP", str(tmp_path))
     assert place_for_temporary_files() == tempfile.gettempdir() == str(tmp_path)
+
+
+def test_no_folder_for_temporary_files_is_one_line(monkeypatch):
+    def full(*_args: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.mkdir", full)
+    with pytest.raises(UsageError, match="No space left on device: make room there"), temporary_folder():
+        pass
