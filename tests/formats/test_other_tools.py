@@ -11,7 +11,6 @@ import pytest
 
 from potr_cl import Scene, cli
 from potr_cl.formats import load_scene
-from potr_cl.formats.registry import bytes_of_scene
 
 #: What is read, and how splat-transform 3.7.0 reads it, as a PLY.
 FILES = {
@@ -109,16 +108,6 @@ def test_commands_take_them(name: str, tools: Path, tmp_path: Path) -> None:
         source.write_bytes(gzip.compress((tools / "plush.ply").read_bytes()))
     assert cli.main(["convert", str(source), str(tmp_path / "out.ply")]) == 0
     np.testing.assert_array_equal(load_scene(tmp_path / "out.ply").means, load_scene(source).means)
-
-
-def test_sizes_of_files_and_folders(tools: Path, tmp_path: Path) -> None:
-    folder = tools / "splat-transform_lod"
-    whole = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-    for given in (folder, f"{folder}#1", folder / "lod-meta.json", f"{folder}/lod-meta.json#0"):
-        assert bytes_of_scene(given) == whole
-    assert bytes_of_scene(tools / "spz-js.spz") == (tools / "spz-js.spz").stat().st_size
-    for nothing in (tmp_path, tmp_path / "gone.ply", tmp_path / "gone" / "meta.json", "a\0b.ply"):
-        assert bytes_of_scene(nothing) is None
 
 
 def test_files_for_every_reader_are_there(tools: Path) -> None:

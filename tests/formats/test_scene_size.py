@@ -30,22 +30,20 @@ def levels(tmp_path: Path, data: Path) -> Path:
     return tmp_path / "lod"
 
 
-def test_other_files_in_a_folder_do_not_count(levels: Path) -> None:
-    whole = bytes_of_scene(levels)
+def test_only_what_is_there_and_belongs_to_it_counts(levels: Path, tmp_path: Path) -> None:
+    whole = sum(file.stat().st_size for file in levels.rglob("*") if file.is_file())
     (levels / "notes.json").write_text("{}")
     (levels / "picture.webp").write_bytes(bytes(1000))
-    assert bytes_of_scene(levels) == bytes_of_scene(levels / "lod-meta.json") == whole
-
-
-def test_levels_that_are_not_there_do_not_count(levels: Path) -> None:
-    whole = bytes_of_scene(levels)
+    for given in (levels, f"{levels}#1", levels / "lod-meta.json", f"{levels}/lod-meta.json#0"):
+        assert bytes_of_scene(given) == whole
     names = json.loads((levels / "lod-meta.json").read_text())["filenames"]
     folder = (levels / names[0]).parent
     gone = sum(file.stat().st_size for file in folder.iterdir())
     shutil.rmtree(folder)
     assert len(load_scene(f"{levels}#1")) > 0
-    assert whole is not None
     assert bytes_of_scene(f"{levels}#1") == whole - gone
+    for nothing in (tmp_path, tmp_path / "gone.ply", tmp_path / "gone" / "meta.json", "a\0b.ply"):
+        assert bytes_of_scene(nothing) is None
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ def scores(kind: str, count: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", ["all equal", "few values", "large", "sorted", "normal"])
-@pytest.mark.parametrize("count", [0, 999, 1000, 50_021])
+@pytest.mark.parametrize("count", [0, 999, 1000, 5021])
 def test_it_is_the_stable_order(kind, count):
     score = scores(kind, count)
     wanted = np.argsort(score, kind="stable")

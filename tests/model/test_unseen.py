@@ -15,25 +15,10 @@ from tests.reference.scenes import plain_splats, random_splats, ring_of_cameras,
 
 def test_what_lies_beside_behind_and_right_in_front_is_unseen():
     camera = straight_camera(60, 60, 60.0, fy=60.0)
-    places = [
-        [0, 0, 5],
-        [0, 0, -5],
-        [0, 0, 0.1],
-        [4, 0, 5],
-        [-4, 0, 5],
-        [0, 4, 5],
-        [0, -4, 5],
-        [2.4, 0, 5],
-        [0, 0, 1e6],
-    ]
-    scene = plain_splats(places, 0.01)
-    assert unseen_splats(scene, [camera]).tolist() == [False, True, True, True, True, True, True, False, False]
-
-
-def test_a_large_splat_beside_the_picture_reaches_into_it():
-    camera = straight_camera(60, 60, 60.0, fy=60.0)
-    assert unseen_splats(plain_splats([[4, 0, 5]], 0.01), [camera])[0]
-    assert not unseen_splats(plain_splats([[4, 0, 5]], 1.0), [camera])[0]
+    beside = [[4, 0, 5], [-4, 0, 5], [0, 4, 5], [0, -4, 5]]
+    places = [[0, 0, 5], [0, 0, -5], [0, 0, 0.1], *beside, [2.4, 0, 5], [0, 0, 1e6]]
+    assert unseen_splats(plain_splats(places, 0.01), [camera]).tolist() == [False, *[True] * 6, False, False]
+    assert not unseen_splats(plain_splats([[4, 0, 5]], 1.0), [camera])[0], "it reaches into the picture"
 
 
 def test_every_view_counts_and_without_views_all_are_unseen():

@@ -76,9 +76,8 @@ def test_they_have_the_intrinsics_of_the_given_ones_and_no_photograph(tmp_path):
     assert len({camera.name for camera in added}) == len(added)
 
 
-def test_the_same_every_time_and_further_rounds_add_to_earlier_ones():
-    two, again = views_between(BALL, ORBIT, 2), views_between(BALL, ORBIT, 2)
-    assert np.array_equal(camera_centres(two), camera_centres(again))
+def test_further_rounds_add_to_earlier_ones():
+    two = views_between(BALL, ORBIT, 2)
     one, second = views_between(BALL, ORBIT, 1), views_between(BALL, ORBIT, 1, first=1)
     assert [camera.name for camera in one + second] == [camera.name for camera in two]
     assert np.array_equal(camera_centres(one + second), camera_centres(two))
@@ -107,16 +106,12 @@ def test_none_is_added_where_it_would_show_what_no_view_shows():
     assert len(views_between(room, pair, 8)) <= 4
 
 
-@pytest.mark.parametrize("cameras", [[], ORBIT[:1]])
-def test_nothing_lies_between_fewer_than_two(cameras):
-    assert views_between(BALL, cameras, 3) == []
-
-
-@pytest.mark.parametrize("cameras", [[ORBIT[0]] * 5, [ORBIT[0], dataclasses.replace(ORBIT[0], name="again")]])
-def test_cameras_at_one_place_do_no_harm(cameras):
+@pytest.mark.parametrize("count", [0, 1, 2, 5])
+def test_nothing_lies_between_fewer_than_two_and_cameras_at_one_place_do_no_harm(count):
     with np.errstate(all="raise", under="ignore"):
-        for camera in views_between(BALL, cameras, 2):
-            assert np.isfinite(camera.translation).all()
+        added = views_between(BALL, [ORBIT[0]] * count, 2)
+    assert count > 1 or added == []
+    assert all(np.isfinite(camera.translation).all() for camera in added)
 
 
 @pytest.mark.parametrize(("each", "spread"), [(-1, 0.3), (1, -0.1), (1, float("nan")), (1, 11)])
