@@ -7,7 +7,6 @@ import math
 
 import pytest
 
-from potr_cl.errors import UsageError
 from potr_cl.formats import load_scene, scene_writer
 from potr_cl.opencl.device import Device
 from tests.cases.judging import psnr
@@ -51,12 +50,3 @@ def test_what_is_written_looks_as_the_scene_does(device, tmp_path, plush_excerpt
     assert len(scene) == len(plush_excerpt)
     assert psnr(device, plush_excerpt, scene, plush_excerpt_cameras) >= WRITTEN[name, version]
     assert [p.name for p in tmp_path.iterdir()] == [name], "something is left behind"
-
-
-@pytest.mark.parametrize("name", ["a.spz", "a.sog"])
-def test_no_file(tmp_path, name):
-    with pytest.raises(UsageError, match="cannot open"):
-        load_scene(tmp_path / name)
-    (tmp_path / name).mkdir()
-    with pytest.raises(UsageError, match="not a regular file"):
-        load_scene(tmp_path / name)

@@ -61,16 +61,14 @@ def test_whole_plush(plush: Path) -> None:
 # Finding the kind ----------------------------------------------------------------------------------------------------
 
 
-def test_folders(data: Path, tmp_path: Path) -> None:
+def test_folders_and_any_file_name(data: Path, tmp_path: Path) -> None:
     refused(tmp_path, "has no cameras, expected a COLMAP model .*, a cameras.json or a transforms.json", UsageError)
-    shutil.copytree(data / "plush_sparse_binary", tmp_path / "sparse")
-    assert len(load_cameras(tmp_path)) == 17
     shutil.copytree(data / "plush_sparse_binary", tmp_path / "another" / "sparse" / "0")
     assert len(load_cameras(tmp_path / "another" / "sparse")) == 17
-    write_json(tmp_path / "transforms.json", nerfstudio(["a.png", "b.png"]))
-    assert len(load_cameras(tmp_path)) == 2
-    write_json(tmp_path / "cameras.json", [view()])
-    assert len(load_cameras(tmp_path)) == 1
+    shutil.copy(data / "plush_cameras.json", tmp_path / "views of mine.JSON")
+    assert len(load_cameras(tmp_path / "views of mine.JSON")) == 17
+    write_json(tmp_path / "poses.json", nerfstudio(["a.png"]))
+    assert len(load_cameras(tmp_path / "poses.json")) == 1
 
 
 def test_views_that_are_too_wide_for_a_pinhole_are_told(
@@ -79,22 +77,14 @@ def test_views_that_are_too_wide_for_a_pinhole_are_told(
     """As of focal lengths in millimetres."""
     load_cameras(data / "plush_cameras.json")
     assert caplog.text == ""
-    views = [view() | {"img_name": f"{number}.png", "width": 990, "height": 742} for number in range(3)]
-    for number, focal in enumerate((35.0, 800.0, 28.0)):
-        views[number] |= {"fx": focal, "fy": focal}
-    load_cameras(write_json(tmp_path / "cameras.json", views))
+    focals = enumerate((35.0, 800.0, 28.0))
+    wide = [view(img_name=f"{k}.png", width=990, height=742, fx=focal, fy=focal) for k, focal in focals]
+    load_cameras(write_json(tmp_path / "cameras.json", wide))
     assert (
         "2 of 3 views are very wide, up to 174 degrees: are their focal lengths in pixels of 990 x 742?" in caplog.text
     )
-    load_cameras(write_json(tmp_path / "tall.json", [view() | {"width": 90, "height": 990, "fx": 28.0, "fy": 28.0}]))
+    load_cameras(write_json(tmp_path / "tall.json", [view(width=90, height=990, fx=28.0, fy=28.0)]))
     assert "up to 174 degrees: are their focal lengths in pixels of 90 x 990?" in caplog.text
-
-
-def test_any_file_name(data: Path, tmp_path: Path) -> None:
-    shutil.copy(data / "plush_cameras.json", tmp_path / "views of mine.JSON")
-    assert len(load_cameras(tmp_path / "views of mine.JSON")) == 17
-    write_json(tmp_path / "poses.json", nerfstudio(["a.png"]))
-    assert len(load_cameras(tmp_path / "poses.json")) == 1
 
 
 @pytest.mark.parametrize(
