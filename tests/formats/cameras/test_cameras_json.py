@@ -23,20 +23,15 @@ def test_cameras_json_is_camera_to_world(tmp_path: Path) -> None:
     assert pixel(camera, [11, 3, -5]) == pytest.approx((20, 21))
 
 
-def test_cameras_json_without_split_are_training_views(tmp_path: Path) -> None:
-    views = [view(img_name=name) for name in "abc"]
-    cameras = load_cameras(write_json(tmp_path / "cameras.json", views))
-    assert [camera.split for camera in cameras] == ["train"] * 3
-    views[1]["split"] = "test"
-    refused(write_json(tmp_path / "cameras.json", views), "view 'a': 'split' is missing")
-
-
-def test_cameras_json_finds_ground_truth_beside_it(tmp_path: Path) -> None:
+def test_cameras_json_without_split_are_training_views_with_ground_truth_beside_it(tmp_path: Path) -> None:
     write_image(tmp_path / "images" / "a.JPG")
     views = [view(img_name=name) for name in ("a", "frame.0001", "missing.png")]
     cameras = load_cameras(write_json(tmp_path / "cameras.json", views))
     assert [camera.name for camera in cameras] == ["a", "frame.0001", "missing"]
     assert [camera.image_path for camera in cameras] == [tmp_path / "images" / "a.JPG", None, None]
+    assert [camera.split for camera in cameras] == ["train"] * 3
+    views[1]["split"] = "test"
+    refused(write_json(tmp_path / "cameras.json", views), "view 'a': 'split' is missing")
 
 
 def test_cameras_json_with_equal_names(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
