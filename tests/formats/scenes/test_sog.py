@@ -1,4 +1,4 @@
-"""SOG files that are damaged; tests of all foreign formats look at good ones."""
+"""SOG files that are damaged or hostile; tests of all foreign formats look at good ones, others at descriptions."""
 
 from __future__ import annotations
 
@@ -18,46 +18,6 @@ from tests.cases.memory import takes_at_most
 from tests.cases.own_warnings import no_warnings
 
 
-def rewritten_sog(source, target, change):
-    """A copy of a SOG file with another description."""
-    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
-        for entry in old.infolist():
-            content = old.read(entry)
-            if entry.filename == "meta.json":
-                meta = json.loads(content)
-                change(meta)
-                content = json.dumps(meta).encode()
-            new.writestr(entry.filename, content)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda m: m.update(version=1), "version 1"),
-        (lambda m: m.pop("version"), "version 1"),
-        (lambda m: m.update(count=-5), "a count of"),
-        (lambda m: m.update(count=10**9), "1000000000 splats in [0-9]+ bytes .*--trust"),
-        (lambda m: m.update(count=1601), "pixels for 1601 splats"),
-        (lambda m: m.update(count=True), "a count of"),
-        (lambda m: m.update(version="\x1b[31m" * 9999), "version unknown, only 2"),
-        (lambda m: m.update(count=10**400), "a count of an impossible number"),
-        (lambda m: m["means"].update(mins=[0, float("nan"), 0]), "not 3 numbers"),
-        (lambda m: m.pop("quats"), "quats"),
-        (lambda m: m["scales"]["codebook"].pop(), "codebook"),
-        (lambda m: m["shN"]["codebook"].__setitem__(0, "x"), "codebook"),
-        (lambda m: m["shN"].update(bands=7), "7 bands"),
-        (lambda m: m["shN"].update(bands=2), "palette"),
-        (lambda m: m["shN"].update(count=60000), "palette"),
-        (lambda m: m["means"].update(files=["../../etc/passwd", "x"]), "etc/passwd"),
-        (lambda m: m["means"].update(mins=[1, 2]), "damaged"),
-    ],
-)
-def test_bad_sog_files(tmp_path, data, change, message):
-    rewritten_sog(data / "foreign" / "degree_3.sog", tmp_path / "bad.sog", change)
-    with pytest.raises(DataError, match=message):
-        sog.load(tmp_path / "bad.sog")
-
-
 def test_a_sog_file_that_unpacks_to_far_more(tmp_path):
     with zipfile.ZipFile(tmp_path / "bomb.sog", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("meta.json", b" " * (1 << 24))
@@ -74,19 +34,13 @@ def webp(width, height, frames=1) -> bytes:
 
 def sog_of(target, count, width, height, method=zipfile.ZIP_DEFLATED, frames=1):
     """A SOG file of equal splats."""
-    images = webp(width, height, frames)
-    book = [0.0] * 256
-    meta = {
-        "version": 2,
-        "count": count,
-        "means": {"mins": [0, 0, 0], "maxs": [1, 1, 1], "files": ["a.webp", "a.webp"]},
-        "quats": {"files": ["a.webp"]},
-        "scales": {"files": ["a.webp"], "codebook": book},
-        "sh0": {"files": ["a.webp"], "codebook": book},
-    }
+    image = {"files": ["a.webp"]}
+    indexed = image | {"codebook": [0.0] * 256}
+    means = {"mins": [0, 0, 0], "maxs": [1, 1, 1], "files": ["a.webp", "a.webp"]}
+    meta = {"version": 2, "count": count, "means": means, "quats": image, "scales": indexed, "sh0": indexed}
     with zipfile.ZipFile(target, "w", method) as archive:
         archive.writestr("meta.json", json.dumps(meta))
-        archive.writestr("a.webp", images)
+        archive.writestr("a.webp", webp(width, height, frames))
     return target
 
 
@@ -104,9 +58,9 @@ def test_a_small_file_of_countless_pixels(tmp_path):
 
 
 def test_many_pixels_for_few_splats_are_not_unpacked(tmp_path, monkeypatch):
-    bomb = sog_of(tmp_path / "bomb.sog", 10, 5000, 5000)
+    bomb = sog_of(tmp_path / "bomb.sog", 10, 1000, 1000)
     monkeypatch.setattr(Image, "open", lambda *args, **kwargs: pytest.fail("an image was opened"))
-    with pytest.raises(DataError, match="5000 x 5000 pixels for 10 splats"):
+    with pytest.raises(DataError, match="1000 x 1000 pixels for 10 splats"):
         load_scene(bomb, trust=True)
 
 
@@ -120,16 +74,18 @@ def test_sizes_of_webp_images(options):
     assert sog.webp_size(file.getvalue()[:12] + b"ABCD" + file.getvalue()[16:]) is None
 
 
-@pytest.mark.parametrize("method", [zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2])
-def test_packings_that_no_sog_file_has(tmp_path, method):
-    """LZMA takes as much memory as a file says."""
-    with pytest.raises(DataError, match="packed in a way"):
-        load_scene(sog_of(tmp_path / "a.sog", 9, 3, 3, method))
-
-
-def test_animated_images_are_refused(tmp_path):
-    with pytest.raises(DataError, match="animated"):
-        load_scene(sog_of(tmp_path / "a.sog", 9, 3, 3, frames=2))
+@pytest.mark.parametrize(
+    ("choices", "message"),
+    [
+        # LZMA takes as much memory as a file says.
+        ({"method": zipfile.ZIP_LZMA}, "packed in a way"),
+        ({"method": zipfile.ZIP_BZIP2}, "packed in a way"),
+        ({"frames": 2}, "animated"),
+    ],
+)
+def test_packings_and_images_that_no_sog_file_has(tmp_path, choices, message):
+    with pytest.raises(DataError, match=message):
+        load_scene(sog_of(tmp_path / "a.sog", 9, 3, 3, **choices))
 
 
 @pytest.mark.parametrize("name", ["degree_0.sog", "degree_3.sog"])

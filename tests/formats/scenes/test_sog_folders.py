@@ -47,13 +47,26 @@ def test_images_outside_of_the_folder_are_not_opened(name: str, folder: Path) ->
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        (lambda m: m.update(version=1), "version 1"),
         (lambda m: m.update(version=3), "version 3"),
-        (lambda m: m.update(count=10**7), "10000000 splats in .*--trust"),
+        (lambda m: m.pop("version"), "version 1"),
+        (lambda m: m.update(version="\x1b[31m" * 9999), "version unknown, only 2"),
+        (lambda m: m.update(count=-5), "a count of"),
+        (lambda m: m.update(count=True), "a count of"),
+        (lambda m: m.update(count=10**400), "a count of an impossible number"),
+        (lambda m: m.update(count=10**7), "10000000 splats in [0-9]+ bytes .*--trust"),
         (lambda m: m.update(count=1000), "pixels for 1000 splats"),
+        (lambda m: m["means"].update(mins=[0, float("nan"), 0]), "not 3 numbers"),
+        (lambda m: m["means"].update(mins=[1, 2]), "damaged"),
+        (lambda m: m.pop("quats"), "quats"),
+        (lambda m: m["scales"]["codebook"].pop(), "codebook"),
+        (lambda m: m["shN"]["codebook"].__setitem__(0, "x"), "codebook"),
+        (lambda m: m["shN"].update(bands=7), "7 bands"),
+        (lambda m: m["shN"].update(bands=2), "palette"),
+        (lambda m: m["shN"].update(count=60000), "palette"),
         (lambda m: m["sh0"].update(files=[]), "damaged"),
         (lambda m: m["sh0"].update(files=[3]), "damaged"),
         (lambda m: m["sh0"].update(files="sh0.webp"), "damaged"),
-        (lambda m: m.pop("quats"), "quats"),
         (lambda m: (m.pop("version"), m.pop("means")), "no description of a SOG scene"),
     ],
 )
@@ -63,7 +76,7 @@ def test_bad_descriptions(change: Any, message: str, folder: Path) -> None:
         load_scene(folder)
 
 
-def test_what_a_folder_lacks(folder: Path, tmp_path: Path) -> None:
+def test_what_a_folder_lacks(folder: Path) -> None:
     (folder / "quats.webp").unlink()
     with pytest.raises(UsageError, match=r"cannot open '.*quats.webp'"):
         load_scene(folder)
@@ -73,14 +86,13 @@ def test_what_a_folder_lacks(folder: Path, tmp_path: Path) -> None:
     (folder / "meta.json").write_bytes(b" " * (5 << 20))
     with pytest.raises(DataError, match="no description of a SOG scene: it has 5242880 bytes"):
         load_scene(folder)
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(
-        UsageError, match=r"has no scene: there is no .ply in it, and no meta.json, lod-meta.json or tileset.json"
-    ):
-        load_scene(tmp_path / "empty")
 
 
-def test_levels_that_there_are_not(levels: Path) -> None:
+def test_levels_that_there_are_not_and_further_ones(levels: Path, caplog: pytest.LogCaptureFixture) -> None:
+    load_scene(f"{levels}#0")
+    assert not caplog.records
+    load_scene(levels)
+    assert "has 2 levels of detail: the finest is read" in caplog.text
     for level in (2, 999_999):
         with pytest.raises(UsageError, match=f"has the levels 0 to 1, and no level {level}"):
             load_scene(f"{levels}#{level}")
@@ -89,15 +101,7 @@ def test_levels_that_there_are_not(levels: Path) -> None:
         load_scene(f"{levels}/lod-meta.json#1")
 
 
-def test_further_levels_are_told_of(levels: Path, caplog: pytest.LogCaptureFixture) -> None:
-    load_scene(levels)
-    assert "has 2 levels of detail: the finest is read" in caplog.text
-    caplog.clear()
-    load_scene(f"{levels}#0")
-    assert not caplog.records
-
-
-def test_a_level_in_parts(levels: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_level_in_parts(levels: Path) -> None:
     """Leaves of a tree that have some splats of two files each."""
     whole = load_scene(f"{levels}#0")
     shutil.copytree(levels / "0_0", levels / "other")
@@ -153,11 +157,14 @@ def test_bad_trees(change: Any, message: str, levels: Path) -> None:
         load_scene(f"{levels}#0")
 
 
-def test_missing_chunks(levels: Path) -> None:
+def test_missing_chunks_and_deep_trees(levels: Path) -> None:
     (levels / "0_0" / "meta.json").unlink()
     with pytest.raises(UsageError, match=r"cannot open '.*0_0.meta.json'"):
         load_scene(levels)
     assert len(load_scene(f"{levels}#1")) == 200
+    (levels / "lod-meta.json").write_text('{"tree": ' * 50_000)
+    with pytest.raises(DataError):
+        sog_levels.load(levels)
 
 
 def test_many_chunks_that_claim_much(levels: Path) -> None:
@@ -170,9 +177,3 @@ def test_many_chunks_that_claim_much(levels: Path) -> None:
     rewritten(levels / "lod-meta.json", lambda meta: meta.update(filenames=names, tree=tree))
     with pytest.raises(DataError, match=r"splats in \d+ bytes .*--trust"):
         load_scene(levels)
-
-
-def test_deep_trees(levels: Path) -> None:
-    (levels / "lod-meta.json").write_text('{"tree": ' * 50_000)
-    with pytest.raises(DataError):
-        sog_levels.load(levels)
