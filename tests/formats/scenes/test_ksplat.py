@@ -6,7 +6,6 @@ import struct
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from potr_cl import DataError, PotrError
@@ -54,18 +53,11 @@ def test_headers_that_are_refused(source: Path, tmp_path: Path, at: int, kind: s
 @pytest.mark.parametrize(
     ("at", "kind", "value"),
     [
-        (8, "I", 2**32 - 1),
-        (8, "I", 0),
-        (12, "I", 0),
-        (12, "I", 2**32 - 1),
+        *((at, "I", value) for at in (8, 12, 32, 1024) for value in (0, 2**32 - 1)),
         (16, "f", float("nan")),
         (20, "H", 0),
         (20, "H", 65535),
-        (32, "I", 2**32 - 1),
-        (32, "I", 0),
         (36, "I", 0),
-        (1024, "I", 2**32 - 1),
-        (1024, "I", 0),
     ],
 )
 def test_buckets_that_are_refused(data: Path, tmp_path: Path, at: int, kind: str, value: float) -> None:
@@ -84,10 +76,8 @@ def test_any_length_is_refused_or_read(source: Path, tmp_path: Path) -> None:
 
 def test_sections_with_room_for_more(source: Path, tmp_path: Path) -> None:
     """Files that are loaded while they grow have fewer splats than room."""
-    whole = load_scene(source)
     part = load_scene(changed(source, tmp_path / "a.ksplat", (SECTION, "I", 20), (16, "I", 20)))
-    np.testing.assert_array_equal(part.means, whole.means[:20])
-    np.testing.assert_array_equal(part.sh, whole.sh[:20])
+    assert part == load_scene(source)[:20]
 
 
 def test_several_sections(source: Path, tmp_path: Path) -> None:
@@ -97,5 +87,4 @@ def test_several_sections(source: Path, tmp_path: Path) -> None:
     empty = bytes(1024)
     (tmp_path / "a.ksplat").write_bytes(bytes(content[:SECTION]) + header + empty + header + body + body)
     whole, twice = load_scene(source), load_scene(tmp_path / "a.ksplat")
-    np.testing.assert_array_equal(twice.means, np.concatenate([whole.means, whole.means]))
-    np.testing.assert_array_equal(twice.sh, np.concatenate([whole.sh, whole.sh]))
+    assert twice == whole[[*range(len(whole))] * 2]
