@@ -6,7 +6,6 @@ import shutil
 from pathlib import Path
 
 import pytest
-from PIL import Image
 
 from potr_cl import UsageError
 from potr_cl.formats import load_cameras
@@ -38,24 +37,6 @@ def test_plush_excerpt_as_cameras_json_and_as_colmap_model(model: str, data: Pat
     assert [c.split for c in load_cameras(data / model)].count("test") == 3
     for file in sorted((data / model).iterdir()):  # each stands for the whole model
         assert_same_views(load_cameras(file), expected, 1e-9)
-
-
-def test_whole_lego(lego: Path) -> None:
-    from_json = load_cameras(lego / "cameras.json")
-    train, test = (load_cameras(lego / f"transforms_{split}.json") for split in ("train", "test"))
-    assert_same_views(from_json, train + test)
-    assert len(train_views(from_json)) == 100
-    assert all(camera.image_path == other.image_path for camera, other in zip(from_json, train + test, strict=True))
-
-
-def test_whole_plush(plush: Path) -> None:
-    from_json, from_model = load_cameras(plush / "cameras.json"), load_cameras(plush / "sparse" / "0")
-    assert_same_views(from_json, from_model)
-    assert len(views_for_judging(from_model)) == 13
-    for camera in from_model:
-        assert camera.image_path is not None
-        with Image.open(camera.image_path) as image:
-            assert image.size == (camera.width, camera.height)
 
 
 # Finding the kind ----------------------------------------------------------------------------------------------------

@@ -12,6 +12,8 @@ from potr_cl.codec import octree
 from potr_cl.errors import DataError
 from potr_cl.formats import load_scene, scene_writer
 from potr_cl.formats.scenes.compressed_ply_values import CHUNK, in_chunks
+from potr_cl.opencl.device import Device
+from tests.cases.judging import psnr
 from tests.reference.scenes import random_scene
 
 
@@ -25,6 +27,12 @@ def test_bounds_of_a_compressed_ply_hold_neighbours(tmp_path):
     distances, index = cKDTree(means).query(load_scene(path).means)
     assert len(np.unique(index)) == len(means)
     assert distances.mean() < 0.2 / 1023
+
+
+def test_what_is_written_looks_as_the_scene_does(tmp_path, plush_excerpt, plush_excerpt_cameras):
+    scene_writer(tmp_path / "a.compressed.ply")(plush_excerpt)
+    scene = load_scene(tmp_path / "a.compressed.ply")
+    assert psnr(Device(), plush_excerpt, scene, plush_excerpt_cameras) >= 59
 
 
 def test_chunks_are_more_compact_than_runs_of_a_curve():
