@@ -1,10 +1,11 @@
-"""Writing a file whole or not at all."""
+"""Writing a file whole or not at all, and where temporary files go."""
 
 from __future__ import annotations
 
 import errno
 import os
 import stat
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ import pytest
 from potr_cl.errors import PotrError, UsageError, WriteError
 from potr_cl.host import atomic_write
 from potr_cl.host.atomic_write import check_place, replacing
+from potr_cl.host.leftovers import place_for_temporary_files, temporary_folder
 
 
 def _write_half_then_raise(target: Path, failure: BaseException) -> None:
@@ -139,3 +141,35 @@ def test_a_file_that_somebody_looks_at_is_tried_again(tmp_path: Path, monkeypatc
         file.write(b"another")
     assert (tmp_path / "out.bin").read_bytes() == b"whole"
     assert os.listdir(tmp_path) == ["out.bin"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Windows finds its folder otherwise")
+def test_no_file_is_tried_in_the_folder_for_temporary_files(tmp_path, monkeypatch):
+    """A signal between the making of such a file and its removal would leave it behind."""
+
+    def tried() -> str:
+        raise AssertionError("a file was made for a trial")
+
+    monkeypatch.setattr(tempfile, "tempdir", None)  # as in a new process
+    monkeypatch.setattr(tempfile, "gettempdir", tried)
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    assert place_for_temporary_files() == str(tmp_path)
+    with temporary_folder() as name:
+        assert [str(each) for each in tmp_path.iterdir()] == [name]
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_is_none_is_passed_over(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "none"))
+    monkeypatch.setenv("TEMP", str(tmp_path))
+    assert place_for_temporary_files() == tempfile.gettempdir() == str(tmp_path)
+
+
+def test_no_folder_for_temporary_files_is_one_line(monkeypatch):
+    def full(*_args: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.mkdir", full)
+    with pytest.raises(UsageError, match="No space left on device: make room there"), temporary_folder():
+        pass
