@@ -49,22 +49,31 @@ def device():
     assert device.allocated == 0, "an encode did not give all its memory back"
 
 
-def encoded_to(output: Output, scene: Scene, cameras, device: Device, **changes) -> Encoded:
-    return potr_cl.encode(scene, cameras, EncodeOptions(output=output).changed(**changes), device=device)
+@pytest.fixture(scope="module")
+def encoded_to(plush_excerpt, plush_excerpt_cameras, device) -> Callable[..., Encoded]:
+    """The excerpt, or another scene, encoded to a kind of output."""
+
+    def encoded(output: Output, scene: Scene = plush_excerpt, **changes) -> Encoded:
+        options = EncodeOptions(output=output).changed(**changes)
+        return potr_cl.encode(scene, plush_excerpt_cameras, options, device=device)
+
+    return encoded
 
 
 @pytest.fixture(scope="module")
-def encodes(plush_excerpt, plush_excerpt_cameras, device) -> Callable[[Output], Encoded]:
-    """Of the excerpt, as it comes, to each kind of output once."""
-    return functools.cache(lambda output: encoded_to(output, plush_excerpt, plush_excerpt_cameras, device))
+def encodes(encoded_to) -> Callable[[Output], Encoded]:
+    """The same of the excerpt, as it comes, once to each."""
+    return functools.cache(encoded_to)
 
 
-def psnr(device: Device, scene: Scene, other: Scene, cameras) -> float:
-    return judging.psnr(device, scene, other, held_out(cameras))
+@pytest.fixture(scope="module")
+def psnr(plush_excerpt, plush_excerpt_cameras, device) -> Callable[[Scene], float]:
+    """How close a scene comes to the excerpt, dB."""
+    return lambda scene: judging.psnr(device, plush_excerpt, scene, held_out(plush_excerpt_cameras))
 
 
 @pytest.mark.parametrize("output", EVERY, ids=name)
-def test_the_file_is_what_its_reader_sees(output, encodes, plush_excerpt, plush_excerpt_cameras, device, tmp_path):
+def test_the_file_is_what_its_reader_sees(output, encodes, plush_excerpt, tmp_path, psnr):
     encoded = encodes(output)
     path = tmp_path / f"file{output.suffix}"
     encoded.save(path)
@@ -77,16 +86,20 @@ def test_the_file_is_what_its_reader_sees(output, encodes, plush_excerpt, plush_
     assert np.corrcoef(seen.opacities, near.opacities)[0, 1] > 0.99
     for field in ("means", "log_scales", "opacities", "sh"):
         assert np.allclose(getattr(encoded.scene, field), getattr(seen, field), rtol=1e-5, atol=2e-5), field
-    assert psnr(device, plush_excerpt, seen, plush_excerpt_cameras) > 49
+    assert psnr(seen) > 49
 
 
 @pytest.mark.parametrize("output", OTHERS, ids=name)
 @pytest.mark.parametrize("degree", [0, 3])
-def test_geometry_is_rounded_as_the_file_holds_it(output, degree):
+def test_geometry_and_fixed_coefficients_are_those_of_the_file(output, degree):
     scene = random_scene(700, degree).rendered(True)
-    request = Request(HyperParameters.from_quality(0.5, "best"))
+    request = Request(HyperParameters.from_quality(0.5 if degree == 0 else 0.3, "best"))
     rounded = output.geometry(scene, request)
-    coded = output.file(scene, None, request)
+    worth = np.random.default_rng(1).lognormal(-20, 2, scene.sh.shape[:2]).astype(np.float32)
+    before = scene.sh.copy()
+    fixed, sh = output.fix_ac(rounded, scene.sh, worth, request)
+    assert np.array_equal(scene.sh, before), "the re-fit still needs what it has handed out"
+    coded = output.file(dataclasses.replace(scene, sh=sh), fixed, request)
     assert np.array_equal(coded.order, rounded.order)
     assert sorted(coded.order) == list(range(700))
     seen, told = output.read(b"".join(coded.pieces)), rounded.decoded(scene.sh).subset(rounded.order)
@@ -95,22 +108,14 @@ def test_geometry_is_rounded_as_the_file_holds_it(output, degree):
     same_turn = np.abs((seen.quaternions * told.quaternions).sum(axis=1))
     lengths = np.linalg.norm(seen.quaternions, axis=1) * np.linalg.norm(told.quaternions, axis=1)
     assert (same_turn / lengths).min() > 1 - 1e-5
-    assert (seen.sh.shape, seen.antialiased) == (scene.sh.shape, True)
-
-
-@pytest.mark.parametrize("output", OTHERS, ids=name)
-def test_fixed_coefficients_are_those_of_the_file(output):
-    scene = random_scene(700, 3)
-    request = Request(HyperParameters.from_quality(0.3, "best"))
-    rounded = output.geometry(scene, request)
-    worth = np.random.default_rng(1).lognormal(-20, 2, scene.sh.shape[:2]).astype(np.float32)
-    before = scene.sh.copy()
-    fixed, sh = output.fix_ac(rounded, scene.sh, worth, request)
-    assert np.array_equal(scene.sh, before), "the re-fit still needs what it has handed out"
-    coded = output.file(dataclasses.replace(scene, sh=sh), fixed, request)
-    seen = output.read(b"".join(coded.pieces)).sh
-    assert np.abs(seen[:, 1:] - sh[coded.order, 1 : seen.shape[1]]).max() < 1e-6
-    assert not sh[:, seen.shape[1] :].any()
+    assert seen.antialiased
+    assert np.abs(seen.sh[:, 1:] - sh[coded.order, 1 : seen.sh.shape[1]]).max(initial=0) < 1e-6
+    assert not sh[:, seen.sh.shape[1] :].any()
+    alone = output.file(scene, None, request)
+    whole = output.read(b"".join(alone.pieces))
+    assert np.array_equal(alone.order, coded.order)
+    assert np.array_equal(whole.means, seen.means)
+    assert whole.sh.shape == scene.sh.shape
 
 
 def test_sog_is_smaller_than_the_whole_scene_as_sog(encodes, plush_excerpt, tmp_path):
@@ -126,9 +131,7 @@ def test_a_potr_file_holds_the_coefficients_of_the_refit(encodes):
 
 
 @pytest.mark.slow
-def test_potr_files_have_less_error_at_no_more_bytes_than_with_the_nearest_levels(
-    encodes, plush_excerpt, plush_excerpt_cameras, device, monkeypatch
-):
+def test_potr_files_have_less_error_than_with_the_nearest_levels(encodes, monkeypatch, encoded_to, psnr):
     def fix_ac(self, rounded, sh, worth, request):
         geometry, grid = self.colour_grid(rounded, worth[:, 0], request)
         return geometry, nearest_levels(sh, grid.others)
@@ -136,10 +139,9 @@ def test_potr_files_have_less_error_at_no_more_bytes_than_with_the_nearest_level
     rounds = encodes(EVERY[0])
     monkeypatch.setattr(Potr, "fix_ac", fix_ac)
     monkeypatch.setattr(Potr, "on_grid", lambda self, request: False)
-    plain = encoded_to(EVERY[0], plush_excerpt, plush_excerpt_cameras, device)
+    plain = encoded_to(EVERY[0])
     assert rounds.nbytes < 1.005 * plain.nbytes
-    figures = [psnr(device, plush_excerpt, each.scene, plush_excerpt_cameras) for each in (plain, rounds)]
-    assert figures[1] > figures[0] + 0.1
+    assert psnr(rounds.scene) > psnr(plain.scene) + 0.1
 
 
 def nearest_levels(sh: np.ndarray, steps: np.ndarray) -> np.ndarray:
@@ -164,40 +166,34 @@ def test_bytes_do_not_depend_on_threads(output):
     assert files[0] == files[1]
 
 
-def test_levels_of_spz_follow_what_errors_cost(plush_excerpt, plush_excerpt_cameras, device):
+def test_levels_of_spz_follow_what_errors_cost(encoded_to, psnr):
     """With a re-fit, which knows what errors cost, files are smaller than with the nearest levels, and hardly worse."""
-    fitted, plain = (
-        encoded_to(Spz(), plush_excerpt, plush_excerpt_cameras, device, q=0.2, prune=False, refit={"steps": steps})
-        for steps in (4, 0)
-    )
+    fitted, plain = (encoded_to(Spz(), q=0.2, prune=False, refit={"steps": steps}) for steps in (4, 0))
     assert fitted.nbytes < 0.85 * plain.nbytes
-    figures = [psnr(device, plush_excerpt, each.scene, plush_excerpt_cameras) for each in (plain, fitted)]
-    assert figures[1] > figures[0] - 1
+    assert psnr(fitted.scene) > psnr(plain.scene) - 1
 
 
-def test_constant_colours_make_up_for_coarse_coefficients(plush_excerpt, plush_excerpt_cameras, device):
+def test_constant_colours_make_up_for_coarse_coefficients(encoded_to, psnr):
     """Compressed PLY rounds AC coefficients to 1/32: without splats lost, that is nearly all that it loses."""
     output = output_of(Path("a.compressed.ply"))
-    fitted = encoded_to(output, plush_excerpt, plush_excerpt_cameras, device, prune=False)
-    plain = encoded_to(output, plush_excerpt, plush_excerpt_cameras, device, prune=False, refit={"steps": 0})
+    fitted, plain = encoded_to(output, prune=False), encoded_to(output, prune=False, refit={"steps": 0})
     assert plain.nbytes == fitted.nbytes
-    figures = [psnr(device, plush_excerpt, each.scene, plush_excerpt_cameras) for each in (plain, fitted)]
-    assert figures[1] > figures[0] + 1
+    assert psnr(fitted.scene) > psnr(plain.scene) + 1
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("suffix", "size", "least"), [(".spz", 40_000, 48), (".compressed.ply", 84_000, 62)])
-def test_a_size_and_a_psnr_are_met(suffix, size, least, plush_excerpt, plush_excerpt_cameras, device):
+def test_a_size_and_a_psnr_are_met(suffix, size, least, plush_excerpt, plush_excerpt_cameras, device, psnr):
     given, told = (plush_excerpt, plush_excerpt_cameras), {"to": suffix, "iterations": 8, "device": device}
     assert 0.9 * size < potr_cl.encode(*given, max_size=size, **told).nbytes <= size
     encoded = potr_cl.encode(*given, min_psnr=least, **told)
-    assert least <= psnr(device, plush_excerpt, encoded.scene, plush_excerpt_cameras) < least + 1.5
+    assert least <= psnr(encoded.scene) < least + 1.5
 
 
 @pytest.mark.slow
-def test_quality_decides_of_size(encodes, plush_excerpt, plush_excerpt_cameras, device):
+def test_quality_decides_of_size(encodes, encoded_to):
     for output in EVERY[1:]:
-        smaller = encoded_to(output, plush_excerpt, plush_excerpt_cameras, device, q=0.2)
+        smaller = encoded_to(output, q=0.2)
         assert smaller.nbytes < encodes(output).nbytes, output
 
 
@@ -224,13 +220,13 @@ def test_highlights_of_a_few_splats_keep_a_degree_unless_a_target_asks_for_its_b
     assert degree(output.to_meet_a_target(), bright) == 0
 
 
-def test_degrees_that_are_left_out_are_told_once(plush_excerpt, plush_excerpt_cameras, device, caplog):
+def test_degrees_that_are_left_out_are_told_once(plush_excerpt, caplog, encoded_to):
     flat = dataclasses.replace(plush_excerpt, sh=plush_excerpt.sh.copy())
     flat.sh[:, 9:] = 0
     with caplog.at_level(logging.WARNING, "potr_cl"):
         output, iterations = output_of_suffix(".compressed.ply"), {"iterations": 8}
         found, whole = (
-            encoded_to(output, scene, plush_excerpt_cameras, device, q=q, prune=iterations, refit={"steps": 2})
+            encoded_to(output, scene, q=q, prune=iterations, refit={"steps": 2})
             for scene, q in ((flat, 0.2), (plush_excerpt, 0.8))
         )
     assert (found.scene.sh_degree, whole.scene.sh_degree) == (2, 3)
@@ -239,7 +235,7 @@ def test_degrees_that_are_left_out_are_told_once(plush_excerpt, plush_excerpt_ca
 
 
 @pytest.mark.slow
-def test_what_a_format_cannot_hold_is_said_once(plush_excerpt, plush_excerpt_cameras, device, caplog):
+def test_what_a_format_cannot_hold_is_said_once(plush_excerpt, plush_excerpt_cameras, caplog):
     scene = dataclasses.replace(antialiased(plush_excerpt), low_pass=MIP_SPLATTING_LOW_PASS)
     with caplog.at_level(logging.WARNING, "potr_cl"):
         potr_cl.encode(scene, plush_excerpt_cameras, to="compressed.ply", max_size=80_000, iterations=4, refit=2)
@@ -280,7 +276,7 @@ def test_without_views_files_are_made_too(plush_excerpt):
 
 
 def test_worth_is_about_training_views_and_coefficients_make_up_for_each_other(
-    plush_excerpt, plush_excerpt_cameras, device
+    plush_excerpt, plush_excerpt_cameras, device, psnr
 ):
     """Rounded in turn, the coefficients of a splat lose less than each for itself, and the file is no larger."""
     views, output = train_views(plush_excerpt_cameras), output_of(Path("a.compressed.ply"))
@@ -303,8 +299,5 @@ def test_worth_is_about_training_views_and_coefficients_make_up_for_each_other(
             errors = [np.mean((rasterizer.render(v)[0] - other.render(v)[0]) ** 2) for v in views]
     # The mean over three channels of which one has changed; colours that are cut at 0 change nothing.
     assert np.mean(errors) == pytest.approx(worth[splat, 2] * 0.05**2, rel=0.1)
-    figures = [
-        psnr(device, plush_excerpt, dataclasses.replace(plush_excerpt, sh=sh), plush_excerpt_cameras)
-        for sh in (alone, together)
-    ]
-    assert figures[1] > figures[0] + 3
+    alone, together = (psnr(dataclasses.replace(plush_excerpt, sh=sh)) for sh in (alone, together))
+    assert together > alone + 3
