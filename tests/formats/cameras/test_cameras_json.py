@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -45,23 +44,22 @@ def test_cameras_json_with_equal_names(tmp_path: Path, caplog: pytest.LogCapture
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("field", "values", "message"),
     [
-        ({"width": 0}, "'width' is 0.*, not a number of pixels"),
-        ({"height": 30.5}, r"'height' is 30\.5, not a number of pixels"),
-        ({"width": True}, "'width' is True, not a finite number"),
-        ({"width": 10**400}, "'width' is a number of more than 64 bits, not a finite number"),
-        ({"fx": float("nan")}, "'fx' is nan"),
-        ({"fy": 0}, "camera 'a': intrinsics"),
-        ({"position": [1, 2]}, "'position' is a list of 2, not 3 numbers"),
-        ({"rotation": [[1, 0, 0]] * 3}, "camera 'a': the pose's 3 x 3 part is not a rotation"),
-        ({"rotation": [[1e200, 0, 0]] * 3}, "camera 'a': the pose's 3 x 3 part is not a rotation"),
-        ({"rotation": {}}, "'rotation' is an object of 0 keys"),
-        ({"split": "valid"}, "'split' is 'valid', neither"),
-        ({"split": ["train"] * 999}, "'split' is a list of 999"),
-        ({"img_name": ""}, "'img_name' is '', not the name"),
+        ("width", [0], "'width' is 0.*, not a number of pixels"),
+        ("height", [30.5], r"'height' is 30\.5, not a number of pixels"),
+        ("width", [True], "'width' is True, not a finite number"),
+        ("width", [10**400], "'width' is a number of more than 64 bits, not a finite number"),
+        ("fx", [float("nan")], "'fx' is nan"),
+        ("fy", [0], "camera 'a': intrinsics"),
+        ("position", [[1, 2]], "'position' is a list of 2, not 3 numbers"),
+        ("rotation", [[[x, 0, 0]] * 3 for x in (1, 1e200)], "camera 'a': the pose's 3 x 3 part is not a rotation"),
+        ("rotation", [{}], "'rotation' is an object of 0 keys"),
+        ("split", ["valid", ["train"] * 999], "'split' is ('valid', neither|a list of 999)"),
+        ("img_name", [""], "'img_name' is '', not the name"),
     ],
 )
 @warnings_are_errors
-def test_bad_views_in_cameras_json(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
-    refused(write_json(tmp_path / "cameras.json", [view(**changes)]), message)
+def test_bad_views_in_cameras_json(field, values, message, tmp_path):
+    for value in values:
+        refused(write_json(tmp_path / "cameras.json", [view(**{field: value})]), message)
