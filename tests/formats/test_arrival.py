@@ -6,7 +6,6 @@ import gzip
 import io
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +24,7 @@ from tests.reference.scenes import random_scene
 
 
 @pytest.fixture
-def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def temporary(tmp_path, monkeypatch):
     """The folder for temporary files."""
     (tmp_path / "temporary").mkdir()
     monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
@@ -55,7 +54,7 @@ def with_a_bad_splat(folder: Path) -> bytes:
 
 
 @pytest.mark.parametrize("name", ["a.ply.gz", "a.PLY.GZ", "a.spz.gz", "b.c.ply.gz", "a.potr.gz"])
-def test_what_is_unpacked_is_read(name: str, tmp_path: Path, temporary: Path) -> None:
+def test_what_is_unpacked_is_read(name, tmp_path, temporary):
     suffix = Path(name[:-3].lower()).suffix
     path = gzipped(tmp_path / name, written(tmp_path, suffix))
     assert load_scene(path) == load_scene(tmp_path / f"a{suffix}")
@@ -63,13 +62,13 @@ def test_what_is_unpacked_is_read(name: str, tmp_path: Path, temporary: Path) ->
 
 
 @pytest.mark.parametrize("name", ["a.gz", "a.obj.gz", "ply.gz", "meta.json.gz"])
-def test_formats_that_are_not_known(name: str, tmp_path: Path) -> None:
+def test_formats_that_are_not_known(name, tmp_path):
     with pytest.raises((UsageError, DataError)) as caught:
         load_scene(gzipped(tmp_path / name, b"abc"))
     assert str(tmp_path / name) in str(caught.value)
 
 
-def test_messages_and_warnings_name_the_file(tmp_path: Path, temporary: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_messages_and_warnings_name_the_file(tmp_path, temporary, caplog):
     path, content = tmp_path / "a.ply.gz", with_a_bad_splat(tmp_path)
     assert len(load_scene(gzipped(path, content))) == 9
     assert [r.getMessage() for r in caplog.records] == [f"'{path}': dropped 1 splats with non-finite values"]
@@ -86,12 +85,12 @@ def test_messages_and_warnings_name_the_file(tmp_path: Path, temporary: Path, ca
 
 
 @pytest.fixture(scope="module")
-def zeros() -> bytes:
+def zeros():
     return gzip.compress(bytes(1 << 25), 9)
 
 
 @pytest.mark.parametrize(("suffix", "most"), [(".ply", 18 << 20), (".potr", 1 << 18), (".spz", 1 << 18)])
-def test_little_that_unpacks_to_much(suffix: str, most: int, zeros: bytes, tmp_path: Path, temporary: Path) -> None:
+def test_little_that_unpacks_to_much(suffix, most, zeros, tmp_path, temporary):
     path = tmp_path / f"a{suffix}.gz"
     path.write_bytes(zeros)
     assert path.stat().st_size < 1 << 16
@@ -104,7 +103,7 @@ def test_little_that_unpacks_to_much(suffix: str, most: int, zeros: bytes, tmp_p
         load_scene(path, trust=True)
 
 
-def test_no_room_for_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_room_for_it(tmp_path, monkeypatch):
     path = gzipped(tmp_path / "a.ply.gz", written(tmp_path, ".ply"))
     monkeypatch.setenv("TMPDIR", str(tmp_path / "gone"))
     for name in ("TEMP", "TMP"):
@@ -116,13 +115,13 @@ POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsiz
 
 
 @pytest.mark.parametrize("name", ["a.ply", "a.spz", "a.sog", "a.potr", "a.splat", "a.ksplat", "a.glb", "a.ply.gz"])
-def test_git_lfs_pointers(name: str, tmp_path: Path) -> None:
+def test_git_lfs_pointers(name, tmp_path):
     (tmp_path / name).write_bytes(POINTER)
     with pytest.raises(DataError, match="is a Git-LFS pointer, not the file itself: run 'git lfs pull'"):
         load_scene(tmp_path / name)
 
 
-def test_git_lfs_pointers_for_others(tmp_path: Path, data: Path) -> None:
+def test_git_lfs_pointers_for_others(tmp_path, data):
     (tmp_path / "meta.json").write_bytes((data / "other_tools" / "splat-transform_sog" / "meta.json").read_bytes())
     for name in ("means_l", "means_u", "quats", "scales", "sh0", "shN_centroids", "shN_labels"):
         (tmp_path / f"{name}.webp").write_bytes(POINTER)
@@ -145,14 +144,14 @@ class Dripping(io.BytesIO):
 
 @pytest.mark.parametrize("suffix", [".ply", ".spz"])
 @pytest.mark.parametrize("kind", [io.BytesIO, Dripping])
-def test_the_content_tells_the_format(tmp_path: Path, suffix: str, kind: type[io.BytesIO]) -> None:
+def test_the_content_tells_the_format(tmp_path, suffix, kind):
     with streams.received(kind(written(tmp_path, suffix))) as path:
         scene = load_scene(path)
     assert scene == load_scene(tmp_path / f"a{suffix}")
     assert not path.parent.exists()
 
 
-def test_what_a_gzip_stream_unpacks_to_tells_the_format(tmp_path: Path) -> None:
+def test_what_a_gzip_stream_unpacks_to_tells_the_format(tmp_path):
     for suffix, packed in ((".ply", ".ply.gz"), (".spz", ".spz")):
         content = written(tmp_path, suffix)
         start = content if content.startswith(b"\x1f\x8b") else gzip.compress(content)
@@ -162,13 +161,13 @@ def test_what_a_gzip_stream_unpacks_to_tells_the_format(tmp_path: Path) -> None:
             registry.suffix_of_content(damaged, "stream")
 
 
-def test_names_of_scenes_without_their_suffixes() -> None:
+def test_names_of_scenes_without_their_suffixes():
     for name in ("a.ply", "b/a.compressed.ply", "a.PLY.gz", "a/meta.json", "a/lod-meta.json#2", "b/a#1"):
         assert registry.stem_of_scene(Path(name)) == "a"
     assert registry.stem_of_scene(Path("v1.2.ply")) == "v1.2"
 
 
-def test_a_stream_has_an_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stream_has_an_end(tmp_path, monkeypatch):
     content = written(tmp_path, ".ply")
     with pytest.raises(UsageError, match="no suffix of a scene"), streams.received(io.BytesIO(b"x"), ".xyz"):
         pytest.fail("it was taken")
@@ -178,9 +177,7 @@ def test_a_stream_has_an_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.parametrize("packed", [bytes, gzip.compress])
-def test_warnings_and_errors_speak_of_the_stream(
-    tmp_path: Path, packed: Callable[[bytes], bytes], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_warnings_and_errors_speak_of_the_stream(tmp_path, packed, caplog):
     content = with_a_bad_splat(tmp_path)
     with streams.received(io.BytesIO(packed(content))) as path:
         assert len(load_scene(path)) == 9
@@ -192,12 +189,12 @@ def test_warnings_and_errors_speak_of_the_stream(
         load_scene(path)
 
 
-def test_all_or_nothing_is_sent() -> None:
+def test_all_or_nothing_is_sent():
     scene, stream = random_scene(50, 1), io.BytesIO()
     assert streams.send(stream, ".ply", lambda path: ply.save(path, scene)) == len(stream.getvalue())
     assert stream.getvalue().startswith(b"ply\n")
 
-    def failing(path: Path) -> None:
+    def failing(path):
         path.write_bytes(b"half of it")
         raise DataError("it cannot be held")
 
@@ -207,7 +204,7 @@ def test_all_or_nothing_is_sent() -> None:
     assert stream.getvalue() == b""
 
 
-def test_no_two_formats_begin_alike() -> None:
+def test_no_two_formats_begin_alike():
     starts = [start for entry in registry.SCENE_FORMATS for start in entry.starts]
     assert all(len(start) <= registry.START_BYTES for start in starts)
     for one in starts:
@@ -217,7 +214,7 @@ def test_no_two_formats_begin_alike() -> None:
 # Sizes ---------------------------------------------------------------------------------------------------------------
 
 
-def test_a_buffer_beside_a_gltf_file_counts_once(tmp_path: Path) -> None:
+def test_a_buffer_beside_a_gltf_file_counts_once(tmp_path):
     description, content = described(attributes(random_scene(20, 1)))
     (tmp_path / "a.glb").write_bytes(glb(description, content))
     (tmp_path / "a.gltf").write_bytes(gltf(description, content, "a%20b.bin"))
@@ -228,12 +225,12 @@ def test_a_buffer_beside_a_gltf_file_counts_once(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def levels(tmp_path: Path, data: Path) -> Path:
+def levels(tmp_path, data):
     shutil.copytree(data / "other_tools" / "splat-transform_lod", tmp_path / "lod")
     return tmp_path / "lod"
 
 
-def test_only_what_is_there_and_belongs_to_it_counts(levels: Path, tmp_path: Path) -> None:
+def test_only_what_is_there_and_belongs_to_it_counts(levels, tmp_path):
     whole = sum(file.stat().st_size for file in levels.rglob("*") if file.is_file())
     (levels / "notes.json").write_text("{}")
     (levels / "picture.webp").write_bytes(bytes(1000))
@@ -263,7 +260,7 @@ def test_only_what_is_there_and_belongs_to_it_counts(levels: Path, tmp_path: Pat
     ],
 )
 @pytest.mark.parametrize("name", ["lod-meta.json", "meta.json", "a.gltf"])
-def test_nothing_is_said_of_damaged_descriptions(name: str, content: bytes, tmp_path: Path) -> None:
+def test_nothing_is_said_of_damaged_descriptions(name, content, tmp_path):
     (tmp_path / name).write_bytes(content)
     size = bytes_of_scene(tmp_path / name)
     assert size is None or size == len(content)

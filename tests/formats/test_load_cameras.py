@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from pathlib import Path
 
 import pytest
 
@@ -17,7 +16,7 @@ from tests.cases.cameras import assert_same_views, nerfstudio, refused, view, wr
 # The same views in different formats ---------------------------------------------------------------------------------
 
 
-def test_the_excerpts_views_as_cameras_json_and_as_transforms(data: Path, tmp_path: Path) -> None:
+def test_the_excerpts_views_as_cameras_json_and_as_transforms(data, tmp_path):
     shutil.copytree(data / "plush_transforms", tmp_path, dirs_exist_ok=True)
     expected = load_cameras(data / "plush_excerpt_cameras.json")
     for camera in expected:
@@ -31,7 +30,7 @@ def test_the_excerpts_views_as_cameras_json_and_as_transforms(data: Path, tmp_pa
 
 
 @pytest.mark.parametrize("model", ["plush_sparse_binary", "plush_sparse_text"])
-def test_plush_excerpt_as_cameras_json_and_as_colmap_model(model: str, data: Path) -> None:
+def test_plush_excerpt_as_cameras_json_and_as_colmap_model(model, data):
     expected = load_cameras(data / "plush_cameras.json")
     assert_same_views(load_cameras(data / model), expected, 1e-9)
     assert [c.split for c in load_cameras(data / model)].count("test") == 3
@@ -42,7 +41,7 @@ def test_plush_excerpt_as_cameras_json_and_as_colmap_model(model: str, data: Pat
 # Finding the kind ----------------------------------------------------------------------------------------------------
 
 
-def test_folders_and_any_file_name(data: Path, tmp_path: Path) -> None:
+def test_folders_and_any_file_name(data, tmp_path):
     refused(tmp_path, "has no cameras, expected a COLMAP model .*, a cameras.json or a transforms.json", UsageError)
     shutil.copytree(data / "plush_sparse_binary", tmp_path / "another" / "sparse" / "0")
     assert len(load_cameras(tmp_path / "another" / "sparse")) == 17
@@ -52,9 +51,7 @@ def test_folders_and_any_file_name(data: Path, tmp_path: Path) -> None:
     assert len(load_cameras(tmp_path / "poses.json")) == 1
 
 
-def test_views_that_are_too_wide_for_a_pinhole_are_told(
-    data: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_views_that_are_too_wide_for_a_pinhole_are_told(data, tmp_path, caplog):
     """As of focal lengths in millimetres."""
     load_cameras(data / "plush_cameras.json")
     assert caplog.text == ""
@@ -85,12 +82,12 @@ def test_views_that_are_too_wide_for_a_pinhole_are_told(
         (b'[{"img_name": "\\ud800"}]', "not the name of an image"),
     ],
 )
-def test_json_of_no_known_kind(content: bytes, message: str, tmp_path: Path) -> None:
+def test_json_of_no_known_kind(content, message, tmp_path):
     (tmp_path / "a.json").write_bytes(content)
     refused(tmp_path / "a.json", message)
 
 
-def test_paths_of_no_known_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_paths_of_no_known_kind(tmp_path, monkeypatch):
     refused(tmp_path / "missing.json", "cannot read '.*missing.json': No such file", UsageError)
     refused(tmp_path / "missing", "there is no file or folder", UsageError)
     (tmp_path / "notes.txt").write_bytes(b"")

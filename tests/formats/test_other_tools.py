@@ -50,7 +50,7 @@ def assert_alike(scene: Scene, expected: Scene) -> None:
 
 
 @pytest.fixture
-def tools(data: Path) -> Path:
+def tools(data):
     return data / "other_tools"
 
 
@@ -59,7 +59,7 @@ def as_splat_transform_reads(tools: Path, name: str) -> Scene:
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_values_are_splat_transforms(name: str, tools: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_values_are_splat_transforms(name, tools, tmp_path, caplog):
     scene = load_scene(tools / name)
     assert not caplog.records  # nothing was lost, so nothing is said
     assert_alike(scene, as_splat_transform_reads(tools, FILES[name]))
@@ -69,7 +69,7 @@ def test_values_are_splat_transforms(name: str, tools: Path, tmp_path: Path, cap
 
 
 @pytest.mark.parametrize("given", ["", "/lod-meta.json", "#0", "/lod-meta.json#0", "#1"])
-def test_a_level_and_the_environment(given: str, tools: Path) -> None:
+def test_a_level_and_the_environment(given, tools):
     scene = load_scene(f"{tools}/splat-transform_lod{given}")
     # Which leaves the environment out.
     expected = as_splat_transform_reads(tools, "level_1.ply" if given == "#1" else "level_0.ply")
@@ -84,19 +84,19 @@ def test_a_level_and_the_environment(given: str, tools: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["splat-transform_sog", "splat-transform_lod#1", "splat-transform.glb"])
-def test_commands_take_them(name: str, tools: Path, tmp_path: Path) -> None:
+def test_commands_take_them(name, tools, tmp_path):
     assert cli.main(["convert", str(tools / name), str(tmp_path / "out.ply")]) == 0
     np.testing.assert_array_equal(load_scene(tmp_path / "out.ply").means, load_scene(tools / name).means)
 
 
-def test_files_for_every_reader_are_there(tools: Path) -> None:
+def test_files_for_every_reader_are_there(tools):
     """What was made is tested, and nothing else lies there."""
     made = {path.name for path in tools.iterdir()}
     used = {name.partition("/")[0] for name in FILES} | {"splat-transform_lod", "plush.ply"}
     assert made == used | {"as_splat-transform_reads_it"}
 
 
-def test_a_folder_may_be_anywhere(tools: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_may_be_anywhere(tools, tmp_path, monkeypatch):
     shutil.copytree(tools / "splat-transform_sog", tmp_path / "a#1")
     monkeypatch.chdir(tmp_path / "a#1")
     assert len(load_scene(".")) == len(load_scene("meta.json")) == len(load_scene(tmp_path / "a#1")) == 150

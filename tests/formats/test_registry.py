@@ -19,7 +19,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from potr_cl import DataError, Scene, UsageError, cli, info
+from potr_cl import DataError, UsageError, cli, info
 from potr_cl.formats import cameras, load_cameras, load_scene, registry, save_scene, scene_writer, scenes
 from potr_cl.formats.declaration import CameraFormat, SceneFormat
 from potr_cl.formats.ladder import Ladder, Rung
@@ -41,14 +41,14 @@ def name(entry: Any) -> str:
 
 
 @pytest.mark.parametrize(("package", "table"), [(scenes, SCENE_FORMATS), (cameras, CAMERA_FORMATS)])
-def test_every_declared_format_is_in_its_table(package: Any, table: tuple[Any, ...]) -> None:
+def test_every_declared_format_is_in_its_table(package, table):
     names = [f"{package.__name__}.{each.name}" for each in pkgutil.iter_modules(package.__path__)]
     values = [each for module in names for each in vars(importlib.import_module(module)).values()]
     declared = {id(each): each for each in values if isinstance(each, (SceneFormat, CameraFormat))}
     assert declared == {id(entry): entry for entry in table}
 
 
-def test_no_two_formats_claim_one_suffix_without_a_recogniser() -> None:
+def test_no_two_formats_claim_one_suffix_without_a_recogniser():
     suffixes = Counter(suffix for entry in SCENE_FORMATS for suffix in entry.suffixes)
     assert set(suffixes.values()) == {1}
     for extension in {extension for entry in SCENE_FORMATS for extension in entry.extensions}:
@@ -56,7 +56,7 @@ def test_no_two_formats_claim_one_suffix_without_a_recogniser() -> None:
         assert sum(entry.recognises is None for entry in having_it) == 1, extension
 
 
-def test_declarations_are_complete() -> None:
+def test_declarations_are_complete():
     for entry in (*SCENE_FORMATS, *CAMERA_FORMATS):
         assert all(re.fullmatch(r"(\.[a-z0-9]+)+", suffix) for suffix in entry.suffixes), entry.name
         assert entry.suffixes or getattr(entry, "names", ()), entry.name
@@ -69,7 +69,7 @@ def test_declarations_are_complete() -> None:
         assert bool(each.json_mark) == (".json" in each.suffixes), each.name
 
 
-def test_formats_import_no_heavy_library() -> None:
+def test_formats_import_no_heavy_library():
     program = "import sys, potr_cl.formats; sys.exit(bool({'gsply', 'pycolmap', 'PIL'} & set(sys.modules)))"
     subprocess.run([sys.executable, "-c", program], check=True)
 
@@ -85,7 +85,7 @@ def test_formats_import_no_heavy_library() -> None:
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
     phases=[Phase.explicit, Phase.reuse, Phase.generate],  # a format that fails does so for nearly every scene
 )
-def test_every_format_reads_what_it_writes(entry, splats, degree, seed, tmp_path) -> None:
+def test_every_format_reads_what_it_writes(entry, splats, degree, seed, tmp_path):
     scene = random_scene(splats, degree, seed)
     for suffix in entry.suffixes:
         path = tmp_path / f"scene{suffix}"
@@ -102,12 +102,12 @@ def test_every_format_reads_what_it_writes(entry, splats, degree, seed, tmp_path
         assert np.quantile(np.abs(back.sh - scene.sh), 0.9) < 0.05
 
 
-def test_suffixes_in_capitals_and_after_points() -> None:
+def test_suffixes_in_capitals_and_after_points():
     for entry in WRITTEN:
         assert all(registry.written_format(Path(f"v1.2{suffix.upper()}")) is entry for suffix in entry.suffixes)
 
 
-def test_content_decides_between_formats_of_one_extension(data: Path, tmp_path: Path) -> None:
+def test_content_decides_between_formats_of_one_extension(data, tmp_path):
     plain, compressed = (
         next(entry for entry in SCENE_FORMATS if suffix in entry.suffixes) for suffix in (".ply", ".compressed.ply")
     )
@@ -119,7 +119,7 @@ def test_content_decides_between_formats_of_one_extension(data: Path, tmp_path: 
     assert registry.format_of(tmp_path / "missing.compressed.ply") is plain
 
 
-def test_unknown_suffixes(tmp_path: Path) -> None:
+def test_unknown_suffixes(tmp_path):
     for unknown in ("a.obj", "a", ".ply.d"):
         for call, formats, said in (
             (load_scene, SCENE_FORMATS, "unknown kind of scene, expected a"),
@@ -131,7 +131,7 @@ def test_unknown_suffixes(tmp_path: Path) -> None:
         assert not any(tmp_path.iterdir())
 
 
-def test_formats_that_are_not_written_say_what_to_do(tmp_path: Path) -> None:
+def test_formats_that_are_not_written_say_what_to_do(tmp_path):
     for entry in SCENE_FORMATS:
         if entry.save is None:
             with pytest.raises(UsageError, match=re.escape(entry.not_written)):
@@ -139,7 +139,7 @@ def test_formats_that_are_not_written_say_what_to_do(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [suffix for entry in SCENE_FORMATS for suffix in entry.suffixes])
-def test_a_file_that_is_gone_or_is_none(suffix: str, tmp_path: Path) -> None:
+def test_a_file_that_is_gone_or_is_none(suffix, tmp_path):
     """Also where it was there a moment ago, when its content told the format, or no file system takes its name."""
     for entry in SCENE_FORMATS:
         with pytest.raises(UsageError, match=r"cannot (open|read)"):
@@ -155,13 +155,13 @@ def test_a_file_that_is_gone_or_is_none(suffix: str, tmp_path: Path) -> None:
 # Cameras -------------------------------------------------------------------------------------------------------------
 
 
-def test_order_in_which_a_folder_is_searched(data: Path, tmp_path: Path) -> None:
+def test_order_in_which_a_folder_is_searched(data, tmp_path):
     """From the last place to the first: each new file wins over those that were there."""
 
-    def model(folder: Path, source: str) -> None:
+    def model(folder, source):
         shutil.copytree(data / source, folder, dirs_exist_ok=True)
 
-    def outer(folder: Path) -> None:
+    def outer(folder):
         model(folder, "plush_sparse_text")
         images = folder / "images.txt"
         images.write_text(images.read_text().replace("20240212", "outer"))
@@ -181,16 +181,14 @@ def test_order_in_which_a_folder_is_searched(data: Path, tmp_path: Path) -> None
 # What people see -----------------------------------------------------------------------------------------------------
 
 
-def test_a_format_is_one_line_of_the_table(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_format_is_one_line_of_the_table(tmp_path, monkeypatch, capsys):
     """Reading, writing, messages and help know a format as soon as the table does."""
     scene, ply, other = random_scene(3, 0), str(tmp_path / "a.ply"), str(tmp_path / "a.centres")
 
-    def save(path: Path, scene: Scene) -> None:
+    def save(path, scene):
         np.save(path.open("wb"), scene.means)
 
-    def load(path: Path, trust: bool = False) -> Scene:
+    def load(path, trust=False):
         return dataclasses.replace(scene, means=np.load(path))
 
     added = SceneFormat("Centres", (".centres",), "of this test", load, save)
@@ -206,7 +204,7 @@ def test_a_format_is_one_line_of_the_table(
     assert " ".join(capsys.readouterr().out.split()).count("or .centres") == 2
 
 
-def test_lists_for_people() -> None:
+def test_lists_for_people():
     assert [listed(list("abc")[:n]) for n in range(4)] == ["", "a", "a or b", "a, b or c"]
     assert listed(["a", "b"], "and") == "a and b"
 
@@ -217,7 +215,7 @@ def test_a_file_of_any_format_that_is_written_while_it_is_read(tmp_path, broken)
     path.write_bytes(bytes(64))
     os.utime(path, ns=(0, 0))
 
-    def read() -> None:
+    def read():
         with opened(path):
             path.write_bytes(bytes(65))
             if broken:

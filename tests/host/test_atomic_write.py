@@ -22,7 +22,7 @@ def _write_half_then_raise(target: Path, failure: BaseException) -> None:
         raise failure
 
 
-def test_writes_a_new_file_with_the_umask_and_replaces_it_with_its_permissions(tmp_path: Path) -> None:
+def test_writes_a_new_file_with_the_umask_and_replaces_it_with_its_permissions(tmp_path):
     target = tmp_path / ("x" * 255)  # as long as the file system allows
     old = os.umask(0o027)
     try:
@@ -45,7 +45,7 @@ def test_writes_a_new_file_with_the_umask_and_replaces_it_with_its_permissions(t
 
 
 @pytest.mark.parametrize("failure", [KeyboardInterrupt(), ValueError("x"), SystemExit(3)])
-def test_a_failing_block_leaves_everything_as_it_was(tmp_path: Path, failure: BaseException) -> None:
+def test_a_failing_block_leaves_everything_as_it_was(tmp_path, failure):
     target = tmp_path / "out.bin"
     target.write_bytes(b"old")
     with pytest.raises(type(failure)):
@@ -54,7 +54,7 @@ def test_a_failing_block_leaves_everything_as_it_was(tmp_path: Path, failure: Ba
     assert os.listdir(tmp_path) == ["out.bin"]
 
 
-def test_disk_full_is_one_clear_line(tmp_path: Path) -> None:
+def test_disk_full_is_one_clear_line(tmp_path):
     target = tmp_path / "out.bin"
     with pytest.raises(PotrError, match=r"cannot write '.*out\.bin': No space left on device") as caught:
         _write_half_then_raise(target, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
@@ -63,10 +63,10 @@ def test_disk_full_is_one_clear_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
-def test_disk_full_while_closing(tmp_path: Path) -> None:
+def test_disk_full_while_closing(tmp_path):
     """The buffered bytes meet the full disk only when the file is closed."""
 
-    def write() -> None:
+    def write():
         with replacing(tmp_path / "out.bin") as file:
             full = os.open("/dev/full", os.O_WRONLY)
             os.dup2(full, file.fileno())
@@ -78,7 +78,7 @@ def test_disk_full_while_closing(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == []
 
 
-def test_a_symbolic_link_is_followed(tmp_path: Path) -> None:
+def test_a_symbolic_link_is_followed(tmp_path):
     (tmp_path / "real.bin").write_bytes(b"old")
     (tmp_path / "link.bin").symlink_to("real.bin")
     with replacing(tmp_path / "link.bin") as file:
@@ -87,7 +87,7 @@ def test_a_symbolic_link_is_followed(tmp_path: Path) -> None:
     assert (tmp_path / "real.bin").read_bytes() == b"new"
 
 
-def test_refuses_what_is_no_file_before_the_work_and_leaves_no_trace(tmp_path: Path) -> None:
+def test_refuses_what_is_no_file_before_the_work_and_leaves_no_trace(tmp_path):
     os.mkfifo(tmp_path / "fifo")
     (tmp_path / "file").write_bytes(b"")
     before = tmp_path.stat().st_mtime_ns
@@ -110,7 +110,7 @@ def test_refuses_what_is_no_file_before_the_work_and_leaves_no_trace(tmp_path: P
     assert tmp_path.stat().st_mtime_ns == before
 
 
-def test_two_that_write_one_file_at_once(tmp_path: Path) -> None:
+def test_two_that_write_one_file_at_once(tmp_path):
     """Both are whole; the last one wins; nothing else is left."""
     target = tmp_path / "out.bin"
     with replacing(target) as first:
@@ -122,11 +122,11 @@ def test_two_that_write_one_file_at_once(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["out.bin"]
 
 
-def test_a_file_that_somebody_looks_at_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_that_somebody_looks_at_is_tried_again(tmp_path, monkeypatch):
     """On Windows a virus scanner or an indexer has a new file open for a moment."""
     replace, refusals = Path.replace, [PermissionError(13, "Access is denied")] * 2
 
-    def refused_at_first(path: Path, target: Path) -> Path:
+    def refused_at_first(path, target):
         if refusals:
             raise refusals.pop()
         return replace(path, target)
@@ -147,7 +147,7 @@ def test_a_file_that_somebody_looks_at_is_tried_again(tmp_path: Path, monkeypatc
 def test_no_file_is_tried_in_the_folder_for_temporary_files(tmp_path, monkeypatch):
     """A signal between the making of such a file and its removal would leave it behind."""
 
-    def tried() -> str:
+    def tried():
         raise AssertionError("a file was made for a trial")
 
     monkeypatch.setattr(tempfile, "tempdir", None)  # as in a new process
@@ -167,7 +167,7 @@ def test_a_folder_that_is_none_is_passed_over(tmp_path, monkeypatch):
 
 
 def test_no_folder_for_temporary_files_is_one_line(monkeypatch):
-    def full(*_args: object) -> None:
+    def full(*_args):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("os.mkdir", full)

@@ -18,7 +18,7 @@ def test_a_missing_extra_is_installed_from_where_the_package_came_from(monkeypat
     monkeypatch.setattr(importlib.metadata, "version", lambda _name: "1.0")
     assert install_command("view") == 'pip install "potr_cl[view]"'  # whatever index it is on, or none
 
-    def unknown(_name: str) -> str:
+    def unknown(_name):
         raise importlib.metadata.PackageNotFoundError
 
     monkeypatch.setattr(importlib.metadata, "version", unknown)

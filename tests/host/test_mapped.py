@@ -44,7 +44,7 @@ def test_an_array_lies_in_a_file_without_a_name(tmp_path, monkeypatch):
 
 @linux
 def test_only_large_arrays_and_only_where_memory_is_bounded():
-    def place(nbytes: int) -> bool:
+    def place(nbytes):
         return in_a_file(mapped.array((nbytes,), np.uint8, "bytes"))
 
     assert not place(10_000_000)
@@ -127,8 +127,8 @@ def full(monkeypatch):
         pytest.skip("the system takes no room beforehand")
     takes, calls = os.posix_fallocate, []
 
-    def make(files: int) -> list[int]:
-        def room(descriptor: int, offset: int, nbytes: int) -> None:
+    def make(files):
+        def room(descriptor, offset, nbytes):
             calls.append(nbytes)
             if len(calls) > files:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -64,7 +64,7 @@ def one_line(said):
     [(*each, "raised") for each in SIGNALS]
     + [(signal.SIGTERM, 143, "turned into another"), (signal.SIGTERM, 143, "swallowed"), (signal.SIGINT, 130, "twice")],
 )
-def test_nothing_is_left(tmp_path: Path, number: signal.Signals, code: int, how: str) -> None:
+def test_nothing_is_left(tmp_path, number, code, how):
     target = tmp_path / "out.bin"
     target.write_bytes(b"old")
     result = run(WRITING, number.name, target, 0.1 if how == "swallowed" else 30, how)
@@ -77,7 +77,7 @@ def test_nothing_is_left(tmp_path: Path, number: signal.Signals, code: int, how:
     assert target.read_bytes() == b"old"
 
 
-def test_what_is_ignored_stays_ignored(tmp_path: Path) -> None:
+def test_what_is_ignored_stays_ignored(tmp_path):
     """As nohup asks for."""
     program = "import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)\n" + WRITING
     result = run(program, "SIGHUP", tmp_path / "out", 1, "raised")
@@ -104,7 +104,7 @@ with process.unwinding(), replacing(sys.argv[1]) as file:
 """
 
 
-def test_the_first_interrupt_asks_and_the_work_goes_on(tmp_path: Path) -> None:
+def test_the_first_interrupt_asks_and_the_work_goes_on(tmp_path):
     result = run(ASKED, tmp_path / "out", "SIGINT")
     assert result.returncode == 0, result.stderr
     assert (tmp_path / "out").read_bytes() == b"2"
@@ -113,14 +113,14 @@ def test_the_first_interrupt_asks_and_the_work_goes_on(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("sent", "code"), [(("SIGINT", "SIGINT"), 130), (("SIGTERM",), 143), (("SIGHUP",), 129)])
-def test_a_second_interrupt_and_any_other_signal_end_it(tmp_path: Path, sent: tuple[str, ...], code: int) -> None:
+def test_a_second_interrupt_and_any_other_signal_end_it(tmp_path, sent, code):
     result = run(ASKED, tmp_path / "out", *sent)
     assert result.returncode == code, result.stderr
     assert "no file is left half written" in result.stderr
     assert not list(tmp_path.iterdir())
 
 
-def test_nobody_is_asked_after_the_work_or_in_a_program_that_has_its_own_way_with_signals(tmp_path: Path) -> None:
+def test_nobody_is_asked_after_the_work_or_in_a_program_that_has_its_own_way_with_signals(tmp_path):
     program = ASKED.replace("    file.write", "    os.kill(os.getpid(), signal.SIGINT)\n    file.write")
     result = run(program, tmp_path / "out")
     assert result.returncode == 130, result.stderr
@@ -149,13 +149,13 @@ runpy.run_module("potr_cl", run_name="__main__", alter_sys=True)
     ("number", "code", "module"),
     [(*SIGNALS[1], "potr_cl.cli"), (*SIGNALS[0], "argparse"), (*SIGNALS[0], "potr_cl.codec.decoder")],
 )
-def test_while_modules_are_imported(number: signal.Signals, code: int, module: str) -> None:
+def test_while_modules_are_imported(number, code, module):
     result = run(WHILE_IMPORTING, module, number.name, "info", "nothing.potr")
     assert result.returncode == code, result.stderr
     assert one_line(result.stderr)
 
 
-def test_a_converter_that_is_told_to_end(tmp_path: Path, data: Path) -> None:
+def test_a_converter_that_is_told_to_end(tmp_path, data):
     """At the moment when all of the file is written but its checksum."""
     program = (
         "import os, signal, sys; from potr_cl.host.process import end_cleanly_on_signals; end_cleanly_on_signals();"
@@ -172,7 +172,7 @@ def test_a_converter_that_is_told_to_end(tmp_path: Path, data: Path) -> None:
 
 
 @pytest.mark.parametrize("closed", [(1,), (0, 1, 2)])
-def test_closed_standard_files_are_not_written_to_by_accident(tmp_path: Path, closed: tuple[int, ...]) -> None:
+def test_closed_standard_files_are_not_written_to_by_accident(tmp_path, closed):
     program = (
         "import os, sys; from potr_cl.host.process import open_standard_files; open_standard_files();"
         "file = open(sys.argv[1], 'wb'); assert file.fileno() > 2; os.write(1, b'x'); os.write(2, b'y');"

@@ -7,9 +7,7 @@ import math
 import os
 import shutil
 import threading
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -25,14 +23,14 @@ SAID = r"was changed while it was read: wait until the program that writes it ha
 
 
 @pytest.fixture
-def written_while_read(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+def written_while_read(monkeypatch):
     """Has a byte of a file written once it has been opened, before each time that it is read or before the first."""
 
-    def prepare(path: Path, times: float = math.inf) -> None:
+    def prepare(path, times=math.inf):
         plainly, written = Path.open, []
 
         class Disturbed(io.BufferedReader):
-            def read(self, size: int | None = -1, /) -> bytes:
+            def read(self, size=-1, /):
                 if len(written) < times:
                     written.append(size)
                     with plainly(path, "r+b") as writer:
@@ -40,7 +38,7 @@ def written_while_read(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
                         writer.write(b" ")
                 return super().read(size)
 
-        def opened(self: Path, mode: str = "r", *args: Any, **keywords: Any) -> Any:
+        def opened(self, mode="r", *args, **keywords):
             if self != path or mode != "rb":
                 return plainly(self, mode, *args, **keywords)
             os.utime(path, ns=(0, 0))  # what is written now is of another time, however coarse the system's clock is
@@ -51,7 +49,7 @@ def written_while_read(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     return prepare
 
 
-def test_cameras(tmp_path: Path, written_while_read: Callable[..., None]) -> None:
+def test_cameras(tmp_path, written_while_read):
     path = cameras_json(tmp_path / "cameras.json")
     written_while_read(path)
     with pytest.raises(DataError, match=rf"cameras\.json' {SAID}$"):
@@ -68,9 +66,7 @@ def test_cameras(tmp_path: Path, written_while_read: Callable[..., None]) -> Non
         ("golden_bundles_degree3", math.inf, coded_scene),
     ],
 )
-def test_a_compressed_scene(
-    tmp_path: Path, data: Path, written_while_read: Callable[..., None], name: str, times: float, read: Any
-) -> None:
+def test_a_compressed_scene(tmp_path, data, written_while_read, name, times, read):
     path = tmp_path / "a.potr"
     shutil.copy(data / f"{name}.potr", path)
     written_while_read(path, times)
@@ -79,7 +75,7 @@ def test_a_compressed_scene(
 
 
 @pytest.mark.parametrize("how", ["replaced", "written"])
-def test_a_file_of_blocks_that_is_written_between_two_of_them(tmp_path: Path, data: Path, how: str) -> None:
+def test_a_file_of_blocks_that_is_written_between_two_of_them(tmp_path, data, how):
     """Another encode may end meanwhile, whose file takes this one's place."""
     path = tmp_path / "a.potr"
     shutil.copy(data / "golden_blocks.potr", path)
@@ -95,7 +91,7 @@ def test_a_file_of_blocks_that_is_written_between_two_of_them(tmp_path: Path, da
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes on this system")
-def test_a_pipe_is_not_said_to_change(tmp_path: Path) -> None:
+def test_a_pipe_is_not_said_to_change(tmp_path):
     path = tmp_path / "pipe"
     os.mkfifo(path)
     writer = threading.Thread(target=path.write_bytes, args=(bytes(1000),))

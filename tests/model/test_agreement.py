@@ -23,7 +23,7 @@ from tests.reference.scenes import ring_of_cameras
 
 
 @pytest.fixture(scope="module")
-def plush_views(data: Path) -> list[Camera]:
+def plush_views(data):
     return train_views(load_cameras(data / "plush_cameras.json"))
 
 

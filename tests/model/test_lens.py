@@ -49,7 +49,7 @@ LENSES = [pytest.param(lens_of(*each), id=each[0]) for each in MODELS]
 
 
 @pytest.mark.parametrize(("model", "params", "rest"), MODELS, ids=[each[0] for each in MODELS])
-def test_the_formulas_are_colmaps(model: str, params: tuple[float, ...], rest: dict[str, Any]) -> None:
+def test_the_formulas_are_colmaps(model, params, rest):
     pycolmap = pytest.importorskip("pycolmap")
     theirs = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=params)
     lens = lens_of(model, params, rest)
@@ -70,7 +70,7 @@ def around(width: int, height: int, inset: float) -> np.ndarray[Any, Any]:
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_a_view_covers_what_was_photographed_and_a_photograph_fills_another(lens: Lens) -> None:
+def test_a_view_covers_what_was_photographed_and_a_photograph_fills_another(lens):
     view, whole = lens.covering()
     columns, rows = around(lens.width, lens.height, 0)
     points, found = lens.undistorted((columns - lens.cx) / lens.fx, (rows - lens.cy) / lens.fy)
@@ -99,7 +99,7 @@ def test_a_view_covers_what_was_photographed_and_a_photograph_fills_another(lens
     assert view.width * view.height > 0.7 * lens.width * lens.height
 
 
-def test_a_field_of_more_than_half_the_world_is_cut_off() -> None:
+def test_a_field_of_more_than_half_the_world_is_cut_off():
     lens = Lens(1000, 1000, 290, 290, 500, 500, fisheye=True)  # 197 degrees from side to side
     view, whole = lens.covering()
     assert not whole
@@ -124,12 +124,12 @@ def test_a_field_of_more_than_half_the_world_is_cut_off() -> None:
         ({"tangential": (500.0, 0.0)}, "folds the picture over"),
     ],
 )
-def test_what_is_no_lens(changes: dict[str, Any], said: str) -> None:
+def test_what_is_no_lens(changes, said):
     with pytest.raises(DataError, match=said):
         Lens(**({"width": 640, "height": 480, "fx": 500, "fy": 500, "cx": 320, "cy": 240} | changes)).covering()
 
 
-def test_many_lenses_are_looked_at_together() -> None:
+def test_many_lenses_are_looked_at_together():
     """Each is found as it is alone, to the last digit, whatever is beside it."""
     lenses = [lens_of(*each) for each in MODELS]
     lenses += [replace(lens, fx=lens.fx + shift) for lens in lenses for shift in (0.5, 31)]
@@ -139,7 +139,7 @@ def test_many_lenses_are_looked_at_together() -> None:
     assert isinstance(found[-1], DataError)
 
 
-def test_only_views_with_a_lens_are_changed() -> None:
+def test_only_views_with_a_lens_are_changed():
     lens = Lens(WIDTH, HEIGHT, 500, 500, 320, 240, radial=(-0.1,))
     pose = {"rotation": np.eye(3), "translation": np.zeros(3)}
     plain = Camera("a", 64, 48, 50, 50, 32, 24, **pose)

@@ -21,24 +21,22 @@ def test_degrees_and_sizes():
 
 
 @pytest.mark.parametrize(
-    ("name", "array"),
+    ("name", "shape"),
     [
-        ("log_scales", np.zeros((7, 2), np.float32)),
-        ("quaternions", np.zeros((6, 4), np.float32)),
-        ("opacity_logits", np.zeros((7, 1), np.float32)),
-        ("sh", np.zeros((7, 5, 3), np.float32)),
-        ("sh", np.zeros((7, 16, 4), np.float32)),
+        ("log_scales", (7, 2)),
+        ("quaternions", (6, 4)),
+        ("opacity_logits", (7, 1)),
+        ("sh", (7, 5, 3)),
+        ("sh", (7, 16, 4)),
     ],
 )
-def test_arrays_that_do_not_belong_together(name, array):
-    with pytest.raises(DataError, match=name if array.shape != (7, 5, 3) else "coefficients"):
-        dataclasses.replace(random_scene(7), **{name: array})
+def test_arrays_that_do_not_belong_together(name, shape):
+    with pytest.raises(DataError, match=name if shape != (7, 5, 3) else "coefficients"):
+        dataclasses.replace(random_scene(7), **{name: np.zeros(shape, np.float32)})
 
 
 def test_activation():
-    scene = random_scene(3, 0)
-    logits = np.array([-200, 0, 200], np.float32)
-    scene = dataclasses.replace(scene, opacity_logits=logits)
+    scene = dataclasses.replace(random_scene(3, 0), opacity_logits=np.array([-200, 0, 200], np.float32))
     with np.errstate(all="raise", under="ignore"):
         assert np.allclose(scene.opacities, [0, 0.5, 1])
     assert np.allclose(scene.scales, np.exp(scene.log_scales))

@@ -92,7 +92,7 @@ def test_none_stands_in_matter():
     scene = together(BALL, clutter)
     free, guarded = (camera_centres(views_between(each, ORBIT, 12, 0.05)) for each in (BALL, scene))
 
-    def inside(centres: np.ndarray) -> int:
+    def inside(centres):
         return int((np.linalg.norm(centres[:, None] - posts, axis=2).min(axis=1) < 0.15).sum())
 
     assert inside(free) > 2
@@ -121,12 +121,10 @@ def test_wrong_numbers(each, spread):
 
 
 def test_half_of_the_given_views_get_one():
-    whole, half = views_between(BALL, ORBIT, 1), views_between(BALL, ORBIT, 0.5)
-    assert [camera.name for camera in half] == [camera.name for camera in whole[1::2]]
-    assert len(half) == 6
-    more = views_between(BALL, ORBIT, 1.5)
-    assert [camera.name for camera in more[:12]] == [camera.name for camera in whole]
-    assert len(more) == 18
+    whole, half, more = ([camera.name for camera in views_between(BALL, ORBIT, each)] for each in (1, 0.5, 1.5))
+    assert half == whole[1::2]
+    assert more[:12] == whole
+    assert (len(half), len(more)) == (6, 18)
 
 
 def test_parts_of_a_scene_are_shown_by_the_views_that_face_them():
@@ -158,8 +156,8 @@ def test_views_are_allowed_together_as_one_by_one():
 
 def test_threads_find_the_same_views():
     with thread_pool(3) as pool:
-        found = views_between(BALL, ORBIT, 4, 0.3, run=pool.map)
-    for one, other in zip(found, views_between(BALL, ORBIT, 4, 0.3), strict=True):
+        pair = views_between(BALL, ORBIT, 4, 0.3, run=pool.map), views_between(BALL, ORBIT, 4, 0.3)
+    for one, other in zip(*pair, strict=True):
         assert one.name == other.name
         assert np.array_equal(one.rotation, other.rotation)
         assert np.array_equal(one.translation, other.translation)

@@ -9,7 +9,7 @@ import itertools
 import json
 import shutil
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 import potr_cl
-from potr_cl import DataError, Scene, UsageError, cli
+from potr_cl import DataError, UsageError, cli
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import WriteError
 from potr_cl.formats import load_scene
@@ -86,12 +86,12 @@ def views(plush_excerpt_cameras):
 
 
 @pytest.fixture(scope="module")
-def files() -> list[bytes]:
+def files():
     return files_of(Sog())
 
 
 @pytest.fixture(scope="module")
-def folder(files, tmp_path_factory) -> tuple[Path, dict[str, Any]]:
+def folder(files, tmp_path_factory):
     path = tmp_path_factory.mktemp("city") / "lod-meta.json"
     return written(StreamedSog(lod_chunk_count=1), files, Told(), path)
 
@@ -103,7 +103,7 @@ def leaves_of(node: dict[str, Any]) -> list[dict[str, Any]]:
 def test_every_level_is_read_as_it_was_encoded_and_lies_within_the_bounds(files, folder):
     path, meta = folder
 
-    def check(node: dict[str, Any]) -> None:
+    def check(node):
         for child in node.get("children", []):
             assert all(np.array(child["bound"]["min"]) >= node["bound"]["min"])
             assert all(np.array(child["bound"]["max"]) <= node["bound"]["max"])
@@ -302,7 +302,7 @@ def test_options_and_the_place_are_checked_before_the_work(flag, data, tmp_path,
 
 
 @pytest.fixture(scope="module", params=[2, 3])
-def tiles(request: Any, tmp_path_factory: Any) -> tuple[list[Scene], Path]:
+def tiles(request, tmp_path_factory):
     """What the levels are read as, and the folder."""
     output = Tiles(lod_chunk_count=1, version=request.param)
     files, told = files_of(output.of_level()), SimpleNamespace(of_level=lambda level: level / 4)
@@ -319,7 +319,7 @@ def tiles_of(path: Path) -> Iterator[tuple[dict[str, Any], dict[str, Any] | None
         tiles += [(child, tile) for child in tile.get("children", [])]
 
 
-def test_tiles_hold_every_level_as_it_was_encoded(tiles: tuple[list[Scene], Path]) -> None:
+def test_tiles_hold_every_level_as_it_was_encoded(tiles):
     levels, path = tiles
     found: list[set[bytes]] = [set() for _ in COUNTS]
     counts = [0] * len(COUNTS)
@@ -334,16 +334,14 @@ def test_tiles_hold_every_level_as_it_was_encoded(tiles: tuple[list[Scene], Path
     assert bytes_of_scene(path) == sum(file.stat().st_size for file in path.parent.rglob("*") if file.is_file())
 
 
-def test_a_folder_is_replaced_whole_or_not_at_all(
-    tiles: tuple[list[Scene], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_is_replaced_whole_or_not_at_all(tiles, tmp_path, monkeypatch):
     _, path = tiles
     shutil.copytree(path.parent, tmp_path / "city")
     there = {file: file.read_bytes() for file in (tmp_path / "city").rglob("*") if file.is_file()}
     contents = {str(file.relative_to(tmp_path / "city")): b"other" for file in there}
     left, write = [2], Path.write_bytes
 
-    def full(self: Path, data: bytes) -> int:
+    def full(self, data):
         left[0] -= 1
         if left[0] < 0:
             raise OSError(errno.ENOSPC, "No space left on device")
@@ -355,7 +353,7 @@ def test_a_folder_is_replaced_whole_or_not_at_all(
     assert {file: file.read_bytes() for file in (tmp_path / "city").rglob("*") if file.is_file()} == there
 
 
-def test_many_tiles_that_claim_much(tmp_path: Path) -> None:
+def test_many_tiles_that_claim_much(tmp_path):
     """Each might hold so many splats by itself."""
     scene = random_scene(1, 0).subset(np.zeros(40_000, np.int64))
     asked = Request(HyperParameters.from_quality(0.5, "best"))
@@ -377,7 +375,7 @@ def test_many_tiles_that_claim_much(tmp_path: Path) -> None:
     assert len(load_scene(tmp_path, trust=True)) == 80_000
 
 
-def test_finer_tiles_replace_coarser_ones_and_boxes_hold_the_ellipsoids(tiles: tuple[list[Scene], Path]) -> None:
+def test_finer_tiles_replace_coarser_ones_and_boxes_hold_the_ellipsoids(tiles):
     """In tiles z is up where y is in glTF, whose x, y, z are x, -z, y of tiles."""
     _, path = tiles
     description = json.loads(path.read_text())
@@ -420,9 +418,7 @@ def test_finer_tiles_replace_coarser_ones_and_boxes_hold_the_ellipsoids(tiles: t
         (lambda m: m["root"]["children"][0].update(transform=[2] * 16), "a place of their own"),
     ],
 )
-def test_bad_tilesets(
-    change: Callable[[Any], Any], message: str, tiles: tuple[list[Scene], Path], tmp_path: Path
-) -> None:
+def test_bad_tilesets(change, message, tiles, tmp_path):
     description = json.loads(tiles[1].read_text())
     change(description)
     (tmp_path / "tileset.json").write_text(json.dumps(description))
@@ -430,7 +426,7 @@ def test_bad_tilesets(
         load_scene(tmp_path)
 
 
-def test_the_command_writes_tiles(data: Path, tmp_path: Path, capsys: Any) -> None:
+def test_the_command_writes_tiles(data, tmp_path, capsys):
     path, words = tmp_path / "city" / "tileset.json", ["encode", f"{data}/plush_excerpt.ply", "-o"]
     choices = f"--cameras {data}/plush_excerpt_cameras.json --levels 2 --lod-chunk-count 1 --iterations 2 --refit 2"
     assert cli.main([*words, str(path), *choices.split(), "--views-between", "0", "--no-quality", "--json"]) == 0

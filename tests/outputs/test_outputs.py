@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import logging
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,13 +17,12 @@ from potr_cl.formats import load_scene
 from potr_cl.formats.scenes import sog
 from potr_cl.model.camera import test_views as held_out
 from potr_cl.model.camera import train_views
-from potr_cl.model.scene import MIP_SPLATTING_LOW_PASS, Scene
+from potr_cl.model.scene import MIP_SPLATTING_LOW_PASS
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import Output, Request
 from potr_cl.outputs.potr import Page, Potr
 from potr_cl.outputs.registry import OUTPUTS, output_of, output_of_suffix
 from potr_cl.outputs.spz import Spz
-from potr_cl.pipeline.encoded import Encoded
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.refitting.colour_refit import ColourRefit
@@ -50,10 +48,10 @@ def device():
 
 
 @pytest.fixture(scope="module")
-def encoded_to(plush_excerpt, plush_excerpt_cameras, device) -> Callable[..., Encoded]:
+def encoded_to(plush_excerpt, plush_excerpt_cameras, device):
     """The excerpt, or another scene, encoded to a kind of output."""
 
-    def encoded(output: Output, scene: Scene = plush_excerpt, **changes) -> Encoded:
+    def encoded(output, scene=plush_excerpt, **changes):
         options = EncodeOptions(output=output).changed(**changes)
         return potr_cl.encode(scene, plush_excerpt_cameras, options, device=device)
 
@@ -61,13 +59,13 @@ def encoded_to(plush_excerpt, plush_excerpt_cameras, device) -> Callable[..., En
 
 
 @pytest.fixture(scope="module")
-def encodes(encoded_to) -> Callable[[Output], Encoded]:
+def encodes(encoded_to):
     """The same of the excerpt, as it comes, once to each."""
     return functools.cache(encoded_to)
 
 
 @pytest.fixture(scope="module")
-def psnr(plush_excerpt, plush_excerpt_cameras, device) -> Callable[[Scene], float]:
+def psnr(plush_excerpt, plush_excerpt_cameras, device):
     """How close a scene comes to the excerpt, dB."""
     return lambda scene: judging.psnr(device, plush_excerpt, scene, held_out(plush_excerpt_cameras))
 
@@ -211,7 +209,7 @@ def test_highlights_of_a_few_splats_keep_a_degree_unless_a_target_asks_for_its_b
     # About a sixth of what the bytes of degree 3 are worth, in one splat of fifty.
     bright[::50, 9:] = 2 * request.parameters.delta_mse_max
 
-    def degree(output, worth) -> int:
+    def degree(output, worth):
         fixed = output.fix_ac(rounded, sh, worth, request)[1]
         return next(degree for degree in (3, 2, 1, 0) if degree == 0 or fixed[:, degree**2 : (degree + 1) ** 2].any())
 

@@ -24,7 +24,7 @@ FAST = {"prune": False, "refit": False, "compact": False}
 
 
 @pytest.fixture(scope="module")
-def encoded(plush_excerpt, plush_excerpt_cameras, tmp_path_factory) -> Path:
+def encoded(plush_excerpt, plush_excerpt_cameras, tmp_path_factory):
     path = tmp_path_factory.mktemp("page") / "scene.html"
     cameras = plush_excerpt_cameras
     potr_cl.encode(plush_excerpt, cameras, EncodeOptions(output=Page()).changed(prune=False)).save(path)

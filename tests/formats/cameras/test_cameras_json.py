@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -12,7 +10,7 @@ from tests.cases.cameras import pixel, refused, view, write_image, write_json
 from tests.cases.own_warnings import warnings_are_errors
 
 
-def test_cameras_json_is_camera_to_world(tmp_path: Path) -> None:
+def test_cameras_json_is_camera_to_world(tmp_path):
     """The columns of ``rotation`` are the camera's axes: this camera looks along +x, its right is -z."""
     (camera,) = load_cameras(write_json(tmp_path / "cameras.json", [view()]))
     np.testing.assert_allclose(camera.centre, [1, 2, -5])
@@ -22,7 +20,7 @@ def test_cameras_json_is_camera_to_world(tmp_path: Path) -> None:
     assert pixel(camera, [11, 3, -5]) == pytest.approx((20, 21))
 
 
-def test_cameras_json_without_split_are_training_views_with_ground_truth_beside_it(tmp_path: Path) -> None:
+def test_cameras_json_without_split_are_training_views_with_ground_truth_beside_it(tmp_path):
     write_image(tmp_path / "images" / "a.JPG")
     views = [view(img_name=name) for name in ("a", "frame.0001", "missing.png")]
     cameras = load_cameras(write_json(tmp_path / "cameras.json", views))
@@ -33,7 +31,7 @@ def test_cameras_json_without_split_are_training_views_with_ground_truth_beside_
     refused(write_json(tmp_path / "cameras.json", views), "view 'a': 'split' is missing")
 
 
-def test_cameras_json_with_equal_names(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_cameras_json_with_equal_names(tmp_path, caplog):
     """The original calls the r_0 of a synthetic scene's train folder and that of its test folder both r_0."""
     views = [view(img_name=name) for name in ("r_0", "r_1", "r_0")]
     cameras = load_cameras(write_json(tmp_path / "cameras.json", views))

@@ -6,7 +6,6 @@ import os
 import shutil
 import struct
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,20 +17,20 @@ from tests.cases.cameras import refused, write_image
 
 
 @pytest.fixture
-def model(data: Path, tmp_path: Path) -> Path:
+def model(data, tmp_path):
     return Path(shutil.copytree(data / "plush_sparse_binary", tmp_path / "sparse" / "0"))
 
 
 @pytest.fixture
-def text_model(data: Path, tmp_path: Path) -> Path:
+def text_model(data, tmp_path):
     return Path(shutil.copytree(data / "plush_sparse_text", tmp_path / "text"))
 
 
 @pytest.fixture
-def of_camera(text_model: Path) -> Callable[[str], Path]:
+def of_camera(text_model):
     """The text model with another line for its camera."""
 
-    def write(line: str) -> Path:
+    def write(line):
         (text_model / "cameras.txt").write_text(line)
         return text_model
 
@@ -43,7 +42,7 @@ CAMERA = "1 PINHOLE 990 742 800 800 495 371\n"
 
 
 @pytest.mark.parametrize("write", ["write_binary", "write_text"])
-def test_a_model_with_points_rigs_and_several_cameras(write: str, tmp_path: Path) -> None:
+def test_a_model_with_points_rigs_and_several_cameras(write, tmp_path):
     """Against what pycolmap itself reads from the whole model."""
     pycolmap = pytest.importorskip("pycolmap")
     options = pycolmap.SyntheticDatasetOptions()
@@ -66,13 +65,13 @@ def test_a_model_with_points_rigs_and_several_cameras(write: str, tmp_path: Path
     assert [i for i, split in enumerate(in_order) if split == "test"] == list(range(0, len(cameras), 8))
 
 
-def test_ground_truth_of_a_model(model: Path, tmp_path: Path) -> None:
+def test_ground_truth_of_a_model(model, tmp_path):
     assert load_cameras(model)[0].image_path is None
     image = write_image(tmp_path / "images" / "20240212_003919.jpg")
     assert [c.image_path for c in load_cameras(tmp_path)] == [image, *[None] * 16]
 
 
-def test_names_and_numbers_of_images(text_model: Path) -> None:
+def test_names_and_numbers_of_images(text_model):
     """Folders in names tell views apart, names may have blanks, and no two images have the same name or number."""
     images = text_model / "images.txt"
     original = images.read_text()
@@ -87,7 +86,7 @@ def test_names_and_numbers_of_images(text_model: Path) -> None:
     refused(text_model, "two images have the same number")
 
 
-def test_camera_models_that_are_not_read(model: Path) -> None:
+def test_camera_models_that_are_not_read(model):
     data = (model / "cameras.bin").read_bytes()
     for number, name in ((7, "FOV"), (11, "RAD_TAN_THIN_PRISM_FISHEYE"), (99, "number 99"), (-1, "number -1")):
         (model / "cameras.bin").write_bytes(data[:12] + struct.pack("<i", number) + data[16:])
@@ -107,9 +106,7 @@ DISTORTED = {
 
 
 @pytest.mark.parametrize("name", DISTORTED)
-def test_distorted_cameras_cover_the_same_field(
-    model: Path, of_camera: Callable[[str], Path], caplog: pytest.LogCaptureFixture, name: str
-) -> None:
+def test_distorted_cameras_cover_the_same_field(model, of_camera, caplog, name):
     number, params = DISTORTED[name]
     header = struct.pack("<QIiQQ", 1, 1, number, 990, 742)
     (model / "cameras.bin").write_bytes(header + struct.pack(f"<{len(params)}d", *params))
@@ -130,7 +127,7 @@ def test_distorted_cameras_cover_the_same_field(
     assert {camera.lens for camera in load_cameras(text)} == {lens}
 
 
-def test_a_lens_that_bends_nothing_is_none(of_camera: Callable[[str], Path]) -> None:
+def test_a_lens_that_bends_nothing_is_none(of_camera):
     (camera, *_) = load_cameras(of_camera("1 OPENCV 990 742 800 810 495 371 0 0 0 0\n"))
     assert camera.lens is None
     assert (camera.width, camera.height, camera.fx, camera.fy) == (990, 742, 800, 810)
@@ -164,11 +161,11 @@ NO_NUMBER = "is not a (whole )?number|is truncated"
         *((f"1 PINHOLE {field} 742 800 800 495 371\n", NO_NUMBER) for field in ("1_0", "0x10", "١", "1e", "1 0 0")),
     ],
 )
-def test_damaged_text_models(of_camera: Callable[[str], Path], line: str, message: str) -> None:
+def test_damaged_text_models(of_camera, line, message):
     refused(of_camera(line), message)
 
 
-def test_every_truncation_of_a_binary_model(model: Path) -> None:
+def test_every_truncation_of_a_binary_model(model):
     """The library itself would take the missing bytes from whatever is in memory, or never return."""
     for name in ("cameras.bin", "images.bin"):
         data = (model / name).read_bytes()
@@ -180,7 +177,7 @@ def test_every_truncation_of_a_binary_model(model: Path) -> None:
     assert len(load_cameras(model)) == 17
 
 
-def test_unusable_values_in_a_binary_model(model: Path) -> None:
+def test_unusable_values_in_a_binary_model(model):
     data = (model / "images.bin").read_bytes()
     for at, value, message in [
         (12, struct.pack("<d", np.nan), "view '20240212_003919': its rotation is not a unit quaternion"),
@@ -199,9 +196,7 @@ def test_unusable_values_in_a_binary_model(model: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["plush_sparse_binary", "plush_sparse_text"])
-def test_poses_have_the_digits_of_the_library_without_it(
-    name: str, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_poses_have_the_digits_of_the_library_without_it(name, data, tmp_path, monkeypatch):
     """The library would parse again what has been checked, and wants it in a folder, which a killed run would leave."""
     pycolmap = pytest.importorskip("pycolmap")
     shutil.copytree(data / name, tmp_path, dirs_exist_ok=True)

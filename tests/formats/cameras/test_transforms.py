@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import io
 import os
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +17,7 @@ from tests.cases.images import png_of
 from tests.cases.own_warnings import warnings_are_errors
 
 
-def test_transforms_have_opengl_axes(tmp_path: Path) -> None:
+def test_transforms_have_opengl_axes(tmp_path):
     """The camera looks along -z, its up is +y."""
     (camera,) = load_cameras(write_json(tmp_path / "transforms.json", nerfstudio(["a.png"])))
     assert camera.name == "a"
@@ -28,7 +26,7 @@ def test_transforms_have_opengl_axes(tmp_path: Path) -> None:
     assert pixel(camera, [0, 1, -10]) == pytest.approx((21, 8))
 
 
-def test_blender_intrinsics_come_from_the_angle_and_the_image(tmp_path: Path) -> None:
+def test_blender_intrinsics_come_from_the_angle_and_the_image(tmp_path):
     write_image(tmp_path / "train" / "r_0.png", 80, 60)
     frames = [{"file_path": "./train/r_0", "transform_matrix": IDENTITY}]
     content = {"camera_angle_x": 2 * np.arctan(0.5), "frames": frames}
@@ -44,7 +42,7 @@ def test_blender_intrinsics_come_from_the_angle_and_the_image(tmp_path: Path) ->
     assert (camera.width, camera.height, camera.fx) == pytest.approx((80, 60, 80))
 
 
-def test_equal_names_in_the_train_and_test_folder(tmp_path: Path) -> None:
+def test_equal_names_in_the_train_and_test_folder(tmp_path):
     for split in ("train", "test"):
         frames = [{"file_path": f"./{split}/r_{i}", "transform_matrix": IDENTITY} for i in range(2)]
         write_json(tmp_path / f"transforms_{split}.json", {"camera_angle_x": 1, "w": 8, "h": 8, "frames": frames})
@@ -53,7 +51,7 @@ def test_equal_names_in_the_train_and_test_folder(tmp_path: Path) -> None:
     assert [camera.split for camera in cameras] == ["train", "train", "test", "test"]
 
 
-def test_a_frame_has_its_own_intrinsics_and_lens(tmp_path: Path) -> None:
+def test_a_frame_has_its_own_intrinsics_and_lens(tmp_path):
     content = nerfstudio(["a.png", "b.png", "c.png"])
     content["frames"][0] |= {"k1": -0.05}
     content["frames"][1] |= {"fl_x": 70, "w": 44, "cx": 23.5}
@@ -64,7 +62,7 @@ def test_a_frame_has_its_own_intrinsics_and_lens(tmp_path: Path) -> None:
     assert (b.lens, c.lens) == (None, None)
 
 
-def test_each_eighth_image_by_name_is_a_test_view(tmp_path: Path) -> None:
+def test_each_eighth_image_by_name_is_a_test_view(tmp_path):
     files = [f"{i:02}.jpg" for i in range(17)]
     cameras = load_cameras(write_json(tmp_path / "transforms.json", nerfstudio(files[::-1])))
     assert sorted(c.name for c in cameras if c.split == "test") == ["00", "08", "16"]
@@ -79,18 +77,18 @@ def test_each_eighth_image_by_name_is_a_test_view(tmp_path: Path) -> None:
         ({"train_filenames": ["b", "c", "d"]}, "a"),
     ],
 )
-def test_splits_that_the_file_lists(lists: dict[str, list[str]], test: str, tmp_path: Path) -> None:
+def test_splits_that_the_file_lists(lists, test, tmp_path):
     lists = {key: [f"images/{name}.png" for name in names] for key, names in lists.items()}
     content = nerfstudio([f"{name}.png" for name in "abcd"], **lists)
     cameras = load_cameras(write_json(tmp_path / "transforms.json", content))
     assert [c.name for c in cameras if c.split == "test"] == list(test)
 
 
-def test_views_are_moved_to_nerfstudios_training_space(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_views_are_moved_to_nerfstudios_training_space(tmp_path, caplog):
     """Nerfstudio orients, centres and scales what the file holds, and notes that step after the applied one."""
     rng = np.random.default_rng(5)
 
-    def rigid() -> np.ndarray:
+    def rigid():
         q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = q * np.linalg.det(q), rng.normal(size=3)
@@ -128,14 +126,14 @@ def test_views_are_moved_to_nerfstudios_training_space(tmp_path: Path, caplog: p
         ({"camera_model": "SIMPLE_RADIAL", "k1": 0.02}, {"radial": (0.02,)}),
     ],
 )
-def test_lenses(changes: dict[str, Any], terms: dict[str, Any], tmp_path: Path) -> None:
+def test_lenses(changes, terms, tmp_path):
     cameras = load_cameras(write_json(tmp_path / "transforms.json", nerfstudio(["a.png", "b.png"], **changes)))
     expected = Lens(40, 30, 50, 60, 21, 14, **terms)
     assert [camera.lens for camera in cameras] == [expected] * 2
     assert (cameras[0].width, cameras[0].height) == expected.covering()[0][:2]
 
 
-def test_a_lens_for_each_frame_costs_no_more_calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lens_for_each_frame_costs_no_more_calls(tmp_path, monkeypatch):
     """They are looked at together: a file of hostile lenses takes as long as its size lets expect."""
     calls: list[int] = []
     bent = lens._Terms.bent
@@ -203,7 +201,7 @@ def test_bad_transforms(changes, message, tmp_path):
         ({"transform": IDENTITY, "scale": float("nan")}, "'scale' is nan, not a finite number"),
     ],
 )
-def test_bad_dataparser_transforms(content: Any, message: str, tmp_path: Path) -> None:
+def test_bad_dataparser_transforms(content, message, tmp_path):
     write_json(tmp_path / "dataparser_transforms.json", content)
     refused(write_json(tmp_path / "transforms.json", nerfstudio(["a.png"])), message)
 
@@ -227,7 +225,7 @@ def bmp() -> bytes:
     ],
     ids=lambda value: "" if isinstance(value, bytes) else value,
 )
-def test_sizes_that_only_the_image_tells_have_limits(tmp_path: Path, image: bytes, message: str) -> None:
+def test_sizes_that_only_the_image_tells_have_limits(tmp_path, image, message):
     content = nerfstudio(["r_0.png"])
     del content["w"], content["h"]
     (tmp_path / "images").mkdir()

@@ -84,25 +84,23 @@ def test_comments_of_other_tools(tmp_path, comments, expected):
         assert back == of_kind(scene, *expected)
 
 
-@pytest.mark.parametrize("keyword", [True, False])
-def test_a_keyword_overrules_the_file_and_comments_hide_no_damage(tmp_path, keyword):
+def test_a_keyword_overrules_the_file_and_comments_hide_no_damage(tmp_path):
     for line in (b"comment SplatRenderMode: mip", b"comment"):
         path = with_lines(tmp_path / "a.ply", random_scene(5, 1), line)
-        assert load_scene(path, antialiased=keyword).antialiased is keyword
-        assert load_scene(path, antialiased=None).antialiased is (line != b"comment")
+        found = [load_scene(path, antialiased=keyword).antialiased for keyword in (True, False, None)]
+        assert found == [True, False, line != b"comment"]
         path.write_bytes(path.read_bytes()[:-1])
         with pytest.raises(DataError, match="truncated"):
             load_scene(path)
 
 
+# ------------------------------------------------------------------------------------------ PLY: filter_3D
+
+
 def test_a_classic_scene_is_written_without_a_mark(tmp_path):
     ply.save(tmp_path / "a.ply", random_scene(3, 0))
     head = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")[0]
-    assert b"comment" not in head
-    assert b"filter" not in head
-
-
-# ------------------------------------------------------------------------------------------ PLY: filter_3D
+    assert not any(mark in head for mark in (b"comment", b"filter"))
 
 
 def mip_splatting_ply(path, scene, filters, dtype="float"):

@@ -30,7 +30,7 @@ def written(path: Path, parts: Attributes, node: dict[str, Any] | None = None) -
 
 
 @pytest.mark.parametrize("degree", range(4))
-def test_floats(degree: int, tmp_path: Path) -> None:
+def test_floats(degree, tmp_path):
     scene = random_scene(300, degree)
     back = load_scene(written(tmp_path / "a.glb", attributes(scene)))
     np.testing.assert_array_equal(back.means, scene.means)
@@ -41,7 +41,7 @@ def test_floats(degree: int, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("uri", [None, "parts/a.bin", "a%20b.bin"])
-def test_buffers_of_a_gltf(uri: str | None, tmp_path: Path) -> None:
+def test_buffers_of_a_gltf(uri, tmp_path):
     description, content = described(attributes(random_scene(20, 1)))
     (tmp_path / "parts").mkdir()
     (tmp_path / (uri or "unused").replace("%20", " ")).write_bytes(content)
@@ -49,7 +49,7 @@ def test_buffers_of_a_gltf(uri: str | None, tmp_path: Path) -> None:
     np.testing.assert_array_equal(load_scene(tmp_path / "a.gltf").sh, random_scene(20, 1).sh)
 
 
-def test_integers(tmp_path: Path) -> None:
+def test_integers(tmp_path):
     """As the specification allows: rotations in signed integers, scales and opacities in unsigned ones."""
     rng = np.random.default_rng(0)
     parts = attributes(random_scene(50, 0))
@@ -68,7 +68,7 @@ def test_integers(tmp_path: Path) -> None:
         np.testing.assert_allclose(scene.opacities, opacity[:, 0] / 255, atol=1e-6)
 
 
-def test_odd_values(tmp_path: Path) -> None:
+def test_odd_values(tmp_path):
     """Flat and opaque splats are kept, values that are none dropped, logarithms and large opacities refused."""
     parts = attributes(random_scene(10, 0))
     position, scale, opacity = (parts[name][0] for name in ("POSITION", f"{PREFIX}SCALE", f"{PREFIX}OPACITY"))
@@ -111,7 +111,7 @@ def matrix_of(node: dict[str, Any]) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", NODES)
-def test_transforms_of_nodes(name: str, tmp_path: Path) -> None:
+def test_transforms_of_nodes(name, tmp_path):
     scene, matrix = random_scene(100, 3), matrix_of(NODES[name])
     back = load_scene(written(tmp_path / "a.glb", attributes(scene), NODES[name]))
     linear = matrix[:3, :3]
@@ -126,7 +126,7 @@ def test_transforms_of_nodes(name: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(after, before, atol=1e-5)
 
 
-def test_nodes_below_nodes_and_several_meshes(tmp_path: Path) -> None:
+def test_nodes_below_nodes_and_several_meshes(tmp_path):
     description, content = described(attributes(random_scene(10, 1)))
     description["nodes"] = [
         {"children": [1, 2], "translation": [10, 0, 0]},
@@ -217,12 +217,12 @@ def names_of(description: dict[str, Any]) -> dict[str, int]:
         (lambda d: d.update(scenes=[5]), "not an object"),
     ],
 )
-def test_what_is_refused(change: Any, message: str, tmp_path: Path) -> None:
+def test_what_is_refused(change, message, tmp_path):
     refused(tmp_path / "a.glb", *described(attributes(random_scene(10, 1))), change, message)
 
 
 @pytest.mark.parametrize("degree", range(4))
-def test_splats_packed_as_spz(degree: int, tmp_path: Path) -> None:
+def test_splats_packed_as_spz(degree, tmp_path):
     scene = random_scene(300, degree)
     for suffix in ("glb", "spz"):
         save_scene(tmp_path / f"a.{suffix}", scene)
@@ -254,13 +254,13 @@ def test_splats_packed_as_spz(degree: int, tmp_path: Path) -> None:
         (lambda d: d["accessors"][0].update(count=31), "not hold as many splats as POSITION"),
     ],
 )
-def test_damaged_spz_in_it(change: Any, message: str, tmp_path: Path) -> None:
+def test_damaged_spz_in_it(change, message, tmp_path):
     save_scene(tmp_path / "a.glb", random_scene(30, 1))
     refused(tmp_path / "a.glb", *opened(tmp_path / "a.glb"), change, message)
 
 
 @pytest.mark.parametrize("size", [0, 3, 4, 11, 19, 20, 30, 500, -1])
-def test_truncated_files(size: int, tmp_path: Path) -> None:
+def test_truncated_files(size, tmp_path):
     data = glb(*described(attributes(random_scene(10, 1))))
     size %= len(data)
     for content in (data[:size], struct.pack("<4sII", b"glTF", 2, size)[:size] + data[12:size]):
@@ -279,9 +279,7 @@ def test_truncated_files(size: int, tmp_path: Path) -> None:
         ("data:;base64,%%%", DataError, "base64"),
     ],
 )
-def test_buffers_that_are_outside_of_the_folder_or_not_there(
-    uri: str, kind: type[Exception], message: str, tmp_path: Path
-) -> None:
+def test_buffers_that_are_outside_of_the_folder_or_not_there(uri, kind, message, tmp_path):
     description, content = described(attributes(random_scene(10, 0)))
     (tmp_path / "a.bin").write_bytes(content)
     (tmp_path / "scene").mkdir()
@@ -290,7 +288,7 @@ def test_buffers_that_are_outside_of_the_folder_or_not_there(
         load_scene(tmp_path / "scene" / "a.gltf")
 
 
-def test_one_mesh_in_countless_nodes(tmp_path: Path) -> None:
+def test_one_mesh_in_countless_nodes(tmp_path):
     """Its splats would be as many as the file has bytes, times a thousand."""
     description, content = described(attributes(random_scene(500, 0)))
     description["nodes"] = [{"mesh": 0}] * 800
@@ -301,7 +299,7 @@ def test_one_mesh_in_countless_nodes(tmp_path: Path) -> None:
     assert len(load_scene(tmp_path / "a.glb", trust=True)) == 400_000 > FREE_SPLATS
 
 
-def test_other_parts_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_other_parts_are_left_out(tmp_path, caplog):
     description, content = described(attributes(random_scene(10, 0)))
     description["meshes"][0]["primitives"].append({"attributes": {"POSITION": 0}})
     kind_of(description)["colorSpace"] = "lin_rec709_display"
@@ -311,7 +309,7 @@ def test_other_parts_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixtu
     assert "linear colours" in caplog.text
 
 
-def test_deep_descriptions(tmp_path: Path) -> None:
+def test_deep_descriptions(tmp_path):
     for text in (b"[" * 100_000, b'{"asset": ' * 50_000, b"\xff\xfe", b"null", json.dumps({"asset": 3}).encode()):
         (tmp_path / "a.gltf").write_bytes(text)
         with pytest.raises(DataError):

@@ -104,7 +104,7 @@ WRITERS = {
 
 
 @pytest.mark.parametrize("writer", WRITERS)
-def test_reads_what_programs_write(writer: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_reads_what_programs_write(writer, tmp_path, caplog):
     scene = random_scene(700, degree=3, seed=1)
     assert ply.load(write(tmp_path / "a.ply", scene, **WRITERS[writer])) == scene
     assert not caplog.records  # nothing was lost, so nothing is said
@@ -119,7 +119,7 @@ def test_every_degree_in_every_encoding(form, tmp_path):
 
 @given(order=st.permutations([*XYZ, *NORMALS, *DC, "opacity", *SCALE, *ROT, *(f"f_rest_{i}" for i in range(9))]))
 @settings(max_examples=15, deadline=None)
-def test_any_order_of_properties(order: list[str], tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_any_order_of_properties(order, tmp_path_factory):
     scene = random_scene(20, degree=1)
     assert ply.load(write(tmp_path_factory.mktemp("order") / "a.ply", scene, order)) == scene
 
@@ -180,7 +180,7 @@ def test_no_splat_left(tmp_path):
 
 
 @pytest.mark.parametrize(("degree", "planar"), [(0, False), (1, True), (2, False), (3, False), (3, True)])
-def test_saves_the_original_layout(degree: int, planar: bool, tmp_path: Path) -> None:
+def test_saves_the_original_layout(degree, planar, tmp_path):
     scene = random_scene(9000, degree)
     expected = write(tmp_path / "expected.ply", scene).read_bytes()
     if planar:
@@ -190,12 +190,12 @@ def test_saves_the_original_layout(degree: int, planar: bool, tmp_path: Path) ->
     assert (tmp_path / "a.ply").read_bytes() == expected
 
 
-def test_real_scene_comes_back_byte_by_byte(plush: Path, tmp_path: Path) -> None:
+def test_real_scene_comes_back_byte_by_byte(plush, tmp_path):
     ply.save(tmp_path / "a.ply", load_scene(plush / "point_cloud.ply"))
     assert (tmp_path / "a.ply").read_bytes() == (plush / "point_cloud.ply").read_bytes()
 
 
-def test_a_failing_save_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failing_save_leaves_the_old_file(tmp_path, monkeypatch):
     (tmp_path / "a.ply").write_bytes(b"old")
     scene = random_scene(10)
     monkeypatch.setattr(Scene, "__len__", lambda self: 11)  # a scene that lies makes the writing fail half-way
@@ -210,7 +210,7 @@ def test_a_failing_save_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.
 # Bad input ----------------------------------------------------------------------------------------------------------
 
 
-def test_paths_that_cannot_be_read(tmp_path: Path) -> None:
+def test_paths_that_cannot_be_read(tmp_path):
     (tmp_path / "locked.ply").write_bytes(b"ply\n")
     (tmp_path / "locked.ply").chmod(0)
     paths = [(tmp_path / "missing.ply", r"'.*missing\.ply': No such file"), (tmp_path, "is a directory"), ("\0", "")]
@@ -245,14 +245,14 @@ def test_truncated(form, tmp_path):
 
 @pytest.mark.parametrize("count", ["1e3", "-1", "18446744073709551615", "9" * 5000, "x", "999999999999"])
 @pytest.mark.parametrize("form", ["binary_little_endian", "ascii"])
-def test_counts_that_lie_take_no_memory(count: str, form: str, tmp_path: Path) -> None:
+def test_counts_that_lie_take_no_memory(count, form, tmp_path):
     path = write(tmp_path / "a.ply", random_scene(40, degree=0), form=form)
     path.write_bytes(path.read_bytes().replace(b"vertex 40", f"vertex {count}".encode()))
     with takes_at_most(8e6):
         damaged(path, "is truncated: its header announces|is not a number of elements")
 
 
-def test_memory_stays_near_the_scene_itself(tmp_path: Path) -> None:
+def test_memory_stays_near_the_scene_itself(tmp_path):
     scene = random_scene(60_000)
     ply.save(tmp_path / "a.ply", scene)
     ply.load(tmp_path / "a.ply")
@@ -306,7 +306,7 @@ RGB += [f"property uchar {n}" for n in ("red", "green", "blue")]
         (header(*RGB) + bytes(200), "lack the properties f_dc_0, f_dc_1, f_dc_2; .* --ply-color-mode sh_coeffs"),
     ],
 )
-def test_other_kinds_of_files(content: bytes, message: str, tmp_path: Path) -> None:
+def test_other_kinds_of_files(content, message, tmp_path):
     (tmp_path / "a.ply").write_bytes(content)
     damaged(tmp_path / "a.ply", message)
 

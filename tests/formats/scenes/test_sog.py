@@ -113,13 +113,13 @@ def test_another_reader_sees_the_same(data, plush_excerpt, tmp_path):
 
 
 @pytest.fixture
-def folder(data: Path, tmp_path: Path) -> Path:
+def folder(data, tmp_path):
     """A SOG folder."""
     return Path(shutil.copytree(data / "other_tools" / "splat-transform_sog", tmp_path / "sog"))
 
 
 @pytest.fixture
-def levels(data: Path, tmp_path: Path) -> Path:
+def levels(data, tmp_path):
     """A streamed SOG folder."""
     return Path(shutil.copytree(data / "other_tools" / "splat-transform_lod", tmp_path / "lod"))
 
@@ -166,7 +166,7 @@ def test_bad_descriptions(place, values, message, folder):
             load_scene(folder)
 
 
-def test_what_a_folder_lacks(folder: Path) -> None:
+def test_what_a_folder_lacks(folder):
     (folder / "quats.webp").unlink()
     with pytest.raises(UsageError, match=r"cannot open '.*quats.webp'"):
         load_scene(folder)
@@ -181,7 +181,7 @@ def test_what_a_folder_lacks(folder: Path) -> None:
         load_scene(folder)
 
 
-def test_levels_that_there_are_not_and_further_ones(levels: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_levels_that_there_are_not_and_further_ones(levels, caplog):
     load_scene(f"{levels}#0")
     assert not caplog.records
     load_scene(levels)
@@ -194,7 +194,7 @@ def test_levels_that_there_are_not_and_further_ones(levels: Path, caplog: pytest
         load_scene(f"{levels}/lod-meta.json#1")
 
 
-def test_a_level_in_parts(levels: Path) -> None:
+def test_a_level_in_parts(levels):
     """Leaves of a tree that have some splats of two files each."""
     whole = load_scene(f"{levels}#0")
     shutil.copytree(levels / "0_0", levels / "other")
@@ -245,7 +245,7 @@ def test_bad_trees(place, values, message, levels):
             load_scene(f"{levels}#0")
 
 
-def test_missing_chunks_and_deep_trees(levels: Path) -> None:
+def test_missing_chunks_and_deep_trees(levels):
     (levels / "0_0" / "meta.json").unlink()
     with pytest.raises(UsageError, match=r"cannot open '.*0_0.meta.json'"):
         load_scene(levels)
@@ -255,7 +255,7 @@ def test_missing_chunks_and_deep_trees(levels: Path) -> None:
         sog_levels.load(levels)
 
 
-def test_many_chunks_that_claim_much(levels: Path) -> None:
+def test_many_chunks_that_claim_much(levels):
     """Each might hold FREE_SPLATS by itself."""
     chunk = {"version": 2, "count": FREE_SPLATS, "means": {}}
     names = [f"c{k}.json" for k in range(40)]

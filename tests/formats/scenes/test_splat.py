@@ -25,7 +25,7 @@ def changed(source: Path, target: Path, *changes: tuple[int, str, Any]) -> Path:
 
 
 @pytest.fixture(params=[0, 1, 2])
-def source(request: pytest.FixtureRequest, data: Path) -> Path:
+def source(request, data):
     return data / "other_tools" / f"GaussianSplats3D_level_{request.param}.ksplat"
 
 
@@ -46,7 +46,7 @@ def source(request: pytest.FixtureRequest, data: Path) -> Path:
         (SECTION + 40, "H", 3, "truncated|damaged|room"),
     ],
 )
-def test_headers_that_are_refused(source: Path, tmp_path: Path, at: int, kind: str, value: int, message: str) -> None:
+def test_headers_that_are_refused(source, tmp_path, at, kind, value, message):
     with pytest.raises(DataError, match=message):
         load_scene(changed(source, tmp_path / "a.ksplat", (at, kind, value)))
 
@@ -61,13 +61,13 @@ def test_headers_that_are_refused(source: Path, tmp_path: Path, at: int, kind: s
         (36, "I", 0),
     ],
 )
-def test_buckets_that_are_refused(data: Path, tmp_path: Path, at: int, kind: str, value: float) -> None:
+def test_buckets_that_are_refused(data, tmp_path, at, kind, value):
     source = data / "other_tools" / "GaussianSplats3D_level_1.ksplat"
     with pytest.raises(DataError, match=r"buckets|truncated"):
         load_scene(changed(source, tmp_path / "a.ksplat", (SECTION + at, kind, value)))
 
 
-def test_any_length_is_refused_or_read(source: Path, tmp_path: Path) -> None:
+def test_any_length_is_refused_or_read(source, tmp_path):
     content = source.read_bytes()
     for size in (0, 1, 4095, 4096, 5119, 5120, 5200, len(content) - 1):
         (tmp_path / "a.ksplat").write_bytes(content[:size])
@@ -75,13 +75,13 @@ def test_any_length_is_refused_or_read(source: Path, tmp_path: Path) -> None:
             load_scene(tmp_path / "a.ksplat")
 
 
-def test_sections_with_room_for_more(source: Path, tmp_path: Path) -> None:
+def test_sections_with_room_for_more(source, tmp_path):
     """Files that are loaded while they grow have fewer splats than room."""
     part = load_scene(changed(source, tmp_path / "a.ksplat", (SECTION, "I", 20), (16, "I", 20)))
     assert part == load_scene(source)[:20]
 
 
-def test_several_sections(source: Path, tmp_path: Path) -> None:
+def test_several_sections(source, tmp_path):
     content = bytearray(source.read_bytes())
     struct.pack_into("<I", content, 4, 3)
     header, body = bytes(content[SECTION : SECTION + 1024]), bytes(content[SECTION + 1024 :])
@@ -101,13 +101,13 @@ def rows(count: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("size", [0, 31, 33])
-def test_files_of_splat_that_are_no_whole_number_of_splats(size: int, tmp_path: Path) -> None:
+def test_files_of_splat_that_are_no_whole_number_of_splats(size, tmp_path):
     (tmp_path / "a.splat").write_bytes(bytes(size))
     with pytest.raises(DataError, match=rf"no .splat file, or is truncated: it has {size} bytes"):
         load_scene(tmp_path / "a.splat")
 
 
-def test_values_of_splat(tmp_path: Path) -> None:
+def test_values_of_splat(tmp_path):
     """By the definition of the format, for more splats than are read at a time."""
     made = rows(70_000)
     made["mean"][:, 0] = np.arange(70_000)
@@ -124,7 +124,7 @@ def test_values_of_splat(tmp_path: Path) -> None:
     np.testing.assert_allclose(scene.quaternions[69_999], [-0.5, 0.5, 0.5, -0.5], atol=1e-6)
 
 
-def test_scales_of_splat_without_a_logarithm(tmp_path: Path) -> None:
+def test_scales_of_splat_without_a_logarithm(tmp_path):
     made = rows(4)
     made["scale"][0, 2], made["scale"][1, 0], made["scale"][2, 1] = 0, -1, np.nan
     (tmp_path / "a.splat").write_bytes(made.tobytes())
