@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import ntpath
 import struct
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 
 from potr_cl import DataError, Scene, UsageError
 from potr_cl.formats import load_scene, save_scene
+from potr_cl.formats.scenes.scene_files import related
 from potr_cl.host.inputs import FREE_SPLATS
 from tests.cases.gltf import PREFIX, Attributes, attributes, described, glb, gltf
 from tests.reference.raster import rotation_matrices, sh_basis
@@ -286,6 +288,29 @@ def test_buffers_that_are_outside_of_the_folder_or_not_there(uri, kind, message,
     (tmp_path / "scene" / "a.gltf").write_bytes(gltf(description, content, uri))
     with pytest.raises(kind, match=message):
         load_scene(tmp_path / "scene" / "a.gltf")
+
+
+#: As files in a scene's folder, on Windows too.
+NAMES = (
+    "means.webp", "level/means.webp", "aux.webp", "level/CON", "nul.tar.gz", "com1 .webp", "means.webp:stream",
+    "C:x.webp", "C:/x.webp", "level/C:x.webp", "..\\x.webp", "a/..\\..\\x.webp", "\\\\server\\share\\x.webp",
+    "//server/share/x.webp", "../x.webp", "a/../../x.webp", "/x.webp", "", ".", "console.webp", "com.webp",
+)  # fmt: skip
+HARMLESS = {"means.webp", "level/means.webp", "console.webp", "com.webp"}
+ON_OTHER_SYSTEMS = {"aux.webp", "level/CON", "nul.tar.gz", "com1 .webp", "means.webp:stream"}
+
+
+@pytest.mark.parametrize("windows", [True, False])
+@pytest.mark.parametrize("name", NAMES)
+def test_names_that_lead_elsewhere_are_refused(tmp_path, name, windows):
+    if name in HARMLESS or (not windows and name in ON_OTHER_SYSTEMS):
+        found = related(tmp_path / "meta.json", name, windows)
+        assert tmp_path in found.parents
+        there = ntpath.normpath(ntpath.join("C:\\scene", *found.relative_to(tmp_path).parts))
+        assert there.startswith("C:\\scene\\")
+    else:
+        with pytest.raises(DataError, match="is damaged: it names a file"):
+            related(tmp_path / "meta.json", name, windows)
 
 
 def test_one_mesh_in_countless_nodes(tmp_path):
