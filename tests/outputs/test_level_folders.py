@@ -265,7 +265,7 @@ def test_an_encode_makes_a_folder(plush_excerpt, plush_excerpt_cameras, tmp_path
     """Which is not there yet; and from the result another one."""
     path = tmp_path / "city" / "lod-meta.json"
     result = potr_cl.encode(
-        plush_excerpt, plush_excerpt_cameras, levels=3, lod_chunk_count=1, iterations=2, refit=1, views_between=0,
+        plush_excerpt, plush_excerpt_cameras, levels=3, lod_chunk_count=1, iterations=2, refit=1, fit=5, views_between=0,
         output=path,
     )  # fmt: skip
     meta = json.loads(path.read_text())
@@ -428,7 +428,7 @@ def test_bad_tilesets(change, message, tiles, tmp_path):
 
 def test_the_command_writes_tiles(data, tmp_path, capsys):
     path, words = tmp_path / "city" / "tileset.json", ["encode", f"{data}/plush_excerpt.ply", "-o"]
-    choices = f"--cameras {data}/plush_excerpt_cameras.json --levels 2 --lod-chunk-count 1 --iterations 2 --refit 2"
+    choices = f"--cameras {data}/plush_excerpt_cameras.json --levels 2 --lod-chunk-count 1 --iterations 2 --refit 2 --fit 5"
     assert cli.main([*words, str(path), *choices.split(), "--views-between", "0", "--no-quality", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert len(load_scene(path)) == report["splats"]
