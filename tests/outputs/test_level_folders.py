@@ -264,10 +264,8 @@ def test_coverage_is_that_of_playcanvas_engine(plush_excerpt_cameras):
 def test_an_encode_makes_a_folder(plush_excerpt, plush_excerpt_cameras, tmp_path):
     """Which is not there yet; and from the result another one."""
     path = tmp_path / "city" / "lod-meta.json"
-    result = potr_cl.encode(
-        plush_excerpt, plush_excerpt_cameras, levels=3, lod_chunk_count=1, iterations=2, refit=1, fit=5, views_between=0,
-        output=path,
-    )  # fmt: skip
+    choices = {"levels": 3, "lod_chunk_count": 1, "iterations": 2, "refit": 1, "fit": 5, "views_between": 0}
+    result = potr_cl.encode(plush_excerpt, plush_excerpt_cameras, output=path, **choices)
     meta = json.loads(path.read_text())
     counts = meta["counts"]
     assert counts[1:] == [round(counts[0] / 2), round(counts[0] / 4)]
@@ -428,8 +426,9 @@ def test_bad_tilesets(change, message, tiles, tmp_path):
 
 def test_the_command_writes_tiles(data, tmp_path, capsys):
     path, words = tmp_path / "city" / "tileset.json", ["encode", f"{data}/plush_excerpt.ply", "-o"]
-    choices = f"--cameras {data}/plush_excerpt_cameras.json --levels 2 --lod-chunk-count 1 --iterations 2 --refit 2 --fit 5"
-    assert cli.main([*words, str(path), *choices.split(), "--views-between", "0", "--no-quality", "--json"]) == 0
+    words += [str(path), "--cameras", f"{data}/plush_excerpt_cameras.json", "--no-quality", "--json"]
+    choices = "--levels 2 --lod-chunk-count 1 --iterations 2 --refit 2 --fit 5 --views-between 0"
+    assert cli.main([*words, *choices.split()]) == 0
     report = json.loads(capsys.readouterr().out)
     assert len(load_scene(path)) == report["splats"]
     assert report["bytes"] == bytes_of_scene(path)
