@@ -127,7 +127,9 @@ def test_any_order_of_properties(order, tmp_path_factory):
 @pytest.mark.parametrize("form", TEXT_AND_BINARY)
 def test_other_properties_types_and_elements(form, tmp_path, caplog):
     scene, text = random_scene(5000, degree=1), form == "ascii"  # more than one block
-    types = {"x": "double", "opacity": "double", "f_rest_3": "double", "state": "uchar", "red": "uchar", "label": "int"}
+    scene.means[:, 1] = np.round(100 * scene.means[:, 1])
+    types = dict.fromkeys(("x", "opacity", "f_rest_3"), "double") | dict.fromkeys(("y", "label"), "int")
+    types |= dict.fromkeys(("state", "red"), "uchar")
     names = ["state", *ORIGINAL[:5], "red", *ORIGINAL[5:], "label"]
     before = ["element camera 2", "property double fx", "property int i"]
     after = ["element intrinsic 9", "property float intrinsic", "element face 1", "property list uchar int index"]
