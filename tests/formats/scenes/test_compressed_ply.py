@@ -87,7 +87,7 @@ TWO_READINGS = {
         (b"binary_little", b"binary_big\x20\x20\x20", "no compressed PLY that can be read"),
         (b"element vertex 1500", b"element vertex 0000", "no splat"),
         (b"end_header", b"end_haeder", "damaged"),
-        *(pytest.param(*pair, "", id=name) for name, pair in TWO_READINGS.items()),
+        *(pytest.param(*pair, None, id=name) for name, pair in TWO_READINGS.items()),
     ],
 )
 def test_only_canonical_headers_are_read(tmp_path, data, old, new, message):

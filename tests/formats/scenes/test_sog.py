@@ -97,7 +97,7 @@ def test_packings_and_images_that_no_sog_file_has(tmp_path, choices, message):
 
 def test_another_reader_sees_the_same(data, plush_excerpt, tmp_path):
     reader = pytest.importorskip("gsply.sog_reader")
-    sog.save(tmp_path / "a.sog", plush_excerpt)
+    sog.save(tmp_path / "a.sog", plush_excerpt[::3])
     for path in (data / "foreign" / "degree_0.sog", data / "foreign" / "degree_3.sog", tmp_path / "a.sog"):
         scene, expected = load_scene(path), reader.sogread(path)
         assert np.abs(scene.means - expected.means).max() < 1e-6
@@ -285,7 +285,7 @@ def scene_of(count, degree=3, seed=1):
 
 @pytest.mark.parametrize("degree", [0, 3])
 def test_values_are_read_again_within_the_steps_of_the_format(tmp_path, plush_excerpt, degree):
-    scene = replace(plush_excerpt, sh=plush_excerpt.sh[:, : (degree + 1) ** 2])
+    scene = replace(plush_excerpt, sh=plush_excerpt.sh[:, : (degree + 1) ** 2])[::2]
     sog.save(tmp_path / "a.sog", scene)
     back = in_order_of(scene, sog.load(tmp_path / "a.sog"))
     logarithms, again = (np.copysign(np.log1p(np.abs(s.means)), s.means) for s in (scene, back))
@@ -302,7 +302,7 @@ def test_values_are_read_again_within_the_steps_of_the_format(tmp_path, plush_ex
 
 
 def test_a_second_time_nothing_is_lost_of_colours(tmp_path, plush_excerpt):
-    sog.save(tmp_path / "a.sog", plush_excerpt)
+    sog.save(tmp_path / "a.sog", plush_excerpt[::3])
     once = sog.load(tmp_path / "a.sog")
     sog.save(tmp_path / "b.sog", once)
     twice = in_order_of(once, sog.load(tmp_path / "b.sog"))

@@ -125,7 +125,7 @@ def test_properties_are_deflated_as_they_pack_best_on_any_number_of_processors(t
 def test_content_and_values_are_those_of_another_program(tmp_path, data):
     gsply = pytest.importorskip("gsply")
     other = pytest.importorskip("gsply.spz")
-    scene = random_scene(3000, 3)
+    scene = random_scene(1000, 3)
     spz.save(tmp_path / "ours.spz", scene, version=3)
     *given, sh = arranged(scene).arrays
     names = dict(zip(("means", "scales", "quats", "opacities"), given, strict=True))
@@ -134,7 +134,7 @@ def test_content_and_values_are_those_of_another_program(tmp_path, data):
     other.write_spz(tmp_path / "theirs.spz", arrays, version=3, fractional_bits=12)
     ours, theirs = (gzip.decompress((tmp_path / name).read_bytes()) for name in ("ours.spz", "theirs.spz"))
     assert len(ours) == len(theirs)
-    assert sum(a != b for a, b in zip(ours, theirs, strict=True)) <= 5  # ties that rounding breaks either way
+    assert sum(a != b for a, b in zip(ours, theirs, strict=True)) <= 2  # ties that rounding breaks either way
     written = [tmp_path / f"{version}.spz" for version in (2, 3, 4)]
     for version, path in enumerate(written, 2):
         spz.save(path, scene, version)
