@@ -46,7 +46,7 @@ def test_every_wrong_frame_of_the_excerpt_is_found(plush_excerpt, plush_excerpt_
 def test_no_right_cameras_of_the_excerpt_are_refused(plush_excerpt, plush_excerpt_cameras):
     # Whoever stands within it sees nothing: it is no larger than the renderer's near plane is far.
     own = right(plush_excerpt, train_views(plush_excerpt_cameras), others=False)
-    for what, cameras in [*own, ("virtual cameras", place_cameras(plush_excerpt, 40))]:
+    for what, cameras in [*own, ("virtual cameras", place_cameras(plush_excerpt, 12))]:
         for scene in (plush_excerpt, without_directions(plush_excerpt)):
             assert not judge_cameras(scene, cameras).suspicious, (what, scene.sh_degree)
 
