@@ -20,6 +20,11 @@ def in_order_of(scene: Scene, back: Scene) -> Scene:
     return back.subset(index)
 
 
+def rows_of(scene: Scene) -> set[bytes]:
+    """The splats of a scene without their order, each as all of its values."""
+    return {row.tobytes() for row in np.hstack([array.reshape(len(scene), -1) for array in scene.arrays])}
+
+
 def turned_by(scene: Scene, back: Scene) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """How far the splats of a file are turned, and how their scales differ, whichever way their axes are numbered.
 

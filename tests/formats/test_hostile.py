@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import struct
 import zipfile
 import zlib
-from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from potr_cl.errors import DataError
-from potr_cl.formats import load_cameras, load_scene, save_scene
+from potr_cl.formats import load_scene, save_scene
 from potr_cl.formats.images import image_size, read_ground_truth
+from tests.cases.cameras import nerfstudio, refused, view, write_json
 from tests.cases.memory import takes_at_most
 from tests.cases.own_warnings import no_warnings
 from tests.reference.scenes import random_scene
@@ -30,20 +29,14 @@ def _warnings_are_errors():
         yield
 
 
-def ply_in_double_precision(path: Path, splats: int, first: bytes) -> None:
-    """A scene of SH degree 0 whose first value is given by its bytes."""
-    names = ["x", "y", "z", *(f"f_dc_{i}" for i in range(3)), "opacity", *(f"scale_{i}" for i in range(3))]
-    names += [f"rot_{i}" for i in range(4)]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {splats}"]
-    header += [*(f"property double {name}" for name in names), "end_header", ""]
-    values = bytearray(np.ones((splats, len(names)), "<f8").tobytes())
-    values[:8] = first
-    path.write_bytes("\n".join(header).encode() + values)
-
-
 @pytest.mark.parametrize("value", [SIGNALLING_NAN, struct.pack("<d", 1e300), struct.pack("<d", float("inf"))])
 def test_a_number_that_single_precision_has_not_gives_no_warning(tmp_path, value):
-    ply_in_double_precision(tmp_path / "a.ply", 3, value)
+    names = ["x", "y", "z", *(f"f_dc_{i}" for i in range(3)), "opacity", *(f"scale_{i}" for i in range(3))]
+    names += [f"rot_{i}" for i in range(4)]
+    header = ["ply", "format binary_little_endian 1.0", "element vertex 3"]
+    header += [*(f"property double {name}" for name in names), "end_header", ""]
+    values = np.ones((3, len(names)), "<f8").tobytes()
+    (tmp_path / "a.ply").write_bytes("\n".join(header).encode() + value + values[8:])
     assert len(load_scene(tmp_path / "a.ply")) == 2
 
 
@@ -56,45 +49,25 @@ def test_infinite_bounds_of_a_chunk_give_no_warning(tmp_path):
     assert len(load_scene(tmp_path / "a.compressed.ply")) == 300 - 256
 
 
-def test_a_view_beyond_all_numbers_gives_no_warning(tmp_path):
-    view = {"img_name": "a.png", "width": 8, "height": 8, "fx": 8, "fy": 8, "position": [1.7e308, 1.7e308, 1.7e308]}
-    view["rotation"] = [[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]]
-    (tmp_path / "cameras.json").write_text(json.dumps([view]))
-    with pytest.raises(DataError, match="non-finite"):
-        load_cameras(tmp_path / "cameras.json")
+def test_a_view_or_frame_beyond_all_numbers_gives_no_warning(tmp_path):
+    turned = [[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]]
+    content = nerfstudio(["a.png"])
+    content["frames"][0]["transform_matrix"] = [[*row, 1.7e308] for row in turned]
+    for each in ([view(rotation=turned, position=[1.7e308] * 3)], content):
+        refused(write_json(tmp_path / "a.json", each), "non-finite")
 
 
-def test_a_frame_beyond_all_numbers_gives_no_warning(tmp_path):
-    rows = [[0.8, -0.6, 0, 1.7e308], [0.6, 0.8, 0, 1.7e308], [0, 0, 1, 1.7e308], [0, 0, 0, 1]]
-    frame = {"file_path": "a.png", "transform_matrix": rows, "w": 8, "h": 8, "fl_x": 8}
-    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
-    with pytest.raises(DataError, match="non-finite"):
-        load_cameras(tmp_path / "transforms.json")
-
-
-def png(path: Path, *more: tuple[bytes, bytes]) -> bytearray:
-    """A good PNG of 8 x 8 pixels with some chunks behind its header."""
+def test_pngs_whose_rows_are_said_to_take_gigabytes_or_that_are_said_to_be_animated(tmp_path):
+    path = tmp_path / "a.png"
     Image.new("RGB", (8, 8)).save(path)
-    data = path.read_bytes()
-    made = b"".join(
-        struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-        for kind, content in more
-    )
-    return bytearray(data[:33] + made + data[33:])
-
-
-def test_a_png_whose_rows_are_said_to_take_gigabytes(tmp_path):
-    data = png(tmp_path / "a.png")
-    data[33:37] = struct.pack(">I", 0x40000000)
-    (tmp_path / "a.png").write_bytes(data)
+    good = path.read_bytes()  # with a header of 33 bytes
+    path.write_bytes(good[:33] + struct.pack(">I", 0x40000000) + good[37:])
     with takes_at_most(1 << 20), contextlib.suppress(DataError):
-        read_ground_truth(tmp_path / "a.png")
-
-
-def test_a_png_that_is_said_to_be_animated_gives_no_warning(tmp_path):
-    (tmp_path / "a.png").write_bytes(png(tmp_path / "a.png", (b"acTL", bytes(8))))
-    assert image_size(tmp_path / "a.png") == (8, 8)
-    assert read_ground_truth(tmp_path / "a.png").shape == (8, 8, 3)
+        read_ground_truth(path)
+    kind = b"acTL" + bytes(8)
+    path.write_bytes(good[:33] + struct.pack(">I", 8) + kind + struct.pack(">I", zlib.crc32(kind)) + good[33:])
+    assert image_size(path) == (8, 8)
+    assert read_ground_truth(path).shape == (8, 8, 3)
 
 
 def test_a_sog_member_that_is_said_to_take_gigabytes(tmp_path, data):

@@ -20,52 +20,50 @@ def random_pixels(channels, seed=0):
     return np.random.default_rng(seed).integers(0, 256, (7, 9, channels), dtype=np.uint8)
 
 
-def test_rgb(tmp_path):
-    pixels = random_pixels(3)
-    Image.fromarray(pixels).save(tmp_path / "a.png")
-    image = read_ground_truth(tmp_path / "a.png", (1, 1, 1))
+def saved(path, pixels, **options):
+    Image.fromarray(pixels).save(path, **options)
+    return path
+
+
+def test_colours_greys_and_webp(tmp_path):
+    pixels, grey = random_pixels(3), random_pixels(1)[..., 0]
+    image = read_ground_truth(saved(tmp_path / "a.png", pixels), (1, 1, 1))
     assert image.dtype == np.float32
     assert np.array_equal(image, pixels.astype(np.float32) / np.float32(255))
     assert image_size(tmp_path / "a.png") == (9, 7)
+    found = [read_ground_truth(saved(tmp_path / name, pixels, lossless=True)) for name in ("a.png", "a.webp")]
+    assert all(np.array_equal(to_8_bits(each), pixels) for each in found)
+    image = read_ground_truth(saved(tmp_path / "a.png", grey))
+    assert np.array_equal(to_8_bits(image), np.stack([grey] * 3, axis=-1))
 
 
-def test_alpha_shows_the_background(tmp_path):
-    pixels = random_pixels(4)
-    Image.fromarray(pixels).save(tmp_path / "a.png")
+def test_alpha_and_transparent_colours_show_the_background(tmp_path):
+    path, pixels = tmp_path / "a.png", random_pixels(4)
+    saved(path, pixels)
     background = np.array([1, 0.5, 0])
     alpha = pixels[..., 3:] / 255
     expected = pixels[..., :3] / 255 * alpha + background * (1 - alpha)
-    assert np.abs(read_ground_truth(tmp_path / "a.png", (1, 0.5, 0)) - expected).max() < 1e-6
-    assert np.abs(read_ground_truth(tmp_path / "a.png") - pixels[..., :3] / 255 * alpha).max() < 1e-6
-
-
-def test_palette_with_a_transparent_colour(tmp_path):
+    assert np.abs(read_ground_truth(path, (1, 0.5, 0)) - expected).max() < 1e-6
+    assert np.abs(read_ground_truth(path) - pixels[..., :3] / 255 * alpha).max() < 1e-6
     image = Image.new("P", (4, 4), 1)
     image.putpalette([255, 0, 0, 0, 255, 0])
-    image.save(tmp_path / "a.png", transparency=1)
-    assert np.array_equal(read_ground_truth(tmp_path / "a.png", (0, 0, 1)), np.full((4, 4, 3), (0, 0, 1)))
-
-
-def test_grey_is_every_channel(tmp_path):
-    pixels = random_pixels(1)[..., 0]
-    Image.fromarray(pixels).save(tmp_path / "a.png")
-    assert np.array_equal(to_8_bits(read_ground_truth(tmp_path / "a.png")), np.stack([pixels] * 3, axis=-1))
+    image.save(path, transparency=1)
+    assert np.array_equal(read_ground_truth(path, (0, 0, 1)), np.full((4, 4, 3), (0, 0, 1)))
 
 
 def test_deep_images_are_refused(tmp_path):
-    Image.fromarray(np.arange(63, dtype=np.uint16).reshape(7, 9)).save(tmp_path / "a.png")
+    path = saved(tmp_path / "a.png", np.arange(63, dtype=np.uint16).reshape(7, 9))
     with pytest.raises(DataError, match="more than 8 bits"):
-        read_ground_truth(tmp_path / "a.png")
+        read_ground_truth(path)
 
 
 @pytest.mark.parametrize("form", ["TIFF", "BMP", "GIF", "AVIF", "DDS", "EPS", "PPM", "TGA", "JPEG2000", "PCX", "BLP"])
-@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif"])
-def test_no_other_kind_of_image_is_read(tmp_path, form, suffix, monkeypatch):
+def test_no_other_kind_of_image_is_read(tmp_path, form, monkeypatch):
     """Whatever it is called; some of Pillow's readers start other programs, others end in tracebacks."""
     started = []
     monkeypatch.setattr("subprocess.Popen", lambda *args, **kwargs: started.append(args))
     monkeypatch.setattr("os.system", started.append)
-    path = tmp_path / f"a{suffix}"
+    path = tmp_path / ("a.tif" if form == "BMP" else "a.png")
     try:
         Image.fromarray(random_pixels(3)).convert("P" if form == "BLP" else "RGB").save(path, form)
     except (KeyError, OSError, ValueError):
@@ -76,12 +74,6 @@ def test_no_other_kind_of_image_is_read(tmp_path, form, suffix, monkeypatch):
     assert not started
 
 
-def test_webp_is_read(tmp_path):
-    pixels = random_pixels(3)
-    Image.fromarray(pixels).save(tmp_path / "a.webp", lossless=True)
-    assert np.array_equal(to_8_bits(read_ground_truth(tmp_path / "a.webp")), pixels)
-
-
 @pytest.mark.parametrize(("width", "height"), [(100_000, 1400), (13_000, 13_000), (60_000, 60_000)])
 def test_too_many_pixels_are_refused_before_they_are_unpacked(tmp_path, width, height):
     path = tmp_path / "a.png"
@@ -90,19 +82,16 @@ def test_too_many_pixels_are_refused_before_they_are_unpacked(tmp_path, width, h
         for read in (image_size, read_ground_truth):
             with pytest.raises(DataError, match="pixels"):
                 read(path)
-
-
-def test_large_photographs_give_no_warning(tmp_path):
-    (tmp_path / "a.png").write_bytes(png_of(10_000, 10_000))
-    with no_warnings():
-        assert image_size(tmp_path / "a.png") == (10_000, 10_000)
+        path.write_bytes(png_of(10_000, 10_000))
+        assert image_size(path) == (10_000, 10_000)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes")
-def test_a_pipe_is_not_waited_for(tmp_path):
-    os.mkfifo(tmp_path / "a.png")
-    with pytest.raises(UsageError, match="not a regular file"):
-        image_size(tmp_path / "a.png")
+def test_what_is_no_file(tmp_path):
+    os.mkfifo(tmp_path / "a.png")  # which is not waited for
+    for path, said in (("a.png", "not a regular file"), ("none.png", "cannot read"), (".", "cannot read")):
+        with pytest.raises(UsageError, match=said):
+            image_size(tmp_path / path)
 
 
 @pytest.mark.parametrize("form", ["PNG", "JPEG"])
@@ -118,25 +107,13 @@ def test_damaged_files(tmp_path, form):
 
 
 def test_a_size_that_would_not_fit_memory(tmp_path):
-    path = tmp_path / "a.jpg"
-    Image.fromarray(random_pixels(3)).save(path)
+    path = saved(tmp_path / "a.jpg", random_pixels(3))
     data = bytearray(path.read_bytes())
     at = data.index(b"\xff\xc0") + 5
     data[at : at + 4] = (50_000).to_bytes(2, "big") * 2
     path.write_bytes(data)
     with pytest.raises(DataError, match=r"damaged or of another kind|pixels"):
         read_ground_truth(path)
-
-
-def test_no_such_file(tmp_path):
-    for path in (tmp_path / "none.png", tmp_path):
-        with pytest.raises(UsageError, match="cannot read"):
-            image_size(path)
-
-
-def test_8_bits_are_clamped_and_rounded():
-    values = np.array([-1, 0, 0.4999 / 255, 0.5001 / 255, 254.6 / 255, 1, 9])
-    assert to_8_bits(values).tolist() == [0, 0, 0, 1, 255, 255, 255]
 
 
 def test_png_keeps_pixels_and_text():
@@ -149,13 +126,7 @@ def test_png_keeps_pixels_and_text():
 
 @pytest.mark.parametrize(
     ("text", "colour"),
-    [
-        ("0,0.5,1", (0, 0.5, 1)),
-        (" 1, 1, 1 ", (1, 1, 1)),
-        ("white", (1, 1, 1)),
-        ("#ff0033", (1, 0, 0.2)),
-        ("#fff", (1, 1, 1)),
-    ],
+    [("0,0.5,1", (0, 0.5, 1)), (" 1, 1, 1 ", (1, 1, 1)), ("white", (1, 1, 1)), ("#ff0033", (1, 0, 0.2))],
 )
 def test_colours(text, colour):
     assert parse_colour(text) == pytest.approx(colour)
@@ -167,8 +138,10 @@ def test_no_colours(text):
         parse_colour(text)
 
 
-def test_rounding_to_8_bits_takes_little_memory() -> None:
+def test_8_bits_are_clamped_and_rounded_in_little_memory():
     """One view of 16384 x 16384 pixels took three times its 3 GB."""
+    values = np.array([-1, 0, 0.4999 / 255, 0.5001 / 255, 254.6 / 255, 1, 9])
+    assert to_8_bits(values).tolist() == [0, 0, 0, 1, 255, 255, 255]
     image = np.random.default_rng(0).normal(0.5, 1, (2000, 900, 3)).astype(np.float32)
     with takes_at_most(image.size + (1 << 24)):
         found = to_8_bits(image)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from pathlib import Path
 
 import pytest
-from PIL import Image
 
 from potr_cl import UsageError
 from potr_cl.formats import load_cameras
@@ -18,7 +16,7 @@ from tests.cases.cameras import assert_same_views, nerfstudio, refused, view, wr
 # The same views in different formats ---------------------------------------------------------------------------------
 
 
-def test_the_excerpts_views_as_cameras_json_and_as_transforms(data: Path, tmp_path: Path) -> None:
+def test_the_excerpts_views_as_cameras_json_and_as_transforms(data, tmp_path):
     shutil.copytree(data / "plush_transforms", tmp_path, dirs_exist_ok=True)
     expected = load_cameras(data / "plush_excerpt_cameras.json")
     for camera in expected:
@@ -32,7 +30,7 @@ def test_the_excerpts_views_as_cameras_json_and_as_transforms(data: Path, tmp_pa
 
 
 @pytest.mark.parametrize("model", ["plush_sparse_binary", "plush_sparse_text"])
-def test_plush_excerpt_as_cameras_json_and_as_colmap_model(model: str, data: Path) -> None:
+def test_plush_excerpt_as_cameras_json_and_as_colmap_model(model, data):
     expected = load_cameras(data / "plush_cameras.json")
     assert_same_views(load_cameras(data / model), expected, 1e-9)
     assert [c.split for c in load_cameras(data / model)].count("test") == 3
@@ -40,61 +38,31 @@ def test_plush_excerpt_as_cameras_json_and_as_colmap_model(model: str, data: Pat
         assert_same_views(load_cameras(file), expected, 1e-9)
 
 
-def test_whole_lego(lego: Path) -> None:
-    from_json = load_cameras(lego / "cameras.json")
-    train, test = (load_cameras(lego / f"transforms_{split}.json") for split in ("train", "test"))
-    assert_same_views(from_json, train + test)
-    assert len(train_views(from_json)) == 100
-    assert all(camera.image_path == other.image_path for camera, other in zip(from_json, train + test, strict=True))
-
-
-def test_whole_plush(plush: Path) -> None:
-    from_json, from_model = load_cameras(plush / "cameras.json"), load_cameras(plush / "sparse" / "0")
-    assert_same_views(from_json, from_model)
-    assert len(views_for_judging(from_model)) == 13
-    for camera in from_model:
-        assert camera.image_path is not None
-        with Image.open(camera.image_path) as image:
-            assert image.size == (camera.width, camera.height)
-
-
 # Finding the kind ----------------------------------------------------------------------------------------------------
 
 
-def test_folders(data: Path, tmp_path: Path) -> None:
+def test_folders_and_any_file_name(data, tmp_path):
     refused(tmp_path, "has no cameras, expected a COLMAP model .*, a cameras.json or a transforms.json", UsageError)
-    shutil.copytree(data / "plush_sparse_binary", tmp_path / "sparse")
-    assert len(load_cameras(tmp_path)) == 17
     shutil.copytree(data / "plush_sparse_binary", tmp_path / "another" / "sparse" / "0")
     assert len(load_cameras(tmp_path / "another" / "sparse")) == 17
-    write_json(tmp_path / "transforms.json", nerfstudio(["a.png", "b.png"]))
-    assert len(load_cameras(tmp_path)) == 2
-    write_json(tmp_path / "cameras.json", [view()])
-    assert len(load_cameras(tmp_path)) == 1
-
-
-def test_views_that_are_too_wide_for_a_pinhole_are_told(
-    data: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """As of focal lengths in millimetres."""
-    load_cameras(data / "plush_cameras.json")
-    assert caplog.text == ""
-    views = [view() | {"img_name": f"{number}.png", "width": 990, "height": 742} for number in range(3)]
-    for number, focal in enumerate((35.0, 800.0, 28.0)):
-        views[number] |= {"fx": focal, "fy": focal}
-    load_cameras(write_json(tmp_path / "cameras.json", views))
-    assert (
-        "2 of 3 views are very wide, up to 174 degrees: are their focal lengths in pixels of 990 x 742?" in caplog.text
-    )
-    load_cameras(write_json(tmp_path / "tall.json", [view() | {"width": 90, "height": 990, "fx": 28.0, "fy": 28.0}]))
-    assert "up to 174 degrees: are their focal lengths in pixels of 90 x 990?" in caplog.text
-
-
-def test_any_file_name(data: Path, tmp_path: Path) -> None:
     shutil.copy(data / "plush_cameras.json", tmp_path / "views of mine.JSON")
     assert len(load_cameras(tmp_path / "views of mine.JSON")) == 17
     write_json(tmp_path / "poses.json", nerfstudio(["a.png"]))
     assert len(load_cameras(tmp_path / "poses.json")) == 1
+
+
+def test_views_that_are_too_wide_for_a_pinhole_are_told(data, tmp_path, caplog):
+    """As of focal lengths in millimetres."""
+    load_cameras(data / "plush_cameras.json")
+    assert caplog.text == ""
+    focals = enumerate((35.0, 800.0, 28.0))
+    wide = [view(img_name=f"{k}.png", width=990, height=742, fx=focal, fy=focal) for k, focal in focals]
+    load_cameras(write_json(tmp_path / "cameras.json", wide))
+    assert (
+        "2 of 3 views are very wide, up to 174 degrees: are their focal lengths in pixels of 990 x 742?" in caplog.text
+    )
+    load_cameras(write_json(tmp_path / "tall.json", [view(width=90, height=990, fx=28.0, fy=28.0)]))
+    assert "up to 174 degrees: are their focal lengths in pixels of 90 x 990?" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -114,12 +82,12 @@ def test_any_file_name(data: Path, tmp_path: Path) -> None:
         (b'[{"img_name": "\\ud800"}]', "not the name of an image"),
     ],
 )
-def test_json_of_no_known_kind(content: bytes, message: str, tmp_path: Path) -> None:
+def test_json_of_no_known_kind(content, message, tmp_path):
     (tmp_path / "a.json").write_bytes(content)
     refused(tmp_path / "a.json", message)
 
 
-def test_paths_of_no_known_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_paths_of_no_known_kind(tmp_path, monkeypatch):
     refused(tmp_path / "missing.json", "cannot read '.*missing.json': No such file", UsageError)
     refused(tmp_path / "missing", "there is no file or folder", UsageError)
     (tmp_path / "notes.txt").write_bytes(b"")

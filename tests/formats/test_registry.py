@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import os
 import pkgutil
@@ -18,12 +19,11 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from potr_cl import DataError, Scene, UsageError, cli, info
+from potr_cl import DataError, UsageError, cli, info
 from potr_cl.formats import cameras, load_cameras, load_scene, registry, save_scene, scene_writer, scenes
 from potr_cl.formats.declaration import CameraFormat, SceneFormat
 from potr_cl.formats.ladder import Ladder, Rung
 from potr_cl.formats.registry import CAMERA_FORMATS, SCENE_FORMATS, listed
-from potr_cl.formats.scenes import page
 from potr_cl.formats.scenes.scene_files import opened
 from tests.cases.cameras import nerfstudio, view, write_json
 from tests.cases.scenes import in_order_of, turned_by
@@ -41,19 +41,14 @@ def name(entry: Any) -> str:
 
 
 @pytest.mark.parametrize(("package", "table"), [(scenes, SCENE_FORMATS), (cameras, CAMERA_FORMATS)])
-def test_every_declared_format_is_in_its_table(package: Any, table: tuple[Any, ...]) -> None:
-    modules = [
-        importlib.import_module(f"{package.__name__}.{each.name}") for each in pkgutil.iter_modules(package.__path__)
-    ]
-    kinds = (SceneFormat, CameraFormat)
-    declared = {
-        id(each): each for module in modules for each in vars(module).values() if isinstance(each, kinds)
-    }.values()
-    assert sorted(map(name, declared)) == sorted(map(name, table))
-    assert all(entry in table for entry in declared)
+def test_every_declared_format_is_in_its_table(package, table):
+    names = [f"{package.__name__}.{each.name}" for each in pkgutil.iter_modules(package.__path__)]
+    values = [each for module in names for each in vars(importlib.import_module(module)).values()]
+    declared = {id(each): each for each in values if isinstance(each, (SceneFormat, CameraFormat))}
+    assert declared == {id(entry): entry for entry in table}
 
 
-def test_no_two_formats_claim_one_suffix_without_a_recogniser() -> None:
+def test_no_two_formats_claim_one_suffix_without_a_recogniser():
     suffixes = Counter(suffix for entry in SCENE_FORMATS for suffix in entry.suffixes)
     assert set(suffixes.values()) == {1}
     for extension in {extension for entry in SCENE_FORMATS for extension in entry.extensions}:
@@ -61,7 +56,7 @@ def test_no_two_formats_claim_one_suffix_without_a_recogniser() -> None:
         assert sum(entry.recognises is None for entry in having_it) == 1, extension
 
 
-def test_declarations_are_complete() -> None:
+def test_declarations_are_complete():
     for entry in (*SCENE_FORMATS, *CAMERA_FORMATS):
         assert all(re.fullmatch(r"(\.[a-z0-9]+)+", suffix) for suffix in entry.suffixes), entry.name
         assert entry.suffixes or getattr(entry, "names", ()), entry.name
@@ -74,10 +69,9 @@ def test_declarations_are_complete() -> None:
         assert bool(each.json_mark) == (".json" in each.suffixes), each.name
 
 
-def test_formats_import_no_heavy_library() -> None:
-    program = "import sys, potr_cl.formats; print(sorted({'gsply', 'pycolmap', 'PIL'} & set(sys.modules)))"
-    result = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True)
-    assert result.stdout.strip() == "[]"
+def test_formats_import_no_heavy_library():
+    program = "import sys, potr_cl.formats; sys.exit(bool({'gsply', 'pycolmap', 'PIL'} & set(sys.modules)))"
+    subprocess.run([sys.executable, "-c", program], check=True)
 
 
 # Reading and writing -------------------------------------------------------------------------------------------------
@@ -85,18 +79,13 @@ def test_formats_import_no_heavy_library() -> None:
 
 # What a page holds is rounded as encode rounds: tests/outputs/test_page.py.
 @pytest.mark.parametrize("entry", [entry for entry in WRITTEN if entry.name != "web page"], ids=name)
-@given(splats=st.integers(1, 400), degree=st.integers(0, 3), seed=st.integers(0, 99))
+@given(splats=st.integers(1, 200), degree=st.integers(0, 3), seed=st.integers(0, 99))
 @settings(
-    max_examples=12,
-    deadline=None,
+    max_examples=8,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
     phases=[Phase.explicit, Phase.reuse, Phase.generate],  # a format that fails does so for nearly every scene
 )
-def test_every_format_reads_what_it_writes(
-    entry: SceneFormat, splats: int, degree: int, seed: int, tmp_path: Path
-) -> None:
-    if entry is page.FORMAT and not page.TEMPLATE.exists():
-        pytest.skip("the viewer of pages is not built: python -m tools.make.web")
+def test_every_format_reads_what_it_writes(entry, splats, degree, seed, tmp_path):
     scene = random_scene(splats, degree, seed)
     for suffix in entry.suffixes:
         path = tmp_path / f"scene{suffix}"
@@ -113,13 +102,12 @@ def test_every_format_reads_what_it_writes(
         assert np.quantile(np.abs(back.sh - scene.sh), 0.9) < 0.05
 
 
-@pytest.mark.parametrize("suffix", [suffix for entry in WRITTEN for suffix in entry.suffixes])
-def test_suffixes_in_capitals_and_after_points(suffix: str, tmp_path: Path) -> None:
-    path = tmp_path / f"v1.2{suffix.upper()}"
-    assert registry.written_format(path) == next(entry for entry in WRITTEN if suffix in entry.suffixes)
+def test_suffixes_in_capitals_and_after_points():
+    for entry in WRITTEN:
+        assert all(registry.written_format(Path(f"v1.2{suffix.upper()}")) is entry for suffix in entry.suffixes)
 
 
-def test_content_decides_between_formats_of_one_extension(data: Path, tmp_path: Path) -> None:
+def test_content_decides_between_formats_of_one_extension(data, tmp_path):
     plain, compressed = (
         next(entry for entry in SCENE_FORMATS if suffix in entry.suffixes) for suffix in (".ply", ".compressed.ply")
     )
@@ -131,19 +119,19 @@ def test_content_decides_between_formats_of_one_extension(data: Path, tmp_path: 
     assert registry.format_of(tmp_path / "missing.compressed.ply") is plain
 
 
-def test_unknown_suffixes(tmp_path: Path) -> None:
-    known = [suffix for entry in SCENE_FORMATS for suffix in entry.suffixes]
+def test_unknown_suffixes(tmp_path):
     for unknown in ("a.obj", "a", ".ply.d"):
-        with pytest.raises(UsageError, match="unknown kind of scene, expected a") as caught:
-            load_scene(tmp_path / unknown)
-        assert all(suffix in str(caught.value) for suffix in known)
-        with pytest.raises(UsageError, match="give it one of") as caught:
-            scene_writer(tmp_path / unknown)
-        assert all(suffix in str(caught.value) for entry in WRITTEN for suffix in entry.suffixes)
+        for call, formats, said in (
+            (load_scene, SCENE_FORMATS, "unknown kind of scene, expected a"),
+            (scene_writer, WRITTEN, "give it one of"),
+        ):
+            with pytest.raises(UsageError, match=said) as caught:
+                call(tmp_path / unknown)
+            assert all(suffix in str(caught.value) for entry in formats for suffix in entry.suffixes)
         assert not any(tmp_path.iterdir())
 
 
-def test_formats_that_are_not_written_say_what_to_do(tmp_path: Path) -> None:
+def test_formats_that_are_not_written_say_what_to_do(tmp_path):
     for entry in SCENE_FORMATS:
         if entry.save is None:
             with pytest.raises(UsageError, match=re.escape(entry.not_written)):
@@ -151,87 +139,72 @@ def test_formats_that_are_not_written_say_what_to_do(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [suffix for entry in SCENE_FORMATS for suffix in entry.suffixes])
-def test_a_file_that_is_gone_or_is_none(suffix: str, tmp_path: Path) -> None:
-    """Also where it was there a moment ago, when its content told the format."""
+def test_a_file_that_is_gone_or_is_none(suffix, tmp_path):
+    """Also where it was there a moment ago, when its content told the format, or no file system takes its name."""
     for entry in SCENE_FORMATS:
         with pytest.raises(UsageError, match=r"cannot (open|read)"):
             entry.load(tmp_path / f"gone{suffix}")
     (tmp_path / f"folder{suffix}").mkdir()
     with pytest.raises(UsageError, match=r"directory|not a regular file"):
         load_scene(tmp_path / f"folder{suffix}")
-
-
-@pytest.mark.parametrize("suffix", [suffix for entry in SCENE_FORMATS for suffix in entry.suffixes])
-def test_a_name_longer_than_a_file_system_takes(suffix: str, tmp_path: Path) -> None:
-    path = tmp_path / ("x" * 300 + suffix)
-    with pytest.raises(UsageError, match=r"cannot (open|read)"):
-        load_scene(path)
-    with pytest.raises(UsageError, match=r"cannot (open|read)"):
-        info(path)
+    for read in (load_scene, info):
+        with pytest.raises(UsageError, match=r"cannot (open|read)"):
+            read(tmp_path / ("x" * 300 + suffix))
 
 
 # Cameras -------------------------------------------------------------------------------------------------------------
 
 
-def test_order_in_which_a_folder_is_searched(data: Path, tmp_path: Path) -> None:
+def test_order_in_which_a_folder_is_searched(data, tmp_path):
     """From the last place to the first: each new file wins over those that were there."""
-    one, two = ([f"{i}.png" for i in range(n)] for n in (1, 2))
 
-    def rewrite(model: Path, source: str) -> None:
-        shutil.copytree(data / source, model, dirs_exist_ok=True)
+    def model(folder, source):
+        shutil.copytree(data / source, folder, dirs_exist_ok=True)
 
-    def names() -> list[str]:
-        return [camera.name for camera in load_cameras(tmp_path)]
+    def outer(folder):
+        model(folder, "plush_sparse_text")
+        images = folder / "images.txt"
+        images.write_text(images.read_text().replace("20240212", "outer"))
 
-    rewrite(tmp_path / "sparse", "plush_sparse_text")
-    (tmp_path / "sparse" / "images.txt").write_text(
-        (data / "plush_sparse_text" / "images.txt").read_text().replace("20240212", "outer")
-    )
-    assert names()[0].startswith("outer")
-    rewrite(tmp_path / "sparse" / "0", "plush_sparse_binary")
-    assert names()[0].startswith("20240212")
-    write_json(tmp_path / "transforms.json", nerfstudio(one))
-    assert names() == ["0"]
-    write_json(tmp_path / "transforms_train.json", nerfstudio(two))
-    assert names() == ["0", "1"]
-    write_json(tmp_path / "cameras.json", [view(img_name="a")])
-    assert names() == ["a"]
-    rewrite(tmp_path, "plush_sparse_binary")
-    assert names()[0].startswith("20240212")
+    for name, write, first in (
+        ("sparse", outer, "outer_003919"),
+        ("sparse/0", lambda path: model(path, "plush_sparse_binary"), "20240212_003919"),
+        ("transforms.json", lambda path: write_json(path, nerfstudio(["b.png"])), "b"),
+        ("transforms_train.json", lambda path: write_json(path, nerfstudio(["c.png", "d.png"])), "c"),
+        ("cameras.json", lambda path: write_json(path, [view(img_name="a")]), "a"),
+        (".", lambda path: model(path, "plush_sparse_binary"), "20240212_003919"),
+    ):
+        write(tmp_path / name)
+        assert load_cameras(tmp_path)[0].name == first, name
 
 
 # What people see -----------------------------------------------------------------------------------------------------
 
 
-def test_a_format_is_one_line_of_the_table(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_format_is_one_line_of_the_table(tmp_path, monkeypatch, capsys):
     """Reading, writing, messages and help know a format as soon as the table does."""
+    scene, ply, other = random_scene(3, 0), str(tmp_path / "a.ply"), str(tmp_path / "a.centres")
 
-    def save(path: Path, scene: Scene) -> None:
+    def save(path, scene):
         np.save(path.open("wb"), scene.means)
 
-    def load(path: Path, trust: bool = False) -> Scene:
-        scene = random_scene(3, 0)
-        return Scene(np.load(path), scene.log_scales, scene.quaternions, scene.opacity_logits, scene.sh)
+    def load(path, trust=False):
+        return dataclasses.replace(scene, means=np.load(path))
 
     added = SceneFormat("Centres", (".centres",), "of this test", load, save)
     monkeypatch.setattr(registry, "SCENE_FORMATS", (*SCENE_FORMATS, added))
-    scene = random_scene(3, 0)
-    save_scene(tmp_path / "a.ply", scene)
-    assert cli.main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "a.centres")]) == 0
-    np.testing.assert_array_equal(load_scene(tmp_path / "a.centres").means, scene.means)
-    assert cli.main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "a.obj")]) == 2
-    assert "or .centres" in capsys.readouterr().err
-    assert cli.main(["convert", str(tmp_path / "a.obj"), str(tmp_path / "b.ply")]) == 2
-    assert "or .centres" in capsys.readouterr().err
+    save_scene(ply, scene)
+    assert cli.main(["convert", ply, other]) == 0
+    assert load_scene(other) == scene
+    for names in ((ply, "a.obj"), ("a.obj", "b.ply")):
+        assert cli.main(["convert", *names]) == 2
+        assert "or .centres" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         cli.main(["convert", "--help"])
-    said = " ".join(capsys.readouterr().out.split())
-    assert said.count("or .centres") == 2
+    assert " ".join(capsys.readouterr().out.split()).count("or .centres") == 2
 
 
-def test_lists_for_people() -> None:
+def test_lists_for_people():
     assert [listed(list("abc")[:n]) for n in range(4)] == ["", "a", "a or b", "a, b or c"]
     assert listed(["a", "b"], "and") == "a and b"
 
@@ -242,7 +215,7 @@ def test_a_file_of_any_format_that_is_written_while_it_is_read(tmp_path, broken)
     path.write_bytes(bytes(64))
     os.utime(path, ns=(0, 0))
 
-    def read() -> None:
+    def read():
         with opened(path):
             path.write_bytes(bytes(65))
             if broken:
@@ -270,38 +243,32 @@ def test_the_folder_of_a_training_is_refused_with_the_name_of_its_scene(tmp_path
         load_scene(tmp_path)
     said = str(caught.value)
     if named is None:
-        assert "has no scene: there is no .ply in it, and no meta.json" in said
-        assert "lod-meta.json" in said
+        assert "has no scene: there is no .ply in it, and no meta.json, lod-meta.json or tileset.json" in said
     assert [file for file in files if f"'{tmp_path / file}'" in said] == ([] if named is None else [files[named]])
 
 
-def test_a_folder_of_scenes_asks_for_one_of_them(tmp_path, data):
+@pytest.mark.parametrize("read", [load_scene, info])
+def test_what_is_no_scene_is_refused_with_what_to_do(tmp_path, data, read):
+    Ladder(tmp_path / "ladder.json", "a.ply", 9, "", (Rung(0.5, "a_q0.5.potr", 3, 1),)).save()
+    for name in ("ckpt_29999_rank0.pt", "a.pth", "step-000029999.ckpt"):
+        (tmp_path / name).write_bytes(b"PK\x03\x04")
+    scenes = tmp_path / "scenes"
+    scenes.mkdir()
     for name in ("a.ply", "b.ply"):
-        shutil.copy(data / "plush_excerpt.ply", tmp_path / name)
-    with pytest.raises(UsageError, match=r"holds 2 scenes: give one of them, such as '.*b\.ply', or all, \*\.ply$"):
-        load_scene(tmp_path)
-
-
-@pytest.mark.parametrize("name", ["plush_excerpt_cameras.json", "plush_sparse_text", "plush_transforms"])
-@pytest.mark.parametrize("read", [load_scene, info])
-def test_cameras_in_the_place_of_a_scene(data, name, read):
-    with pytest.raises(UsageError, match="holds cameras, not a scene: give the scene's file, and these as --cameras"):
-        read(data / name)
-
-
-@pytest.mark.parametrize("read", [load_scene, info])
-def test_a_ladder_in_the_place_of_a_scene(tmp_path, read):
-    ladder = Ladder(tmp_path / "ladder.json", "a.ply", 9, "", (Rung(0.5, "a_q0.5.potr", 3, 1),))
-    ladder.save()
-    for path in (tmp_path, ladder.path):
-        with pytest.raises(UsageError, match=r"is a ladder, .* see all of them with potr-cl view SCENE"):
+        shutil.copy(data / "plush_excerpt.ply", scenes / name)
+    a_ladder = r"is a ladder, .* see all of them with potr-cl view SCENE"
+    cameras_here = "holds cameras, not a scene: give the scene's file, and these as --cameras"
+    a_checkpoint = "is a checkpoint of a training, not a scene: export it as PLY, .*"
+    for path, said in (
+        (tmp_path, a_ladder),
+        (tmp_path / "ladder.json", a_ladder),
+        (data / "plush_excerpt_cameras.json", cameras_here),
+        (data / "plush_sparse_text", cameras_here),
+        (data / "plush_transforms", cameras_here),
+        (tmp_path / "ckpt_29999_rank0.pt", a_checkpoint + "gsplat"),
+        (tmp_path / "a.pth", a_checkpoint + "gsplat"),
+        (tmp_path / "step-000029999.ckpt", a_checkpoint + "ns-export"),
+        (scenes, r"holds 2 scenes: give one of them, such as '.*b\.ply', or all, \*\.ply$"),
+    ):
+        with pytest.raises(UsageError, match=said):
             read(path)
-
-
-@pytest.mark.parametrize(
-    ("file", "export"), [("ckpt_29999_rank0.pt", "gsplat"), ("a.pth", "gsplat"), ("step-000029999.ckpt", "ns-export")]
-)
-def test_checkpoints_of_trainings_are_refused_with_the_way_to_export_them(tmp_path, file, export):
-    (tmp_path / file).write_bytes(b"PK\x03\x04")
-    with pytest.raises(UsageError, match=f"is a checkpoint of a training, not a scene: export it as PLY, .*{export}"):
-        info(tmp_path / file)

@@ -1,4 +1,4 @@
-"""Arrays in temporary files: where they lie, what is left of them, and what a full disk does."""
+"""Arrays in temporary files: where they lie, what a full disk does, and how much memory is left."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_an_array_lies_in_a_file_without_a_name(tmp_path, monkeypatch):
 
 @linux
 def test_only_large_arrays_and_only_where_memory_is_bounded():
-    def place(nbytes: int) -> bool:
+    def place(nbytes):
         return in_a_file(mapped.array((nbytes,), np.uint8, "bytes"))
 
     assert not place(10_000_000)
@@ -77,21 +77,17 @@ def test_a_scene_that_is_read_and_what_is_taken_of_it(tmp_path):
         part = read.subset(np.arange(0, 500)[::-1])
         assert in_a_file(read.sh)
         assert in_a_file(part.sh)
-    assert np.array_equal(read.sh, scene.sh)
-    for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
-        assert np.array_equal(getattr(part, name), getattr(scene, name)[::-1])
+    assert read == scene
+    assert part == scene[::-1]
 
 
 @pytest.mark.slow
 def test_a_file_is_the_same_wherever_arrays_lie(plush_excerpt, plush_excerpt_cameras, tmp_path, monkeypatch):
     potr_cl.save(plush_excerpt, tmp_path / "scene.ply")
-    files = []
+    choices, files = {"preset": "fast", "iterations": 2, "memory": 0.25}, []
     for part in (1e9, 1e-9):
         monkeypatch.setattr(mapped, "_PART", part)
-        encoded = potr_cl.encode(
-            tmp_path / "scene.ply", plush_excerpt_cameras[:4], preset="fast", iterations=2, memory=0.25
-        )
-        files.append(encoded.data)
+        files.append(potr_cl.encode(tmp_path / "scene.ply", plush_excerpt_cameras[:4], **choices).data)
     assert files[0] == files[1]
 
 
@@ -124,50 +120,83 @@ def test_a_full_disk_is_told_before_anything_is_written(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@linux
-@pytest.mark.parametrize(("left", "first"), [(1 << 62, True), (5_000_000, False), (1 << 62, False)])
-def test_what_finds_no_room_later_is_kept_in_memory_where_there_is_plenty(left, first, monkeypatch, caplog):
-    """But what the work begins with, whose loss is none, and what there is no memory for."""
-
-    def full(descriptor: int, offset: int, nbytes: int) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "posix_fallocate", full)
-    monkeypatch.setattr(mapped, "memory_left", lambda: left)
-    with mapped.bounded(1_000_000):
-        if first or left < 1 << 62:
-            with pytest.raises(PotrError, match=r"no room for 0\.0 GB of numbers"):
-                mapped.array((1_000_000,), np.float32, "numbers", first)
-            assert caplog.text == ""
-        else:
-            array = mapped.array((1_000_000,), np.float32, "numbers", first)
-            assert array.shape == (1_000_000,)
-            assert not in_a_file(array)
-            mapped.array((1_000_000,), np.float32, "others")
-            assert len(caplog.records) == 1  # it is said once
-            assert "no room for 0.0 GB of numbers" in caplog.text
-            assert "it and what follows takes memory beyond --memory now" in caplog.text
-
-
-def test_an_encode_whose_disk_is_full_after_the_scene_was_read_ends_well(
-    plush_excerpt, plush_excerpt_cameras, tmp_path, monkeypatch, caplog
-):
-    potr_cl.save(plush_excerpt, tmp_path / "scene.ply")
-    monkeypatch.setattr(mapped, "_PART", 1e-9)
-    choices = {"preset": "fast", "iterations": 2, "memory": 0.25}
-    wanted = potr_cl.encode(tmp_path / "scene.ply", plush_excerpt_cameras[:4], **choices).data
+@pytest.fixture
+def full(monkeypatch):
+    """Makes a disk that has room for so many files."""
     if not hasattr(os, "posix_fallocate"):
         pytest.skip("the system takes no room beforehand")
     takes, calls = os.posix_fallocate, []
 
-    def nearly_full(descriptor: int, offset: int, nbytes: int) -> None:
-        calls.append(nbytes)
-        if len(calls) > 1:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        takes(descriptor, offset, nbytes)
+    def make(files):
+        def room(descriptor, offset, nbytes):
+            calls.append(nbytes)
+            if len(calls) > files:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            takes(descriptor, offset, nbytes)
 
-    monkeypatch.setattr(os, "posix_fallocate", nearly_full)
+        monkeypatch.setattr(os, "posix_fallocate", room)
+        return calls
+
+    return make
+
+
+@linux
+@pytest.mark.parametrize(("left", "first"), [(1 << 62, True), (5_000_000, False)])
+def test_what_finds_no_room_is_an_error_where_the_work_begins_or_there_is_no_memory(
+    left, first, full, monkeypatch, caplog
+):
+    full(0)
+    monkeypatch.setattr(mapped, "memory_left", lambda: left)
+    with mapped.bounded(1_000_000), pytest.raises(PotrError, match=r"no room for 0\.0 GB of numbers"):
+        mapped.array((1_000_000,), np.float32, "numbers", first)
+    assert caplog.text == ""
+
+
+@linux
+def test_what_finds_no_room_later_is_kept_in_memory_where_there_is_plenty(full, monkeypatch, caplog):
+    full(0)
+    monkeypatch.setattr(mapped, "memory_left", lambda: 1 << 62)
+    with mapped.bounded(1_000_000):
+        array = mapped.array((1_000_000,), np.float32, "numbers", False)
+        assert array.shape == (1_000_000,)
+        assert not in_a_file(array)
+        mapped.array((1_000_000,), np.float32, "others")
+    assert len(caplog.records) == 1  # it is said once
+    assert "no room for 0.0 GB of numbers" in caplog.text
+    assert "it and what follows takes memory beyond --memory now" in caplog.text
+
+
+def test_an_encode_whose_disk_is_full_after_the_scene_was_read_ends_well(
+    full, plush_excerpt, plush_excerpt_cameras, tmp_path, monkeypatch, caplog
+):
+    potr_cl.save(plush_excerpt, tmp_path / "scene.ply")
+    monkeypatch.setattr(mapped, "_PART", 1e-9)
+    given = (tmp_path / "scene.ply", plush_excerpt_cameras[:2])
+    choices = {"preset": "fast", "iterations": 1, "memory": 0.25}
+    wanted = potr_cl.encode(*given, **choices).data
+    calls = full(1)
     monkeypatch.setattr(mapped, "memory_left", lambda: 1 << 40)
-    assert potr_cl.encode(tmp_path / "scene.ply", plush_excerpt_cameras[:4], **choices).data == wanted
+    assert potr_cl.encode(*given, **choices).data == wanted
     assert len(calls) > 1
     assert "no room for" in caplog.text
+
+
+@linux
+def test_memory_that_is_left_of_this_machine():
+    assert 1 << 20 < mapped.memory_left() < 1 << 50
+
+
+@pytest.mark.parametrize(
+    ("most", "taken", "left"), [("max", "5", 2 << 30), (f"{1 << 30}", "1000", (1 << 30) - 1000), ("10", "20", 0)]
+)
+def test_memory_that_is_left_of_a_container(most, taken, left, tmp_path, monkeypatch):
+    for name, content in (("meminfo", "MemFree: 1 kB\nMemAvailable: 2097152 kB\n"), ("max", most), ("taken", taken)):
+        (tmp_path / name).write_text(content)
+    monkeypatch.setattr(mapped, "_SYSTEM", tmp_path / "meminfo")
+    monkeypatch.setattr(mapped, "_GROUPS", ((tmp_path / "max", tmp_path / "taken"), (tmp_path / "no", tmp_path / "no")))
+    assert mapped.memory_left() == left
+
+
+def test_where_the_system_does_not_say(tmp_path, monkeypatch):
+    monkeypatch.setattr(mapped, "_SYSTEM", tmp_path / "none")
+    assert mapped.memory_left() == 0

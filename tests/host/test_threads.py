@@ -30,7 +30,7 @@ def test_results_come_in_their_order_and_few_are_made_ahead():
             asked.append(number)
             yield number
 
-    def work(number: int) -> int:
+    def work(number):
         time.sleep(0.01 if number % 3 == 0 else 0)
         done.append(number)
         return number * number
@@ -45,11 +45,11 @@ def test_results_come_in_their_order_and_few_are_made_ahead():
 def test_what_work_ahead_raises_is_raised_in_its_turn_and_the_rest_is_left():
     begun = []
 
-    def work(number: int) -> int:
+    def work(number):
         begun.append(number)
         return 1 // (number - 4)
 
-    def use() -> None:
+    def use():
         with Ahead(work, range(1000), 2) as results:
             for number, _ in results:
                 assert number < 4

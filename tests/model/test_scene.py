@@ -1,4 +1,4 @@
-"""Scene: shapes that belong together, activation without overflow, cleaning that counts."""
+"""Scene: shapes that belong together, activation without overflow, cleaning that counts, colours that turn with it."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import pytest
 
 from potr_cl.errors import DataError
 from potr_cl.model import scene as scene_module
+from potr_cl.model.spherical_harmonics import rotated_sh
+from tests.reference.raster import rotation_matrices, sh_basis
 from tests.reference.scenes import random_scene
 
 
@@ -21,30 +23,28 @@ def test_degrees_and_sizes():
 
 
 @pytest.mark.parametrize(
-    ("name", "array"),
+    ("name", "shape"),
     [
-        ("log_scales", np.zeros((7, 2), np.float32)),
-        ("quaternions", np.zeros((6, 4), np.float32)),
-        ("opacity_logits", np.zeros((7, 1), np.float32)),
-        ("sh", np.zeros((7, 5, 3), np.float32)),
-        ("sh", np.zeros((7, 16, 4), np.float32)),
+        ("log_scales", (7, 2)),
+        ("quaternions", (6, 4)),
+        ("opacity_logits", (7, 1)),
+        ("sh", (7, 5, 3)),
+        ("sh", (7, 16, 4)),
     ],
 )
-def test_arrays_that_do_not_belong_together(name, array):
-    with pytest.raises(DataError, match=name if array.shape != (7, 5, 3) else "coefficients"):
-        dataclasses.replace(random_scene(7), **{name: array})
+def test_arrays_that_do_not_belong_together(name, shape):
+    with pytest.raises(DataError, match=name if shape != (7, 5, 3) else "coefficients"):
+        dataclasses.replace(random_scene(7), **{name: np.zeros(shape, np.float32)})
 
 
 def test_activation():
-    scene = random_scene(3, 0)
-    logits = np.array([-200, 0, 200], np.float32)
-    scene = dataclasses.replace(scene, opacity_logits=logits)
+    scene = dataclasses.replace(random_scene(3, 0), opacity_logits=np.array([-200, 0, 200], np.float32))
     with np.errstate(all="raise", under="ignore"):
         assert np.allclose(scene.opacities, [0, 0.5, 1])
     assert np.allclose(scene.scales, np.exp(scene.log_scales))
 
 
-@pytest.mark.parametrize(("splats", "value"), [(1, np.nan), (5, -np.inf), (40000, np.inf)])
+@pytest.mark.parametrize(("splats", "value"), [(1, np.nan), (40000, np.inf), (5, -np.inf)])
 def test_non_finite_splats_are_dropped_and_counted(splats, value):
     rng = np.random.default_rng(splats)
     scene = random_scene(splats + 5, 2)
@@ -57,48 +57,34 @@ def test_non_finite_splats_are_dropped_and_counted(splats, value):
     for strided in (scene, dataclasses.replace(scene, sh=np.asfortranarray(scene.sh))):
         clean, report = strided.cleaned()
         assert (len(clean), report.non_finite, report.zero_quaternions) == (splats, 5, 0)
-        kept = np.setdiff1d(np.arange(splats + 5), bad)
-        assert np.array_equal(clean.sh, scene.sh[kept])
-        assert np.array_equal(clean.means, scene.means[kept])
+        assert clean == scene[np.setdiff1d(np.arange(splats + 5), bad)]
 
 
-def test_infinite_opacity_logits_become_finite():
-    scene = random_scene(4)
+def test_infinite_opacity_logits_become_finite_and_zero_quaternions_the_identity():
+    scene = random_scene(6)
+    assert scene.cleaned()[0] is scene  # not even copied
     scene.opacity_logits[:3] = np.inf, -np.inf, 1
     scene.means[3] = np.nan
+    scene.quaternions[4] = 0
+    scene.quaternions[5] = 1e-20
+    before = scene.quaternions.copy()
     clean, report = scene.cleaned()
-    assert (len(clean), report.non_finite, report.infinite_opacities) == (3, 1, 2)
+    assert (len(clean), report.non_finite, report.infinite_opacities, report.zero_quaternions) == (5, 1, 2, 2)
     assert np.isfinite(clean.opacity_logits).all()
     assert clean.opacities[0] == 1
     assert 0 <= clean.opacities[1] < 1e-8
     assert clean.opacity_logits[2] == 1
+    assert clean.quaternions[3:].tolist() == [[1, 0, 0, 0]] * 2
     assert np.isinf(scene.opacity_logits[:2]).all()
-
-
-def test_zero_quaternions_become_the_identity():
-    scene = random_scene(4)
-    scene.quaternions[1] = 0
-    scene.quaternions[2] = 1e-20
-    before = scene.quaternions.copy()
-    clean, report = scene.cleaned()
-    assert report.zero_quaternions == 2
-    assert clean.quaternions[1:3].tolist() == [[1, 0, 0, 0]] * 2
     assert np.array_equal(scene.quaternions, before)
-
-
-def test_a_clean_scene_is_not_copied():
-    scene = random_scene(4)
-    assert scene.cleaned()[0] is scene
 
 
 def test_nothing_left_is_an_error():
     scene = random_scene(2)
     scene.means[:] = np.nan
-    with pytest.raises(DataError, match="no splat"):
-        scene.cleaned()
-    empty = random_scene(2).subset(np.arange(0))
-    with pytest.raises(DataError, match="no splat"):
-        empty.cleaned()
+    for nothing in (scene, scene[:0]):
+        with pytest.raises(DataError, match="no splat"):
+            nothing.cleaned()
 
 
 def test_many_splats_are_taken_by_threads_as_few_are(monkeypatch):
@@ -107,9 +93,8 @@ def test_many_splats_are_taken_by_threads_as_few_are(monkeypatch):
     few = scene.subset(numbers)
     monkeypatch.setattr(scene_module, "_LARGE", 64)
     many = scene.subset(numbers)
-    for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
-        assert np.array_equal(getattr(many, name), getattr(few, name))
-        assert getattr(many, name).flags.c_contiguous
+    assert many == few
+    assert all(array.flags.c_contiguous for array in many.arrays)
     assert len(scene.subset(np.arange(-700, 0))) == 700  # as NumPy counts
     with pytest.raises(IndexError):
         scene.subset(np.arange(301, 1001))
@@ -124,9 +109,8 @@ def test_scenes_are_joined_in_an_order(monkeypatch, planar):
         some = dataclasses.replace(some, sh=np.ascontiguousarray(some.sh.transpose(1, 2, 0)).transpose(2, 0, 1))
     order = np.random.default_rng(3).permutation(57)
     joined = some.joined(others, order)
-    for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
-        both = np.concatenate([getattr(some, name), getattr(others, name)])
-        assert np.array_equal(getattr(joined, name), both[order])
+    for found, *both in zip(joined.arrays, some.arrays, others.arrays, strict=True):
+        assert np.array_equal(found, np.concatenate(both)[order])
 
 
 def test_without_colours_a_part_of_a_scene_takes_no_memory_for_them():
@@ -136,8 +120,7 @@ def test_without_colours_a_part_of_a_scene_takes_no_memory_for_them():
     part = scene.uncoloured().subset(some)
     taken = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    for name in ("means", "log_scales", "quaternions", "opacity_logits"):
-        assert np.array_equal(getattr(part, name), getattr(scene, name)[some])
+    assert all(map(np.array_equal, part.arrays[:4], scene[some].arrays[:4]))
     assert part.sh.shape == (len(some), 1, 3)
     assert not part.sh.any()
     assert taken < scene.nbytes / 6  # the half of all but the colours, and little else
@@ -157,3 +140,24 @@ def test_splats_are_selected_and_scenes_compared(plush_excerpt):
         plush_excerpt[opaque[:-1]]
     with pytest.raises(TypeError, match="no sequence of splats"):
         list(plush_excerpt)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_a_colour_turns_with_the_scene(degree):
+    rng = np.random.default_rng(degree)
+    quaternion = rng.normal(size=4)
+    rotation = rotation_matrices(quaternion[None] / np.linalg.norm(quaternion))[0]
+    sh = random_scene(70_000 if degree == 1 else 200, degree).sh
+    turned = rotated_sh(sh, rotation)
+    directions = rng.normal(size=(50, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    before = sh_basis(directions, degree) @ sh[-200:].astype(float)
+    after = sh_basis(directions @ rotation.T, degree) @ turned[-200:].astype(float)
+    np.testing.assert_allclose(after, before, atol=3e-6)
+    np.testing.assert_array_equal(turned[:, 0], sh[:, 0])
+
+
+def test_half_a_turn_about_z_changes_signs_alone():
+    sh = random_scene(10, 3).sh
+    turned = rotated_sh(sh, np.diag([-1.0, -1.0, 1.0]))
+    np.testing.assert_allclose(np.abs(turned), np.abs(sh), atol=1e-6)

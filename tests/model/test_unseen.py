@@ -1,4 +1,4 @@
-"""Splats outside of every picture."""
+"""Splats outside of every picture, their groups, and stable orders of many numbers that threads find."""
 
 from __future__ import annotations
 
@@ -9,31 +9,17 @@ import pytest
 
 from potr_cl.host.threads import thread_pool
 from potr_cl.model import order, splat_groups
+from potr_cl.model.order import BITS, ascending, morton_codes, morton_order
 from potr_cl.model.splat_groups import SplatGroups, opacity_weighted_areas, unseen_splats
 from tests.reference.scenes import plain_splats, random_splats, ring_of_cameras, straight_camera
 
 
 def test_what_lies_beside_behind_and_right_in_front_is_unseen():
     camera = straight_camera(60, 60, 60.0, fy=60.0)
-    places = [
-        [0, 0, 5],
-        [0, 0, -5],
-        [0, 0, 0.1],
-        [4, 0, 5],
-        [-4, 0, 5],
-        [0, 4, 5],
-        [0, -4, 5],
-        [2.4, 0, 5],
-        [0, 0, 1e6],
-    ]
-    scene = plain_splats(places, 0.01)
-    assert unseen_splats(scene, [camera]).tolist() == [False, True, True, True, True, True, True, False, False]
-
-
-def test_a_large_splat_beside_the_picture_reaches_into_it():
-    camera = straight_camera(60, 60, 60.0, fy=60.0)
-    assert unseen_splats(plain_splats([[4, 0, 5]], 0.01), [camera])[0]
-    assert not unseen_splats(plain_splats([[4, 0, 5]], 1.0), [camera])[0]
+    beside = [[4, 0, 5], [-4, 0, 5], [0, 4, 5], [0, -4, 5]]
+    places = [[0, 0, 5], [0, 0, -5], [0, 0, 0.1], *beside, [2.4, 0, 5], [0, 0, 1e6]]
+    assert unseen_splats(plain_splats(places, 0.01), [camera]).tolist() == [False, *[True] * 6, False, False]
+    assert not unseen_splats(plain_splats([[4, 0, 5]], 1.0), [camera])[0], "it reaches into the picture"
 
 
 def test_every_view_counts_and_without_views_all_are_unseen():
@@ -82,3 +68,45 @@ def test_threads_make_the_same_groups(monkeypatch, plush_excerpt):
     for group in range(len(found.starts) - 1):
         own = found.order[found.starts[group] : found.starts[group + 1]]
         assert np.array_equal(np.flatnonzero(found.group_of == group), np.sort(own))
+
+
+@pytest.fixture
+def _small_ranges(monkeypatch):
+    """So that a few thousand numbers are many."""
+    monkeypatch.setattr(order, "_LARGE", 1000)
+    monkeypatch.setattr(order, "_RANGE", 128)
+    monkeypatch.setattr(order, "_DEALT", 700)
+    monkeypatch.setattr(order, "_ROWS", 300)
+
+
+@pytest.mark.usefixtures("_small_ranges")
+@pytest.mark.parametrize("kind", ["all equal", "few values", "large", "sorted", "normal"])
+@pytest.mark.parametrize("count", [0, 999, 1000, 5021])
+def test_it_is_the_stable_order(kind, count):
+    rng = np.random.default_rng(3)
+    score = {
+        "all equal": np.full(count, 7, np.uint64),
+        "few values": rng.integers(0, 5, count).astype(np.uint64),
+        "large": rng.integers(0, 1 << 64, count, dtype=np.uint64),
+        "sorted": np.arange(count, dtype=np.uint64),
+        "normal": rng.normal(size=count),
+    }[kind]
+    wanted = np.argsort(score, kind="stable")
+    assert np.array_equal(ascending(score), wanted)
+    with thread_pool(3) as pool:
+        assert np.array_equal(ascending(score, pool.map), wanted)
+
+
+@pytest.mark.usefixtures("_small_ranges")
+def test_morton_codes_have_the_bits_of_three_coordinates_in_turn():
+    rng = np.random.default_rng(4)
+    means = rng.normal(size=(2000, 3)).astype(np.float32)
+    means[5], means[6] = 1e30, -1e30
+    codes = morton_codes(means)
+    low, high = np.percentile(means.astype(np.float64), (2, 98), axis=0)
+    side = 2 * (high - low).max()
+    cells = (means - ((low + high) / 2 - side / 2)) * ((1 << BITS) / side)
+    cells = np.clip(cells, 0, (1 << BITS) - 1).astype(np.uint64)
+    bits = [cells[:, axis] >> np.uint64(bit) & np.uint64(1) for bit in range(BITS) for axis in range(3)]
+    assert np.array_equal(codes, sum(bit << np.uint64(at) for at, bit in enumerate(bits)))
+    assert np.array_equal(morton_order(means), np.argsort(codes, kind="stable"))

@@ -76,9 +76,8 @@ def test_they_have_the_intrinsics_of_the_given_ones_and_no_photograph(tmp_path):
     assert len({camera.name for camera in added}) == len(added)
 
 
-def test_the_same_every_time_and_further_rounds_add_to_earlier_ones():
-    two, again = views_between(BALL, ORBIT, 2), views_between(BALL, ORBIT, 2)
-    assert np.array_equal(camera_centres(two), camera_centres(again))
+def test_further_rounds_add_to_earlier_ones():
+    two = views_between(BALL, ORBIT, 2)
     one, second = views_between(BALL, ORBIT, 1), views_between(BALL, ORBIT, 1, first=1)
     assert [camera.name for camera in one + second] == [camera.name for camera in two]
     assert np.array_equal(camera_centres(one + second), camera_centres(two))
@@ -93,7 +92,7 @@ def test_none_stands_in_matter():
     scene = together(BALL, clutter)
     free, guarded = (camera_centres(views_between(each, ORBIT, 12, 0.05)) for each in (BALL, scene))
 
-    def inside(centres: np.ndarray) -> int:
+    def inside(centres):
         return int((np.linalg.norm(centres[:, None] - posts, axis=2).min(axis=1) < 0.15).sum())
 
     assert inside(free) > 2
@@ -107,16 +106,12 @@ def test_none_is_added_where_it_would_show_what_no_view_shows():
     assert len(views_between(room, pair, 8)) <= 4
 
 
-@pytest.mark.parametrize("cameras", [[], ORBIT[:1]])
-def test_nothing_lies_between_fewer_than_two(cameras):
-    assert views_between(BALL, cameras, 3) == []
-
-
-@pytest.mark.parametrize("cameras", [[ORBIT[0]] * 5, [ORBIT[0], dataclasses.replace(ORBIT[0], name="again")]])
-def test_cameras_at_one_place_do_no_harm(cameras):
+@pytest.mark.parametrize("count", [0, 1, 2, 5])
+def test_nothing_lies_between_fewer_than_two_and_cameras_at_one_place_do_no_harm(count):
     with np.errstate(all="raise", under="ignore"):
-        for camera in views_between(BALL, cameras, 2):
-            assert np.isfinite(camera.translation).all()
+        added = views_between(BALL, [ORBIT[0]] * count, 2)
+    assert count > 1 or added == []
+    assert all(np.isfinite(camera.translation).all() for camera in added)
 
 
 @pytest.mark.parametrize(("each", "spread"), [(-1, 0.3), (1, -0.1), (1, float("nan")), (1, 11)])
@@ -126,12 +121,10 @@ def test_wrong_numbers(each, spread):
 
 
 def test_half_of_the_given_views_get_one():
-    whole, half = views_between(BALL, ORBIT, 1), views_between(BALL, ORBIT, 0.5)
-    assert [camera.name for camera in half] == [camera.name for camera in whole[1::2]]
-    assert len(half) == 6
-    more = views_between(BALL, ORBIT, 1.5)
-    assert [camera.name for camera in more[:12]] == [camera.name for camera in whole]
-    assert len(more) == 18
+    whole, half, more = ([camera.name for camera in views_between(BALL, ORBIT, each)] for each in (1, 0.5, 1.5))
+    assert half == whole[1::2]
+    assert more[:12] == whole
+    assert (len(half), len(more)) == (6, 18)
 
 
 def test_parts_of_a_scene_are_shown_by_the_views_that_face_them():
@@ -163,8 +156,8 @@ def test_views_are_allowed_together_as_one_by_one():
 
 def test_threads_find_the_same_views():
     with thread_pool(3) as pool:
-        found = views_between(BALL, ORBIT, 4, 0.3, run=pool.map)
-    for one, other in zip(found, views_between(BALL, ORBIT, 4, 0.3), strict=True):
+        pair = views_between(BALL, ORBIT, 4, 0.3, run=pool.map), views_between(BALL, ORBIT, 4, 0.3)
+    for one, other in zip(*pair, strict=True):
         assert one.name == other.name
         assert np.array_equal(one.rotation, other.rotation)
         assert np.array_equal(one.translation, other.translation)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import gzip
 import json
 from pathlib import Path
 
@@ -17,35 +18,33 @@ from potr_cl.outputs.potr import Page, Potr
 from potr_cl.pipeline.options import EncodeOptions
 
 pytestmark = [pytest.mark.one_family, pytest.mark.one_runtime]
-needs_viewer = pytest.mark.skipif(
-    not pages.TEMPLATE.exists(), reason="the viewer of pages is not built: python -m tools.make.web"
-)
-FAST = {"prune": False, "refit": False, "compact": False}
+#: The page without the viewer's program, which takes Node to build.
+SOURCE = Path(__file__).parents[2] / "web" / "src" / "page" / "page.html"
 
 
-@pytest.fixture(scope="module")
-def encoded(plush_excerpt, plush_excerpt_cameras, tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("page") / "scene.html"
-    cameras = plush_excerpt_cameras
-    potr_cl.encode(plush_excerpt, cameras, EncodeOptions(output=Page()).changed(prune=False)).save(path)
+@pytest.fixture(autouse=True)
+def template(tmp_path_factory, monkeypatch):
+    path = tmp_path_factory.mktemp("template") / "page.html"
+    viewer = base64.b64encode(gzip.compress(b"the program", mtime=0)).decode()
+    path.write_text(SOURCE.read_text("utf-8").replace("@viewer@", viewer), "utf-8")
+    monkeypatch.setattr(pages, "TEMPLATE", path)
     return path
 
 
-@needs_viewer
-def test_holds_what_a_potr_file_holds(plush_excerpt, tmp_path):
-    whole = potr_cl.encode(plush_excerpt, None, EncodeOptions(output=Page()).changed(**FAST))
+def test_holds_what_a_potr_file_holds_and_loads_nothing_from_elsewhere(plush_excerpt, template, tmp_path):
+    options = {"prune": False, "refit": False, "compact": False}
+    whole, alone = (
+        potr_cl.encode(plush_excerpt, None, EncodeOptions(output=output).changed(**options))
+        for output in (Page(), Potr())
+    )
     inner = pages.scene_in(whole.data)
-    alone = potr_cl.encode(plush_excerpt, None, EncodeOptions(output=Potr()).changed(**FAST))
     assert len(inner) == alone.nbytes
     scene = potr_cl.load_scene(_written(tmp_path / "a.html", whole.data))
     assert np.array_equal(scene.means, potr_cl.decode(inner).means)
     assert sum(Page().properties(whole.data).values()) == len(whole.data)
-    assert Page().properties(whole.data)["viewer"] == pages.TEMPLATE.stat().st_size
-
-
-@needs_viewer
-def test_loads_nothing_from_elsewhere(encoded):
-    text = encoded.read_text()
+    assert Page().properties(whole.data)["viewer"] == template.stat().st_size
+    assert pages.viewer_script() == b"the program"
+    text = (tmp_path / "a.html").read_text("utf-8")
     assert "default-src 'none'" in text
     assert "@" not in text.split('<script id="viewer"')[0].replace("@media", "")
 
@@ -59,12 +58,11 @@ def test_needs_its_viewer(monkeypatch, tmp_path, data, capsys):
     assert not any(tmp_path.iterdir())
 
 
-@needs_viewer
-def test_convert_takes_over_a_file_as_it_is(data, tmp_path, capsys):
+def test_convert_takes_over_a_file_as_it_is(data, template, tmp_path, capsys):
     first, second, third = (tmp_path / f"{name}.html" for name in "abc")
     sound = data / "golden_bundles_antialiased.potr"
     assert main(["convert", str(sound), str(first)]) == 0
-    assert f"{pages.TEMPLATE.stat().st_size:,} of them the viewer" in capsys.readouterr().out
+    assert f"{template.stat().st_size:,} of them the viewer" in capsys.readouterr().out
     assert pages.scene_in(first.read_bytes()) == sound.read_bytes()
     potr_cl.convert(first, second, title="Again")
     assert pages.scene_in(second.read_bytes()) == sound.read_bytes()
@@ -74,7 +72,6 @@ def test_convert_takes_over_a_file_as_it_is(data, tmp_path, capsys):
     assert not third.exists()
 
 
-@needs_viewer
 def test_convert_leaves_no_splat_out(data, plush_excerpt, tmp_path):
     path = tmp_path / "a.html"
     assert main(["convert", str(data / "plush_excerpt.ply"), "-o", str(path)]) == 0
@@ -89,7 +86,6 @@ def test_convert_leaves_no_splat_out(data, plush_excerpt, tmp_path):
         assert np.abs(np.sort(found, axis=0) - np.sort(wanted, axis=0)).max() < most
 
 
-@needs_viewer
 def test_titles_are_text(data, tmp_path):
     path, title = tmp_path / "a.html", '</script><b>@about@ @scene@ & "x"\n\udc80'
     named = ["--title", title, "--author", "<Ada>"]

@@ -6,7 +6,6 @@ import os
 import shutil
 import struct
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,28 +17,32 @@ from tests.cases.cameras import refused, write_image
 
 
 @pytest.fixture
-def model(data: Path, tmp_path: Path) -> Path:
+def model(data, tmp_path):
     return Path(shutil.copytree(data / "plush_sparse_binary", tmp_path / "sparse" / "0"))
 
 
 @pytest.fixture
-def text_model(data: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(data / "plush_sparse_text", tmp_path / "sparse" / "0"))
+def text_model(data, tmp_path):
+    return Path(shutil.copytree(data / "plush_sparse_text", tmp_path / "text"))
 
 
 @pytest.fixture
-def text_model_lines(data: Path, tmp_path: Path) -> Callable[[str], Path]:
-    def write(cameras: str) -> Path:
-        folder = tmp_path / "text"
-        shutil.copytree(data / "plush_sparse_text", folder, dirs_exist_ok=True)
-        (folder / "cameras.txt").write_text(cameras)
-        return folder
+def of_camera(text_model):
+    """The text model with another line for its camera."""
+
+    def write(line):
+        (text_model / "cameras.txt").write_text(line)
+        return text_model
 
     return write
 
 
+#: What the camera of the model is.
+CAMERA = "1 PINHOLE 990 742 800 800 495 371\n"
+
+
 @pytest.mark.parametrize("write", ["write_binary", "write_text"])
-def test_a_model_with_points_rigs_and_several_cameras(write: str, tmp_path: Path) -> None:
+def test_a_model_with_points_rigs_and_several_cameras(write, tmp_path):
     """Against what pycolmap itself reads from the whole model."""
     pycolmap = pytest.importorskip("pycolmap")
     options = pycolmap.SyntheticDatasetOptions()
@@ -62,29 +65,32 @@ def test_a_model_with_points_rigs_and_several_cameras(write: str, tmp_path: Path
     assert [i for i, split in enumerate(in_order) if split == "test"] == list(range(0, len(cameras), 8))
 
 
-def test_ground_truth_of_a_model(model: Path, tmp_path: Path) -> None:
+def test_ground_truth_of_a_model(model, tmp_path):
     assert load_cameras(model)[0].image_path is None
     image = write_image(tmp_path / "images" / "20240212_003919.jpg")
     assert [c.image_path for c in load_cameras(tmp_path)] == [image, *[None] * 16]
 
 
-def test_folders_in_image_names_tell_views_apart(text_model: Path) -> None:
+def test_names_and_numbers_of_images(text_model):
+    """Folders in names tell views apart, names may have blanks, and no two images have the same name or number."""
     images = text_model / "images.txt"
-    renamed = images.read_text().replace("20240212_003920.jpg", "right/20240212_003919.jpg")
-    images.write_text(renamed)
+    original = images.read_text()
+    renamed = original.replace("20240212_003920.jpg", "right/20240212_003919.jpg")
+    images.write_text(renamed.replace("20240212_003922.jpg", "the first one.jpg"))
     names = [camera.name for camera in load_cameras(text_model)]
     assert names[0] == "20240212_003919"
-    assert names[-1] == "right/20240212_003919"
+    assert names[-2:] == ["right/20240212_003919", "the first one"]
     images.write_text(renamed.replace("20240212_003921", "20240212_003919"))
     refused(text_model, r"more than one view has the image '20240212_003919\.jpg'")
+    images.write_text(original.replace("\n2 0.99", "\n1 0.99"))
+    refused(text_model, "two images have the same number")
 
 
-def test_camera_models_that_are_not_read(model: Path, text_model_lines: Callable[[str], Path]) -> None:
+def test_camera_models_that_are_not_read(model):
     data = (model / "cameras.bin").read_bytes()
     for number, name in ((7, "FOV"), (11, "RAD_TAN_THIN_PRISM_FISHEYE"), (99, "number 99"), (-1, "number -1")):
         (model / "cameras.bin").write_bytes(data[:12] + struct.pack("<i", number) + data[16:])
         refused(model, f"camera 1 has the model '{name}', which is not supported: .* 'colmap image_undistorter'")
-    refused(text_model_lines("1 FOV 990 742 800 800 495 371 0.9\n"), "'1' has the model 'FOV', which is not supported")
 
 
 DISTORTED = {
@@ -100,12 +106,7 @@ DISTORTED = {
 
 
 @pytest.mark.parametrize("name", DISTORTED)
-def test_distorted_cameras_cover_the_same_field(
-    model: Path,
-    text_model_lines: Callable[[str], Path],
-    caplog: pytest.LogCaptureFixture,
-    name: str,
-) -> None:
+def test_distorted_cameras_cover_the_same_field(model, of_camera, caplog, name):
     number, params = DISTORTED[name]
     header = struct.pack("<QIiQQ", 1, 1, number, 990, 742)
     (model / "cameras.bin").write_bytes(header + struct.pack(f"<{len(params)}d", *params))
@@ -122,52 +123,61 @@ def test_distorted_cameras_cover_the_same_field(
     u, v = lens.distorted(np.array([0.0, 0.3]), np.array([0.0, -0.2]))
     wanted = theirs.img_from_cam(np.array([[0, 0, 1], [0.3, -0.2, 1]]))
     np.testing.assert_allclose(np.stack([u * lens.fx + lens.cx, v * lens.fy + lens.cy], axis=1), wanted, atol=1e-9)
-    text = text_model_lines(f"1 {name} 990 742 {' '.join(map(str, params))}\n")
+    text = of_camera(f"1 {name} 990 742 {' '.join(map(str, params))}\n")
     assert {camera.lens for camera in load_cameras(text)} == {lens}
 
 
-def test_a_lens_that_bends_nothing_is_none(text_model_lines: Callable[[str], Path]) -> None:
-    (camera, *_) = load_cameras(text_model_lines("1 OPENCV 990 742 800 810 495 371 0 0 0 0\n"))
+def test_a_lens_that_bends_nothing_is_none(of_camera):
+    (camera, *_) = load_cameras(of_camera("1 OPENCV 990 742 800 810 495 371 0 0 0 0\n"))
     assert camera.lens is None
     assert (camera.width, camera.height, camera.fx, camera.fy) == (990, 742, 800, 810)
 
 
-def test_insane_lenses(text_model_lines: Callable[[str], Path]) -> None:
-    refused(text_model_lines("1 SIMPLE_RADIAL 990 742 800 495 371 -50\n"), "camera 1|view .*folds the picture over")
-    refused(text_model_lines("1 SIMPLE_RADIAL 990 742 800 495 371 nan\n"), "coefficient")
-    refused(text_model_lines("1 SIMPLE_RADIAL 990 742 -800 495 371 0.1\n"), "intrinsics")
-    refused(text_model_lines("1 SIMPLE_RADIAL 990 99999999 800 495 371 0.1\n"), "not a number of pixels")
-    refused(text_model_lines("1 SIMPLE_RADIAL 990 742 800 495 371\n"), "truncated")
+TRUNCATED = r"cameras\.txt' is truncated, or is no file of a COLMAP model"
+NO_NUMBER = "is not a (whole )?number|is truncated"
 
 
-def test_damaged_text_models(text_model_lines: Callable[[str], Path]) -> None:
-    for line in ("1 PINHOLE 990\n", "1 PINHOLE 990 742 800 800 495\n", "PINHOLE\n"):
-        refused(text_model_lines(line), r"cameras\.txt' is truncated, or is no file of a COLMAP model")
-    for line in ("", "# nothing\n", "2 PINHOLE 990 742 800 800 495 371\n", "1 PINHOLE x y 800 800 495 371\n"):
-        refused(text_model_lines(line), "is a damaged COLMAP model: ")
-    refused(text_model_lines("1 PINHOLE 990 742 nan 800 495 371\n"), "intrinsics|damaged")
-    refused(
-        text_model_lines("1 PINHOLE 990 99999999 800 800 495 371\n"),
-        "the height of its camera is 99999999, not a number of pixels",
-    )
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("1 FOV 990 742 800 800 495 371 0.9\n", "'1' has the model 'FOV', which is not supported"),
+        ("1 SIMPLE_RADIAL 990 742 800 495 371 -50\n", "view .*folds the picture over"),
+        ("1 SIMPLE_RADIAL 990 742 800 495 371 nan\n", "coefficient"),
+        ("1 SIMPLE_RADIAL 990 742 -800 495 371 0.1\n", "intrinsics"),
+        ("1 SIMPLE_RADIAL 990 99999999 800 495 371 0.1\n", "not a number of pixels"),
+        ("1 SIMPLE_RADIAL 990 742 800 495 371\n", "truncated"),
+        ("1 PINHOLE 990\n", TRUNCATED),
+        ("1 PINHOLE 990 742 800 800 495\n", TRUNCATED),
+        ("PINHOLE\n", TRUNCATED),
+        ("", "is a damaged COLMAP model: "),
+        ("# nothing\n", "is a damaged COLMAP model: "),
+        (CAMERA.replace("1", "2", 1), "is a damaged COLMAP model: "),
+        ("1 PINHOLE x y 800 800 495 371\n", "is a damaged COLMAP model: "),
+        ("1 PINHOLE 990 742 nan 800 495 371\n", "intrinsics|damaged"),
+        ("1 PINHOLE 990 99999999 800 800 495 371\n", "the height of its camera is 99999999, not a number of pixels"),
+        (CAMERA * 2, "camera 1 stands twice"),
+        # Numbers that only Python reads.
+        *((f"1 PINHOLE 990 742 {field} 800 495 371\n", NO_NUMBER) for field in ("1_0", "0x10", "١", "1e", "1 0 0")),
+        *((f"1 PINHOLE {field} 742 800 800 495 371\n", NO_NUMBER) for field in ("1_0", "0x10", "١", "1e", "1 0 0")),
+    ],
+)
+def test_damaged_text_models(of_camera, line, message):
+    refused(of_camera(line), message)
 
 
-def test_every_truncation_of_a_binary_model(model: Path) -> None:
+def test_every_truncation_of_a_binary_model(model):
     """The library itself would take the missing bytes from whatever is in memory, or never return."""
     for name in ("cameras.bin", "images.bin"):
         data = (model / name).read_bytes()
-        for size in range(0, len(data), 1 if name == "cameras.bin" else 13):
-            (model / name).write_bytes(data[:size])
+        cut = [data[:size] for size in range(0, len(data), 1 if name == "cameras.bin" else 13)]
+        for bad in (*cut, data + b"\0", struct.pack("<Q", 1 << 60) + data[8:]):
+            (model / name).write_bytes(bad)
             refused(model, f"{name}' is truncated, or is no file of a COLMAP model")
-        (model / name).write_bytes(data + b"\0")
-        refused(model, f"{name}' is truncated, or is no file of a COLMAP model")
-        (model / name).write_bytes(struct.pack("<Q", 1 << 60) + data[8:])
-        refused(model, f"{name}' is truncated, or is no file of a COLMAP model")
         (model / name).write_bytes(data)
     assert len(load_cameras(model)) == 17
 
 
-def test_unusable_values_in_a_binary_model(model: Path) -> None:
+def test_unusable_values_in_a_binary_model(model):
     data = (model / "images.bin").read_bytes()
     for at, value, message in [
         (12, struct.pack("<d", np.nan), "view '20240212_003919': its rotation is not a unit quaternion"),
@@ -186,39 +196,17 @@ def test_unusable_values_in_a_binary_model(model: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["plush_sparse_binary", "plush_sparse_text"])
-def test_poses_have_the_digits_of_the_library(name: str, data: Path, tmp_path: Path) -> None:
+def test_poses_have_the_digits_of_the_library_without_it(name, data, tmp_path, monkeypatch):
+    """The library would parse again what has been checked, and wants it in a folder, which a killed run would leave."""
     pycolmap = pytest.importorskip("pycolmap")
     shutil.copytree(data / name, tmp_path, dirs_exist_ok=True)
     ending = next(tmp_path.iterdir()).suffix
     (tmp_path / f"points3D{ending}").write_bytes(bytes(8) if ending == ".bin" else b"")
     expected = {Path(image.name).stem: image for image in pycolmap.Reconstruction(tmp_path).images.values()}
-    for camera in load_cameras(data / name):
-        pose = np.column_stack([camera.rotation, camera.translation])
-        assert np.array_equal(pose, expected[camera.name].cam_from_world().matrix())
-
-
-@pytest.mark.parametrize("name", ["plush_sparse_binary", "plush_sparse_text"])
-def test_no_library_and_no_temporary_folder(name: str, data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The library would parse again what has been checked, and wants it in a folder, which a killed run would leave."""
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     monkeypatch.setattr("tempfile.mkdtemp", lambda *args, **kwargs: pytest.fail("a temporary folder was made"))
-    assert len(load_cameras(data / name)) == 17
-
-
-def test_names_of_images_may_have_blanks(text_model: Path) -> None:
-    images = text_model / "images.txt"
-    images.write_text(images.read_text().replace("20240212_003919.jpg", "the first one.jpg"))
-    assert "the first one" in [camera.name for camera in load_cameras(text_model)]
-
-
-def test_numbers_that_stand_twice(text_model: Path, text_model_lines: Callable[[str], Path]) -> None:
-    refused(text_model_lines("1 PINHOLE 990 742 800 800 495 371\n" * 2), "camera 1 stands twice")
-    images = text_model / "images.txt"
-    images.write_text(images.read_text().replace("\n2 0.99", "\n1 0.99"))
-    refused(text_model, "two images have the same number")
-
-
-@pytest.mark.parametrize("field", ["1_0", "0x10", "١", "1e", "--1", "1 0 0"])
-def test_numbers_that_only_python_reads(text_model_lines: Callable[[str], Path], field: str) -> None:
-    refused(text_model_lines(f"1 PINHOLE 990 742 {field} 800 495 371\n"), "is not a number|is truncated")
-    refused(text_model_lines(f"1 PINHOLE {field} 742 800 800 495 371\n"), "is not a whole number|is truncated")
+    cameras = load_cameras(data / name)
+    assert len(cameras) == 17
+    for camera in cameras:
+        pose = np.column_stack([camera.rotation, camera.translation])
+        assert np.array_equal(pose, expected[camera.name].cam_from_world().matrix())
