@@ -138,7 +138,6 @@ def test_names_that_cannot_be(small, cameras_path, capsys, name, place):
     assert set(names()) - {"new"} == {"cameras.json", "loop.ply", "scene.ply"}
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(sys.platform in ("darwin", "win32"), reason="names are Unicode there")
 def test_a_name_that_is_not_utf_8(small, capsys):
     odd = os.fsdecode(b"odd\xff\x1b[31m")
