@@ -63,6 +63,7 @@ def called(capsys, *arguments):
     ("call", "said"),
     [
         (["convert", "a.ply", "x.spz", "--antialiased", "perhaps"], "perhaps"),
+        (["convert", "a.ply", "x.spz", "--spz-version", "1"], "--spz-version"),
         ([], "a command is missing: encode, prune, "),
         (["encod", "a.ply"], "unknown command 'encod': did you mean encode?"),
         (["a.ply"], "to compress a scene: potr-cl encode a.ply -o OUT.potr"),
