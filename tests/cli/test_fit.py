@@ -51,22 +51,6 @@ def test_the_command(paths, capsys):
     assert judged["mean"]["b_against_a"]["psnr"] == pytest.approx(after, abs=0.01)
 
 
-@pytest.mark.parametrize(
-    ("more", "said"),
-    [
-        (("--steps", "-1"), "-1 steps"),
-        (("--steps", "10000000"), "steps of the fit"),
-        (("--views-between", "101"), "from 0 to 100"),
-    ],
-    ids=str,
-)
-def test_what_is_out_of_range_is_told_before_anything_is_read(paths, capsys, more, said):
-    (paths / "half.ply").write_bytes(b"")
-    assert cli.main(command_of(paths, *more)) == 2
-    assert said in capsys.readouterr().err
-    assert not (paths / "out.ply").exists()
-
-
 def test_one_training_view_is_too_few(paths, capsys):
     views = json.loads((paths / "cameras.json").read_text())
     (paths / "cameras.json").write_text(json.dumps([v for v in views if v["split"] == "test" or v["id"] == 1]))

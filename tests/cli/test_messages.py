@@ -78,6 +78,7 @@ def called(capsys, *arguments):
             ["encode", "a.ply", "-o", "c", "--preset", "bset"],
             "must be best, smallest, fast or paper; did you mean best?",
         ),
+        (["encode", "a.ply", "-o", "c", "--max-size", "1M", "-q", "0.2"], "not allowed with argument"),
         (["info", "a.potr", "b.ply"], "'b.ply' is one argument too many"),
         (["info", "a\x1b[31m.ply", "b\x1b[31m.ply"], "'b\\x1b[31m.ply' is one argument too many"),
         (["--print-completion", "bahs"], "did you mean bash?"),

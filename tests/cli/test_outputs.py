@@ -25,12 +25,20 @@ def files(tmp_path_factory, encoded):
     return folder
 
 
+#: What places views, where no cameras are given.
+PLACED = ("--turntable 3", "--virtual-views 3", "--up z", "--size 3")
 #: Values of options that are out of range, and what is said of them.
 WRONG = {
     "encode": [
         *(("-q 1.5", "quality"), ("-q nan", "quality"), ("--sf-sh 0", "sf_sh"), ("--gamma -1", "gamma")),
         *(("--zstd-level 40", "level 40"), ("--threads -2", "--threads")),
         *(("--compact-at 2", "--compact-at is 2"), ("--refit-at 2", "--refit-at is 2")),
+        *((f"--max-size={size}", "size") for size in ("8bananas", "", "-5", "1e", "1.2.3M")),
+        *(
+            ("--max-size=0.1", "0.1 bytes"),
+            ("--min-psnr -3", "-3 dB"),
+            ("--cameras cameras.json --virtual-views 8", "leave it out, or --cameras"),
+        ),
     ],
     "prune": [
         *(("--keep 0", "--keep"), ("--keep 1.5", "--keep"), ("--count 0", "at least 1")),
@@ -42,6 +50,14 @@ WRONG = {
         *(("-q 2", "quality"), ("--memory -1", "memory"), ("--background octarine", "octarine")),
     ],
     "refit": [("--steps=-1", "steps"), ("--prior -1", "prior"), ("--lambda nan", "lam"), ("--drop inf", "drop")],
+    "fit": [("--steps=-1", "-1 steps"), ("--steps 10000000", "steps of the fit"), ("--views-between 101", "0 to 100")],
+    "render": [
+        *(("--up sideways", "--up=x|y|z|-x|-y|-z"), ("--up 0,0,0", "'0,0,0' is not a direction")),
+        ("--up nan,0,1", "is not a direction"),
+        ("--background beige-ish", "unknown colour 'beige-ish'"),
+        *((f"--cameras cameras.json {one}", "without cameras") for one in PLACED),
+    ],
+    "compare": [(f"--cameras cameras.json {one}", "without cameras") for one in PLACED],
 }
 
 
@@ -96,6 +112,10 @@ WRONG = {
         *((f"prune a.ply -o b.ply {wrong}", said) for wrong, said in WRONG["prune"]),
         *((f"compact a.ply -o b.ply {wrong}", said) for wrong, said in WRONG["compact"]),
         *((f"refit a.ply --reference a.ply -o b.ply {wrong}", said) for wrong, said in WRONG["refit"]),
+        *((f"fit a.ply --reference a.ply -o b.ply {wrong}", said) for wrong, said in WRONG["fit"]),
+        *((f"render a.ply -o new {wrong}", said) for wrong, said in WRONG["render"]),
+        *((f"compare a.ply a.ply {wrong}", said) for wrong, said in WRONG["compare"]),
+        ("encode a.ply -o sub --ladder 0.5 --cameras cameras.json --virtual-views 8", "leave it out, or --cameras"),
     ],
 )
 def test_refused_in_one_line_before_any_work(files, capsys, monkeypatch, call, said):
