@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -27,7 +28,7 @@ def files(tmp_path_factory, data) -> dict[str, Path]:
     cameras = folder / "cameras.json"
     cameras.write_text(json.dumps(few))
     scene = potr_cl.read_scene(data / "plush_excerpt.ply")
-    scene = scene.subset(np.arange(0, len(scene), 5))
+    scene = dataclasses.replace(scene, sh=scene.sh[:, :4]).subset(np.arange(0, len(scene), 5))
     reduced = scene.subset(np.arange(0, len(scene), 2))
     for name, each in (("scene", scene), ("reduced", reduced)):
         potr_cl.save(each, folder / f"{name}.ply")

@@ -15,6 +15,7 @@ import json
 import re
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -60,8 +61,8 @@ VALUES: dict[str, Any] = {
     **dict.fromkeys(("--compact", "--one-pass", "--trust", "--antialiased", "--cameras-anyway"), True),
     "--no-prune": False,
     **dict.fromkeys(("--sf-dc", "--sf-sh", "--sf-opacity", "--sf-rotation", "--sf-scale"), 9),
-    **dict.fromkeys(("--level", "--damping"), 0),
-    **dict.fromkeys(("--threads", "--views-between", "--sh-degree"), 1),
+    **dict.fromkeys(("--level", "--damping", "--sh-degree"), 0),
+    **dict.fromkeys(("--threads", "--views-between"), 1),
     **dict.fromkeys(("--levels", "--lod-chunk-count", "--steps"), 2),
     **dict.fromkeys(("--iterations", "--turns", "--zstd-level", "--spz-version", "--turntable"), 3),
     **dict.fromkeys(("--virtual-views", "--prior"), 5),
@@ -107,6 +108,7 @@ WITH: dict[str, list[str]] = {"--report-view": ["--report"], "--compact-at": ["-
 WITHOUT_CAMERAS = {"--virtual-views", "--turntable", "--up", "--size"}
 
 
+@cache
 def options_of(command: str) -> list[argparse.Action]:
     parser = command_parser([command])
     commands = next(action for action in parser._actions if isinstance(action, argparse._SubParsersAction))

@@ -57,6 +57,7 @@ def test_bad_cameras(tmp_path, scene_path, capsys):
     path = tmp_path / "cameras.json"
     path.write_text('{"neither": "nor"}')
     fails(capsys, ["encode", scene_path, "-o", tmp_path / "a.potr", "--cameras", path], 1, "cameras.json")
+    fails(capsys, ["encode", scene_path, "-o", tmp_path / "a.potr", "--cameras", tmp_path / "no.json"], 2, "no.json")
     assert names(tmp_path) == ["cameras.json", "scene.ply"]
 
 

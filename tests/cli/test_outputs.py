@@ -104,6 +104,7 @@ WRONG = {
         ("encode a.ply -o b.potr --report no/b.html", "no' does not exist"),
         ("encode a.ply -o b.potr --report sub", "is a directory"),
         ("decode a.potr -o no/b.ply", "no' does not exist"),
+        ("info .", "is a folder: give the scene in it"),
         ("prune a.ply -o sub", "is a directory"),
         ("compact a.ply -o sub", "is a directory"),
         ("refit a.ply --reference a.ply -o sub", "is a directory"),

@@ -185,7 +185,6 @@ def test_compare_picture(tmp_path, scene_path, potr_path, cameras_path, capsys):
         )
 
 
-@pytest.mark.slow
 def test_compare_with_ground_truth(tmp_path, scene_path, potr_path, cameras_path, capsys):
     """The uncompressed scene's own pictures as photographs: 8 bits are all that A loses."""
     photos = tmp_path / "photos"

@@ -89,7 +89,6 @@ def test_degree_0_has_nothing_to_compact(device, monkeypatch):
     assert len(left) == 50
 
 
-@pytest.mark.one_family
 def test_refits_on_the_way_need_none_at_the_end(device, plush_excerpt, views):
     options = FEW.changed(compact=False, refit={"steps": 0, "at": (0.5,)})
     left, pruned = reduced(plush_excerpt, views, options, device)
@@ -152,7 +151,6 @@ def test_progress_of_pruning_is_of_its_time(device, plush_excerpt, views):
     assert made_again[1:10] == pytest.approx(np.arange(1, 10) / 10)
 
 
-@pytest.mark.one_family
 def test_progress_of_the_refit_is_of_its_time(device, plush_excerpt, views):
     """Before its first step all views are prepared and looked at, after its last one colours are rounded."""
     options = EncodeOptions.for_preset("best", between=False, prune={"iterations": 2})
@@ -173,7 +171,6 @@ def test_a_stage_within_another_counts_for_itself(monkeypatch):
     assert watch.seconds == {"a": 1 + 1 + 3 + 1 + 10, "b": 4, "c": 1}
 
 
-@pytest.mark.one_family
 def test_views_that_see_nothing(device):
     scene = random_scene(60, 1)
     away = [dataclasses.replace(c, translation=np.array([0, 0, -50.0])) for c in ring_of_cameras(2)]
