@@ -242,32 +242,6 @@ def test_a_file_that_cannot_be_decoded_replaces_nothing(small, capsys, monkeypat
     assert names() == ["a.potr", "scene.ply"]
 
 
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")
-@pytest.mark.parametrize("preset", ["paper", "fast"])
-def test_extreme_scenes_are_encoded_or_refused(tmp_path, capsys, preset):
-    """Positions and logarithms of scales that come near to float32's limits."""
-    one = np.array([1.0, -1.0, 1.0])
-    extremes = [*((one * size, 0 * one) for size in (1e37, 2e38, 3.4e38))]
-    extremes += [(0 * one, one * size) for size in (-1e4, 80.0, 88.7)]
-    source, out, back = (tmp_path / each for each in ("i.ply", "o.potr", "back.ply"))
-    for means, log_scales in extremes:
-        scene = random_scene(20, 0)
-        scene.means[:2] = means.astype(np.float32) * np.array([[1], [-1]], np.float32)
-        scene.log_scales[:2] = log_scales.astype(np.float32)
-        ply.save(source, scene)
-        code = cli.main(["encode", str(source), "-o", str(out), "--preset", preset, *KEEP])
-        said = capsys.readouterr().err.splitlines()
-        if code == 0:
-            assert cli.main(["decode", str(out), "-o", str(back)]) == 0
-            out.unlink()
-            back.unlink()
-            continue
-        assert code == 1
-        assert said[-1].startswith("potr-cl: ")
-        assert "unforeseen" not in said[-1]
-        assert names(tmp_path) == ["i.ply"]
-
-
 def test_a_scene_that_is_removed_meanwhile(small, capsys, monkeypatch):
     """What was read is enough."""
     scene = Path("scene.ply")
