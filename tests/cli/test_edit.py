@@ -46,6 +46,15 @@ def test_compact(tmp_path, scene_path, cameras_path, capsys):
     assert np.abs(compacted.sh[:, 1:]).sum() < np.abs(scene.sh[:, 1:]).sum()
 
 
+def test_each_part_of_compaction_can_be_left_out(tmp_path, scene_path, cameras_path, capsys):
+    out, made = tmp_path / "out.ply", set()
+    choices = ([], ["--colour-model", "rgb"], ["--weighting", "visibility"], ["--one-pass"], ["--alpha", "1"])
+    for options in choices:
+        run(capsys, "compact", scene_path, "--cameras", cameras_path, "-o", out, "-q", "0.2", *options)
+        made.add(out.read_bytes())
+    assert len(made) == len(choices)
+
+
 def test_refit(tmp_path, scene_path, dimmed_path, cameras_path, capsys):
     out = tmp_path / "out.ply"
     refit = ["refit", dimmed_path, "--reference", scene_path, "--cameras", cameras_path, "-o", out]
