@@ -32,8 +32,12 @@ def test_prune(tmp_path, scene_path, cameras_path, capsys):
     removal_order = np.load(order)
     assert sorted(removal_order) == list(range(200))
     assert np.array_equal(ply.load(out).means, ply.load(scene_path).means[np.sort(removal_order[150:])])
-    for unseen, limit, kept in (("keep", "0", 200), ("drop", "1e9", 1)):
-        run(capsys, *arguments, "--unseen", unseen, "--delta-mse-max", limit)
+    for more, kept in (
+        (["--keep", "0.5"], 100),
+        (["--delta-mse-max", "0"], 200),
+        (["--delta-mse-max", "1e9", "--unseen", "drop"], 1),
+    ):
+        run(capsys, *arguments, *more)
         assert len(ply.load(out)) == kept
 
 
