@@ -175,8 +175,15 @@ def standard_output_for_data() -> Iterator[BinaryIO]:
     kept = os.dup(descriptor)
     try:
         os.dup2(2, descriptor)
-        with redirect_stdout(sys.stderr), os.fdopen(os.dup(kept), "wb") as stream:
-            yield stream
+        stream = os.fdopen(os.dup(kept), "wb")
+        try:
+            with redirect_stdout(sys.stderr):
+                yield stream
+        except BaseException:
+            with suppress(OSError):  # of what could not be written, which has been told
+                stream.close()
+            raise
+        stream.close()
     finally:
         os.dup2(kept, descriptor)
         os.close(kept)

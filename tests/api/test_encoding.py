@@ -17,8 +17,8 @@ pytestmark = pytest.mark.one_runtime
 OWN = {"file", "command", "seconds", "source"}
 
 
-def test_the_report_is_what_the_command_prints(data, tmp_path, capsys, caplog):
-    scene, cameras = data / "plush_excerpt.ply", data / "plush_excerpt_cameras.json"
+def test_the_report_is_what_the_command_prints(files, tmp_path, capsys, caplog):
+    scene, cameras = files["scene"], files["cameras"]
     words = ["encode", scene, "--cameras", cameras, "--iterations", "2", "--refit", "1", "-o"]
     assert cli.main([str(word) for word in [*words, tmp_path / "a.potr", "--json"]]) == 0
     typed = json.loads(capsys.readouterr().out)
@@ -34,10 +34,11 @@ def test_the_report_is_what_the_command_prints(data, tmp_path, capsys, caplog):
     assert any("kernels for" in message for message in caplog.messages)
 
 
-def test_nothing_is_judged_unless_asked_for(plush_excerpt):
-    encoded = potr_cl.encode(plush_excerpt, prune=False, refit=False)
+def test_without_cameras_virtual_ones_are_placed_and_nothing_is_judged_unless_asked_for(plush_excerpt):
+    encoded = potr_cl.encode(plush_excerpt, virtual_views=8, iterations=1, refit=False)
     assert encoded.report["quality"] == "not judged, as asked"
     assert encoded.report["bytes"] == encoded.nbytes
+    assert potr_cl.info(encoded)["cameras"] == "virtual"
 
 
 def test_help_fits_a_screen_and_leads_to_all_options():

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import subprocess
+import runpy
 import sys
 import threading
-from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 
+import potr_cl
 from potr_cl import UsageError
 from potr_cl.api import pictures
 from potr_cl.api.pictures import Rendering, written_pictures
@@ -20,7 +21,6 @@ from potr_cl.raster.rasterizer import Rasterizer
 from tests.reference.scenes import random_scene, ring_of_cameras
 
 CAMERAS = ring_of_cameras(12)
-ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
@@ -83,13 +83,11 @@ def test_names_of_views_as_names_of_files(view, elsewhere, windows):
     assert pictures.file_name(view, windows=True) == windows
 
 
-def test_a_notebook_shows_a_scene_as_a_picture():
+def test_a_notebook_shows_a_scene_as_a_picture(monkeypatch):
     """Arrays know nothing of rendering: the package tells the notebook, when it is imported there."""
-    pytest.importorskip("IPython")
-    program = (
-        "from IPython.core.interactiveshell import InteractiveShell; shell = InteractiveShell.instance();"
-        "shell.run_cell('import potr_cl; from tests.reference.scenes import random_scene; scene = random_scene(50)');"
-        "shown, _ = shell.display_formatter.format(shell.user_ns['scene']); print(shown['image/png'][:4])"
-    )
-    said = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True, cwd=ROOT)
-    assert said.stdout.strip() == repr(b"\x89PNG")
+    formatters = pytest.importorskip("IPython.core.formatters")
+    shell = SimpleNamespace(display_formatter=formatters.DisplayFormatter())
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
+    runpy.run_path(potr_cl.__file__)
+    shown, _ = shell.display_formatter.format(random_scene(50))
+    assert shown["image/png"].startswith(b"\x89PNG")

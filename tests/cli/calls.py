@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 from potr_cl import cli
 from tests.reference.scenes import ring_of_cameras
 
+ROOT = Path(__file__).parents[2]
 #: Options of an encode that keeps everything, and so looks at no views.
 KEEP = ["--no-prune", "--no-compact", "--refit", "off"]
 
 
-def cameras_json(path: Path, count: int = 8) -> Path:
+def cameras_json(path: Path, count: int = 8, size: int = 64) -> Path:
     """Write that many cameras around the origin."""
     views = [
         {
@@ -26,7 +31,7 @@ def cameras_json(path: Path, count: int = 8) -> Path:
             "fy": camera.fy,
             "split": camera.split,
         }
-        for number, camera in enumerate(ring_of_cameras(count))
+        for number, camera in enumerate(ring_of_cameras(count, size=size))
     ]
     path.write_text(json.dumps(views))
     return path
@@ -35,12 +40,28 @@ def cameras_json(path: Path, count: int = 8) -> Path:
 def fails(capsys, arguments, code, *words) -> None:
     """One clear line on standard error, the exit code, no traceback."""
     assert cli.main([str(a) for a in arguments]) == code
-    captured = capsys.readouterr()
-    lines = [line for line in captured.err.splitlines() if line.startswith("potr-cl: ")]
-    assert len(lines) == 1, captured.err
-    assert "Traceback" not in captured.err
+    err = capsys.readouterr().err
+    lines = [line for line in err.splitlines() if line.startswith("potr-cl: ")]
+    assert len(lines) == 1, err
+    assert "Traceback" not in err
     for word in words:
         assert word in lines[0]
+
+
+def refused(capsys, call: str, *words: str) -> None:
+    """A wrong call of words in a line: one line is all that is said, and the current folder stays as it is."""
+    before = contents(Path())
+    assert cli.main(call.split()) == 2
+    out, err = capsys.readouterr()
+    assert err.startswith("potr-cl: ")
+    assert (out, err.count("\n")) == ("", 1)
+    assert any(word in err for word in words), err
+    assert contents(Path()) == before
+
+
+def contents(folder: Path) -> dict[str, bytes | None]:
+    """All that lies in a folder."""
+    return {str(path): path.read_bytes() if path.is_file() else None for path in sorted(folder.rglob("*"))}
 
 
 def run(capsys, *arguments) -> str:
@@ -49,3 +70,11 @@ def run(capsys, *arguments) -> str:
     captured = capsys.readouterr()
     assert code == 0, captured.err
     return captured.out
+
+
+def program(*words: object, shell: str = '"$@"', **how: Any) -> subprocess.CompletedProcess[Any]:
+    """The program in a process of its own; "$@" of a shell's line stands for it and its arguments."""
+    command = [sys.executable, "-m", "potr_cl", *map(str, words)]
+    how = {"cwd": ROOT, "capture_output": True, "text": True, "timeout": 300, "check": False} | how
+    how["env"] = os.environ | {"PYTHONPATH": str(ROOT)} | how.get("env", {})
+    return subprocess.run(command if shell == '"$@"' else ["bash", "-c", shell, "bash", *command], **how)

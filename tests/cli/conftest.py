@@ -4,10 +4,19 @@ from __future__ import annotations
 
 import pytest
 
-from potr_cl import cli
+import potr_cl
 from potr_cl.formats.scenes import ply
-from tests.cli.calls import KEEP, cameras_json
+from potr_cl.model import agreement
+from tests.cli.calls import cameras_json
 from tests.reference.scenes import random_scene
+
+
+@pytest.fixture(scope="session", autouse=True)
+def judged_once(computed_once):
+    """Whether cameras belong to a scene is asked in one more place by what only looks."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("potr_cl.api.views.judge_cameras", agreement.judge_cameras)
+        yield
 
 
 @pytest.fixture
@@ -17,18 +26,16 @@ def scene_path(tmp_path):
     return path
 
 
+@pytest.fixture(scope="session")
+def encoded():
+    return potr_cl.encode(random_scene(200, 2), prune=False, refit=False, compact=False, zstd_level=1).data
+
+
 @pytest.fixture
-def potr_path(tmp_path, scene_path, capsys):
+def potr_path(tmp_path, scene_path, encoded):
     path = tmp_path / "scene.potr"
-    assert cli.main(["encode", str(scene_path), "-o", str(path), "--zstd-level", "1", *KEEP]) == 0
-    capsys.readouterr()
+    path.write_bytes(encoded)
     return path
-
-
-@pytest.fixture
-def excerpt(data):
-    """Arguments that encode a real excerpt fast."""
-    return ["encode", data / "plush_excerpt.ply", "--cameras", data / "plush_excerpt_cameras.json", "--iterations", "4"]
 
 
 @pytest.fixture

@@ -48,31 +48,24 @@ printf '%s\\n' "${COMPREPLY[@]}"
 """
 
 
-def test_bash(script, tmp_path):
-    path = script("bash")
+def in_bash(path, words, folder):
+    return output("bash", "-c", BASH, "bash", str(path), "potr-cl", *words, cwd=folder).split()
+
+
+def in_fish(path, words, folder):
+    line = " ".join(["potr-cl", *words])
+    said = output("fish", "--no-config", "-c", f"source {path}; complete -C '{line}'", cwd=folder)
+    return [each.split("\t")[0] for each in said.splitlines()]
+
+
+@pytest.mark.parametrize(("shell", "completed"), [("bash", in_bash), ("fish", in_fish)])
+def test_words_are_completed(script, tmp_path, shell, completed):
+    path = script(shell)
     (tmp_path / "scene.potr").touch()
-
-    def completed(*words: str) -> list[str]:
-        return output("bash", "-c", BASH, "bash", str(path), "potr-cl", *words, cwd=tmp_path).split()
-
-    assert completed("enc") == ["encode"]
-    assert completed("encode", "--pres") == ["--preset"]
-    assert completed("encode", "--preset", "") == ["best", "smallest", "fast", "paper"]
-    assert completed("decode", "sce") == ["scene.potr"]
-
-
-def test_fish(script, tmp_path):
-    path = script("fish")
-    (tmp_path / "scene.potr").touch()
-
-    def completed(line: str) -> list[str]:
-        said = output("fish", "--no-config", "-c", f"source {path}; complete -C '{line}'", cwd=tmp_path)
-        return [each.split("\t")[0] for each in said.splitlines()]
-
-    assert completed("potr-cl enc") == ["encode"]
-    assert "--preset" in completed("potr-cl encode --pres")
-    assert completed("potr-cl encode --preset ") == ["best", "smallest", "fast", "paper"]
-    assert completed("potr-cl decode sce") == ["scene.potr"]
+    assert completed(path, ["enc"], tmp_path) == ["encode"]
+    assert "--preset" in completed(path, ["encode", "--pres"], tmp_path)
+    assert completed(path, ["encode", "--preset", ""], tmp_path) == ["best", "smallest", "fast", "paper"]
+    assert completed(path, ["decode", "sce"], tmp_path) == ["scene.potr"]
 
 
 def test_zsh(script, tmp_path):

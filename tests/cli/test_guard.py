@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -14,25 +13,23 @@ from potr_cl import cli
 from potr_cl.cli import guard
 from potr_cl.errors import UsageError
 from potr_cl.formats.scenes import ply
-from tests.cli.calls import cameras_json
+from tests.cli.calls import KEEP, cameras_json, refused
 from tests.reference.scenes import random_scene, ring_of_cameras
 
-Link = Callable[[Path, Path], None]
 
-
-def same_name(_: Path, __: Path) -> None:
+def same_name(source, link):
     """The output is named as the input is."""
 
 
-def symbolic_link(source: Path, link: Path) -> None:
+def symbolic_link(source, link):
     link.symlink_to(source)
 
 
-def hard_link(source: Path, link: Path) -> None:
+def hard_link(source, link):
     os.link(source, link)
 
 
-def link_to_its_folder(source: Path, link: Path) -> None:
+def link_to_its_folder(source, link):
     link.symlink_to(source.parent, target_is_directory=True)
 
 
@@ -40,8 +37,9 @@ LINKS = [same_name, symbolic_link, hard_link, link_to_its_folder]
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """Scenes, cameras in a folder of their own, and photographs of their views."""
+def folder(tmp_path, monkeypatch):
+    """The current folder, with scenes, cameras in a folder of their own, and photographs of their views."""
+    monkeypatch.chdir(tmp_path)
     for name in ("i.ply", "j.ply"):
         ply.save(tmp_path / name, random_scene(20, 0))
     (tmp_path / "x.potr").write_bytes(b"POTR, never read")
@@ -81,10 +79,6 @@ CALLS = [
 ]
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
 def written_suffix(call: str) -> str:
     """Of the output "{out}" of a call."""
     for option, suffix in (("--report", ".html"), ("--order", ".npy"), ("encode", ".potr"), ("compare", ".png")):
@@ -93,30 +87,11 @@ def written_suffix(call: str) -> str:
     return ".ply"
 
 
-def refused(capsys: pytest.CaptureFixture[str], folder: Path, arguments: list[str], *words: str) -> None:
-    before = contents(folder)
-    assert cli.main(arguments) == 2
-    said = capsys.readouterr()
-    assert any(word in said.err for word in words)
-    assert said.err.startswith("potr-cl: ")
-    assert said.err.count("\n") == 1
-    assert said.out == ""
-    assert contents(folder) == before
-
-
 @pytest.mark.parametrize(
     ("call", "target", "link"),
     [*((*CALLS[0], link) for link in LINKS), *((*call, LINKS[n % 2]) for n, call in enumerate(CALLS[1:]))],
 )
-def test_an_output_that_is_an_input(
-    folder: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    call: str,
-    target: str,
-    link: Link,
-) -> None:
-    monkeypatch.chdir(folder)
+def test_an_output_that_is_an_input(folder, capsys, call, target, link):
     source = folder / target
     # Links have the suffix that the command writes: another one is reason enough to refuse.
     out = source if link is same_name else folder / f"link{written_suffix(call)}"
@@ -126,72 +101,45 @@ def test_an_output_that_is_an_input(
     words = ["would be replaced"]
     if out.name == source.name and source.suffix != written_suffix(call):
         words += ["a name that ends in", "give it one of"]
-    refused(capsys, folder, [word.format(out=out) for word in call.split()], *words)
-
-
-def test_a_name_that_leads_through_a_folder_that_is_not_there(
-    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The system finds no "missing/../i.ply", but a file of this name would be written over i.ply."""
-    monkeypatch.chdir(folder)
-    refused(capsys, folder, ["encode", "i.ply", "-o", "missing/../i.ply"], "would be replaced")
+    refused(capsys, call.format(out=out), *words)
 
 
 @pytest.mark.parametrize(
-    "call",
+    ("call", "said"),
     [
-        "encode i.ply -o new --report new",
-        "encode i.ply -o new --report data/../new",
-        "encode i.ply -o new --report link/new",
-        "encode i.ply -o new --report dangling",
-        "prune i.ply -o old --order old",
-        "prune i.ply -o old --order hard",
+        # The system finds no such name, but a file of this name would be written over i.ply.
+        ("encode i.ply -o missing/../i.ply", "would be replaced"),
+        *(
+            (f"encode i.ply -o new --report {report}", "name the same file")
+            for report in ("new", "data/../new", "link/new", "dangling")
+        ),
+        *((f"prune i.ply -o old --order {order}", "name the same file") for order in ("old", "hard")),
+        *(
+            (f"render i.ply --cameras {cameras} -o data/images", "view_0.png' is an input too")
+            for cameras in ("data", "data/cameras.json")
+        ),
+        ("render i.ply --cameras data -o out", "view_2.png' is an input too"),
     ],
 )
-def test_two_outputs_that_are_one(
-    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, call: str
-) -> None:
-    monkeypatch.chdir(folder)
+def test_two_names_of_one_file(folder, capsys, call, said):
     (folder / "link").symlink_to(folder, target_is_directory=True)
     (folder / "dangling").symlink_to("new")
     (folder / "old").write_bytes(b"old")
     os.link(folder / "old", folder / "hard")
-    refused(capsys, folder, call.split(), "name the same file")
-
-
-@pytest.mark.parametrize("cameras", ["data", "data/cameras.json"])
-def test_pictures_in_the_place_of_photographs(
-    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, cameras: str
-) -> None:
-    monkeypatch.chdir(folder)
-    refused(
-        capsys, folder, ["render", "i.ply", "--cameras", cameras, "-o", "data/images"], "view_0.png' is an input too"
-    )
-
-
-def test_a_picture_in_the_place_of_the_scene(
-    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(folder)
     (folder / "out").mkdir()
     os.link(folder / "i.ply", folder / "out" / "view_2.png")
-    refused(capsys, folder, ["render", "i.ply", "--cameras", "data", "-o", "out"], "view_2.png' is an input too")
+    refused(capsys, call, said)
 
 
-def test_what_is_no_input_may_be_replaced(
-    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_no_input_may_be_replaced(folder):
     """Outputs in the folder of the cameras, twice; and pictures, twice."""
-    monkeypatch.chdir(folder)
-    keep = ["--no-prune", "--no-compact", "--refit", "off", "--no-quality"]
+    keep = ["--no-quality", "--report", "data/out.html", *KEEP]
     for _ in range(2):
-        call = ["encode", "i.ply", "-o", "data/out.potr", "--cameras", "data", "--report", "data/out.html", *keep]
-        assert cli.main(call) == 0
+        assert cli.main(["encode", "i.ply", "-o", "data/out.potr", "--cameras", "data", *keep]) == 0
         assert cli.main(["render", "i.ply", "--cameras", "data", "-o", "pictures", "--views", "0"]) == 0
-    capsys.readouterr()
 
 
-def test_every_command_says_of_every_path_what_becomes_of_it() -> None:
+def test_every_command_says_of_every_path_what_becomes_of_it():
     parser = cli.command_parser()
     commands = next(action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
     for name, command in commands.choices.items():
@@ -199,12 +147,12 @@ def test_every_command_says_of_every_path_what_becomes_of_it() -> None:
             assert action.type is not Path, f"{name}: {action.dest}: give it one of the types of {guard.__name__}"
 
 
-def test_a_path_of_which_nothing_is_said_is_a_mistake() -> None:
+def test_a_path_of_which_nothing_is_said_is_a_mistake():
     with pytest.raises(TypeError, match="'scene' is a path"):
         guard.check(argparse.Namespace(scene=Path("i.ply")))
 
 
-def test_inputs_may_be_the_same(folder: Path) -> None:
+def test_inputs_may_be_the_same(folder):
     scene = guard.ReadFile(folder / "i.ply")
     guard.check(argparse.Namespace(a=scene, b=scene))
     with pytest.raises(UsageError):

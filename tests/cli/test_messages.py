@@ -10,8 +10,8 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -21,11 +21,10 @@ from potr_cl.api import inputs
 from potr_cl.cli import command_parser
 from potr_cl.cli.progress import Progress
 from potr_cl.cli.terminal import note, speak
-from potr_cl.errors import UsageError
 from potr_cl.formats.scenes import ply
+from tests.cli.calls import ROOT, cameras_json
 from tests.reference.scenes import random_scene
 
-ROOT = Path(__file__).parents[2]
 COMMANDS = next(
     action.choices for action in command_parser()._actions if isinstance(action, argparse._SubParsersAction)
 )
@@ -37,21 +36,18 @@ def _normal_again():
     speak("normal")
 
 
-@pytest.fixture
-def encode(data, tmp_path):
-    """A short encode of the excerpt."""
-    excerpt, cameras = data / "plush_excerpt.ply", data / "plush_excerpt_cameras.json"
-    return ["encode", excerpt, "--cameras", cameras, "-o", tmp_path / "a.potr", "--iterations", "2", "--refit", "1"]
-
-
 @pytest.fixture(scope="module")
-def told(data, tmp_path_factory):
-    """What such an encode writes to standard error."""
-    path = tmp_path_factory.mktemp("told") / "a.potr"
-    words = ["encode", data / "plush_excerpt.ply", "--cameras", data / "plush_excerpt_cameras.json", "-o", path]
-    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()) as said:
-        assert cli.main([str(word) for word in [*words, "--iterations", "2", "--refit", "1"]]) == 0
-    return said.getvalue()
+def scene(tmp_path_factory):
+    """A small scene, and its cameras."""
+    folder = tmp_path_factory.mktemp("scene")
+    ply.save(folder / "scene.ply", random_scene(200, 2))
+    return folder / "scene.ply", cameras_json(folder / "cameras.json")
+
+
+@pytest.fixture
+def encode(scene, tmp_path):
+    """A short encode."""
+    return ["encode", scene[0], "--cameras", scene[1], "-o", tmp_path / "a.potr", "--iterations", "2", "--refit", "1"]
 
 
 def called(capsys, *arguments):
@@ -66,6 +62,8 @@ def called(capsys, *arguments):
 @pytest.mark.parametrize(
     ("call", "said"),
     [
+        (["convert", "a.ply", "x.spz", "--antialiased", "perhaps"], "perhaps"),
+        (["convert", "a.ply", "x.spz", "--spz-version", "1"], "--spz-version"),
         ([], "a command is missing: encode, prune, "),
         (["encod", "a.ply"], "unknown command 'encod': did you mean encode?"),
         (["a.ply"], "to compress a scene: potr-cl encode a.ply -o OUT.potr"),
@@ -80,6 +78,7 @@ def called(capsys, *arguments):
             ["encode", "a.ply", "-o", "c", "--preset", "bset"],
             "must be best, smallest, fast or paper; did you mean best?",
         ),
+        (["encode", "a.ply", "-o", "c", "--max-size", "1M", "-q", "0.2"], "not allowed with argument"),
         (["info", "a.potr", "b.ply"], "'b.ply' is one argument too many"),
         (["info", "a\x1b[31m.ply", "b\x1b[31m.ply"], "'b\\x1b[31m.ply' is one argument too many"),
         (["--print-completion", "bahs"], "did you mean bash?"),
@@ -108,44 +107,34 @@ def test_every_argument_has_help_and_every_command_can_be_quiet(name):
 # How much is said
 
 
-@pytest.mark.slow
+def test_how_much_is_said(encode, capsys, monkeypatch):
+    code, _, err = called(capsys, *encode)
+    cameras, device, *_ = err.splitlines()
+    assert code == 0
+    assert cameras.endswith("the cameras were taken as they are")
+    assert re.fullmatch(r"on '.+' \(.+\), kernels for [CG]PUs: 200 splats, 6 views of 64 x 64", device)
+    assert not re.search("driver: |reading|[\x1b\r]", err)
+    monkeypatch.setattr(inputs, "_LONG_TO_READ", 10_000)
+    _, _, verbose = called(capsys, *encode, "--verbose")
+    assert re.fullmatch(r"reading .*scene\.ply, 0\.0 GB …", verbose.splitlines()[0])
+    assert "driver: " in verbose
+
+
 def test_quiet_says_nothing_but_what_was_asked_for(encode, capsys):
     assert called(capsys, *encode, "--quiet") == (0, "", "")
-    code, out, err = called(capsys, "info", encode[5], "--quiet")
-    assert (code, err) == (0, "")
-    assert "splats" in out
-    code, out, err = called(capsys, *encode, "--quiet", "--json")
-    assert (code, err) == (0, "")
-    assert out.startswith("{")
+    for call, said in (("info", "splats"), ("encode", "{")):
+        words = ["info", encode[5]] if call == "info" else [*encode, "--json"]
+        code, out, err = called(capsys, *words, "--quiet")
+        assert (code, err) == (0, "")
+        assert said in out
     code, out, err = called(capsys, "decode", "nothing.potr", "-o", "a.ply", "--quiet")
     assert (code, out, err.count("\n")) == (2, "", 1)
 
 
-@pytest.mark.slow
-def test_verbose_says_more(encode, told, capsys):
-    _, _, verbose = called(capsys, *encode, "--verbose")
-    assert "driver: " not in told
-    assert "driver: " in verbose
-
-
-def test_the_device_is_named_first(told):
-    cameras, device = told.splitlines()[:2]
-    assert cameras.endswith("the cameras were taken as they are")
-    assert re.fullmatch(r"on '.+' \(.+\), kernels for [CG]PUs: 1,500 splats, 9 views of 240 x 180", device)
-
-
-def test_a_long_run_says_what_it_will_take(data, tmp_path, capsys, monkeypatch):
-    def far_enough(*_, **__):
-        raise UsageError("far enough")
-
-    monkeypatch.setattr("potr_cl.api.encoder.run_stages", far_enough)
-    ply.save(tmp_path / "a.ply", random_scene(250_000, 0))
-    cameras = data / "plush_excerpt_cameras.json"
-    encode = ["encode", tmp_path / "a.ply", "--cameras", cameras, "-o", tmp_path / "a.potr"]
-    _, _, err = called(capsys, *encode, "--iterations", "1", "--refit", "off", "--no-quality", "--cameras-anyway")
-    first, second = err.splitlines()[:2]
-    assert re.search(r"kernels for [CG]PUs: 250,000 splats, 9 views", first)
-    assert re.fullmatch(r"about [\d.]+ [MG]B of memory( of the device)?", second)
+def test_a_long_run_says_what_it_will_take(encode, capsys, monkeypatch):
+    monkeypatch.setattr("potr_cl.pipeline.forecast._LONG", 1000)
+    _, _, err = called(capsys, *encode)
+    assert re.fullmatch(r"about [\d.]+ [MG]B of memory( of the device)?", err.splitlines()[2])
 
 
 def test_a_long_stage_says_how_long_it_will_go_on(capsys, monkeypatch):
@@ -156,25 +145,15 @@ def test_a_long_stage_says_how_long_it_will_go_on(capsys, monkeypatch):
     assert capsys.readouterr().err.splitlines() == ["a …", "a: about 36 s left", "b …"]
 
 
-@pytest.mark.slow
-def test_what_takes_long_to_read_is_named(encode, told, capsys, monkeypatch):
-    assert "reading" not in told
-    monkeypatch.setattr(inputs, "_LONG_TO_READ", 100_000)
-    _, _, err = called(capsys, *encode)
-    assert re.fullmatch(r"reading .*plush_excerpt\.ply, 0\.0 GB …", err.splitlines()[0])
-
-
 # Progress
 
 
-@pytest.mark.slow
 def test_a_stage_is_told_once_in_a_log(encode, capsys):
-    _, _, err = called(capsys, *encode, "--max-size", "20k")
+    _, _, err = called(capsys, *encode, "--max-size", "4k")
     lines = err.splitlines()
     for stage in ("prepare views", "prune", "refit", "entropy coding", "evaluate"):
         assert lines.count(f"{stage} …") == 1, err
         assert sum(line.startswith(f"{stage}: ") for line in lines) == 1, err
-    assert not re.search("[\x1b\r]", err)
 
 
 def test_a_stage_that_goes_on_is_told_once(capsys):
@@ -201,9 +180,19 @@ class Terminal(io.StringIO):
             time.sleep(0.02)
 
 
-def test_the_clock_ticks_whatever_the_work_does():
+def test_the_clock_ticks_whatever_the_work_does(monkeypatch):
+    class Soon(threading.Event):
+        """Of a clock by which seconds pass faster."""
+
+        def wait(self, timeout=None):
+            return super().wait(timeout / 50)
+
+    now = time.time
+    monkeypatch.setattr("tqdm.std.time", lambda: 50 * now())
+    faster = SimpleNamespace(Event=Soon, Thread=threading.Thread, RLock=threading.RLock)
+    monkeypatch.setattr("potr_cl.cli.progress.threading", faster)
     with contextlib.redirect_stderr(Terminal()) as terminal, Progress() as progress:
-        terminal.shows(r"preparing: 00:0[1-9] elapsed")
+        terminal.shows(r"preparing: 00:\d[1-9] elapsed")
         progress("fit", 0.0)
         terminal.shows(r"fit:   0%.* 00:\d[1-9] elapsed, \? left")
         progress("fit", 1.0)
@@ -234,41 +223,23 @@ def test_what_is_interrupted_is_not_shown_as_done():
 # Terminals
 
 
-def on_a_terminal(*arguments: object, **variables: str) -> str:
-    """What a command writes to standard error where that is a terminal."""
-    pty = pytest.importorskip("pty")
-    import fcntl
-    import struct
-    import termios
-
-    ours, theirs = pty.openpty()
-    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
-    environment = {name: value for name, value in os.environ.items() if name not in ("NO_COLOR", "TERM")}
-    process = subprocess.Popen(
-        [sys.executable, "-m", "potr_cl", *map(str, arguments)],
-        cwd=ROOT, stdin=theirs, stdout=subprocess.DEVNULL, stderr=theirs,
-        env=environment | {"TERM": "xterm"} | variables,
-    )  # fmt: skip
-    os.close(theirs)
-    written = b""
-    try:
-        while part := os.read(ours, 10_000):
-            written += part
-    except OSError:  # Linux's way of saying that the other end is closed
-        pass
-    os.close(ours)
-    process.wait(300)
-    return written.decode()
-
-
-def test_colours_are_for_terminals_that_want_them(capsys):
+@pytest.mark.parametrize(
+    ("variables", "start"),
+    [
+        ({"TERM": "xterm"}, "\x1b[1;31mpotr-cl:\x1b[0m "),
+        ({"TERM": "xterm", "NO_COLOR": "1"}, "potr-cl: "),
+        ({"TERM": "dumb"}, "potr-cl: "),
+    ],
+)
+def test_colours_are_for_terminals_that_want_them(variables, start, monkeypatch, capsys):
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
     wrong = ["decode", "nothing.potr", "-o", "a.ply"]
-    coloured = on_a_terminal(*wrong)
-    assert coloured.startswith("\x1b[1;31mpotr-cl:\x1b[0m ")
-    for variables in ({"NO_COLOR": "1"}, {"TERM": "dumb"}):
-        plain = on_a_terminal(*wrong, **variables)
-        assert "\x1b" not in plain
-        assert plain.startswith("potr-cl: ")
+    with contextlib.redirect_stderr(Terminal()) as terminal:
+        assert cli.main(wrong) == 2
+    assert terminal.getvalue().startswith(start)
+    assert "\x1b" not in terminal.getvalue().removeprefix(start)
     assert "\x1b" not in called(capsys, *wrong)[2]
 
 
@@ -280,13 +251,12 @@ def test_help_has_no_escapes_in_any_version_of_python(monkeypatch, capsys):
     assert "x1b" not in capsys.readouterr().out
 
 
-@pytest.mark.slow
 def test_a_terminal_gets_a_bar(encode):
-    written = on_a_terminal(*encode)
-    assert "elapsed" in written
-    assert "\r" in written
-    assert "…" not in written
-    assert "\r" not in on_a_terminal(*encode, "--quiet")
+    with contextlib.redirect_stderr(Terminal()) as terminal:
+        assert cli.main([str(word) for word in encode]) == 0
+    assert "elapsed" in terminal.getvalue()
+    assert "\r" in terminal.getvalue()
+    assert "…" not in terminal.getvalue()
 
 
 def test_a_warning_has_its_colour_and_is_said_even_if_quiet(capsys):
@@ -301,8 +271,7 @@ def test_a_warning_has_its_colour_and_is_said_even_if_quiet(capsys):
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals")
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
-def test_an_encode_that_is_told_to_end_leaves_nothing(encode, tmp_path, number, code):
+def test_an_encode_that_is_told_to_end_leaves_nothing(encode, tmp_path):
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     target = tmp_path / "a.potr"
@@ -315,9 +284,9 @@ def test_an_encode_that_is_told_to_end_leaves_nothing(encode, tmp_path, number, 
     assert process.stderr is not None
     while "prune …" not in (line := process.stderr.readline()):
         assert line
-    process.send_signal(number)
+    process.send_signal(signal.SIGTERM)
     _, err = process.communicate(timeout=300)
-    assert process.returncode == code
+    assert process.returncode == 143
     assert err.count("\n") == 1
     assert "no file is left half written" in err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.potr", "temporary"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 
 import numpy as np
@@ -36,23 +37,19 @@ def test_render_writes_what_the_rasterizer_sees(tmp_path, potr_path, cameras_pat
 @pytest.mark.parametrize(
     ("options", "views"),
     [
-        (["--split", "test"], [0, 4]),
-        (["--split", "train"], [1, 2, 3, 5, 6, 7]),
-        (["--split", "all"], range(8)),
-        (["--views", "view_3", "5", "view_5"], [3, 5]),
+        (["--split", "test"], ["view_0", "view_4"]),
+        (["--split", "train"], ["0", *(f"view_{k}" for k in (1, 2, 3, 5, 6))]),
+        (["--split", "all"], ["0", *(f"view_{k}" for k in range(7))]),
+        # A view named like a number is that view.
+        (["--views", "view_3", "5", "view_5", "0"], ["0", "view_3", "view_5"]),
     ],
 )
 def test_render_chosen_views(tmp_path, scene_path, cameras_path, capsys, options, views):
+    given = json.loads(cameras_path.read_text())
+    given[7]["img_name"] = "0"
+    cameras_path.write_text(json.dumps(given))
     run(capsys, "render", scene_path, "--cameras", cameras_path, "-o", tmp_path / "out", *options)
-    assert sorted(file.name for file in (tmp_path / "out").iterdir()) == [f"view_{k}.png" for k in views]
-
-
-def test_a_view_named_like_a_number_is_that_view(tmp_path, scene_path, cameras_path, capsys):
-    views = json.loads(cameras_path.read_text())
-    views[7]["img_name"] = "0"
-    cameras_path.write_text(json.dumps(views))
-    run(capsys, "render", scene_path, "--cameras", cameras_path, "-o", tmp_path / "out", "--views", "0", "1")
-    assert sorted(file.name for file in (tmp_path / "out").iterdir()) == ["0.png", "view_1.png"]
+    assert sorted(file.name for file in (tmp_path / "out").iterdir()) == [f"{view}.png" for view in views]
 
 
 def test_pictures_stay_in_their_folder(tmp_path, scene_path, cameras_path, capsys):
@@ -75,15 +72,10 @@ def test_pictures_stay_in_their_folder(tmp_path, scene_path, cameras_path, capsy
 def test_render_bad_calls(tmp_path, scene_path, cameras_path, capsys):
     out = tmp_path / "out"
     render = ["render", scene_path, "--cameras", cameras_path, "-o", out]
-    fails(capsys, ["render", tmp_path / "none.ply", *render[2:]], 2, "none.ply")
     fails(capsys, ["render", cameras_path, *render[2:]], 2, "cameras.json", "holds cameras, not a scene")
-    fails(capsys, [*render[:3], tmp_path / "none.json", *render[4:]], 2, "none.json")
     fails(capsys, [*render, "--views", "view_9"], 2, "'view_9'", "0 ('view_0') to 7 ('view_7')")
     fails(capsys, [*render, "--views", "8"], 2, "'8'")
-    fails(capsys, [*render, "--background", "beige-ish"], 2, "unknown colour 'beige-ish'")
     fails(capsys, [*render, "--device", "no such thing"], 1, "'no such thing'", list_devices()[0].name)
-    (tmp_path / "file").write_bytes(b"")
-    fails(capsys, [*render[:5], tmp_path / "file"], 2, "cannot make the folder")
     (tmp_path / "folder" / "view_0.png").mkdir(parents=True)
     fails(capsys, [*render[:5], tmp_path / "folder"], 2, "view_0.png")
     views = [view for view in json.loads(cameras_path.read_text()) if view["split"] == "train"]
@@ -91,7 +83,7 @@ def test_render_bad_calls(tmp_path, scene_path, cameras_path, capsys):
     fails(capsys, [*render, "--split", "test"], 2, "--split all")
 
 
-def test_compare_from_cameras(tmp_path, scene_path, potr_path, cameras_path, capsys, monkeypatch):
+def test_compare_from_cameras(scene_path, potr_path, cameras_path, capsys, monkeypatch):
     both = [scene_path, potr_path, "--cameras", cameras_path]
     report = json.loads(run(capsys, "compare", *both, "--json"))
     assert [view["name"] for view in report["views"]] == ["view_0", "view_4"]  # the test views
@@ -105,37 +97,32 @@ def test_compare_from_cameras(tmp_path, scene_path, potr_path, cameras_path, cap
     text = run(capsys, "compare", *both)
     assert f"{np.mean(psnrs):.2f}" in text
     assert "LPIPS" not in text
-    with monkeypatch.context() as patch:
-        patch.setitem(sys.modules, "lpips", None)
-        fails(capsys, ["compare", *both, "--lpips"], 2, "LPIPS needs", "pip install")
-    assert len(json.loads(run(capsys, "compare", *both, "--json", "--split", "all"))["views"]) == 8
     assert json.loads(run(capsys, "compare", *both, "--json", "--views", "2"))["worst_view"] == "view_2"
+    monkeypatch.setitem(sys.modules, "lpips", None)
+    fails(capsys, ["compare", *both, "--lpips"], 2, "LPIPS needs", "pip install")
 
 
 def test_compare_with_itself_is_valid_json(scene_path, cameras_path, capsys):
-    report = json.loads(run(capsys, "compare", scene_path, scene_path, "--cameras", cameras_path, "--json"))
-    assert report["mean"]["b_against_a"] == {"psnr": None, "ssim": 1}
-    assert "identical" in run(capsys, "compare", scene_path, scene_path, "--cameras", cameras_path)
+    compare = ["compare", scene_path, scene_path, "--cameras", cameras_path]
+    assert json.loads(run(capsys, *compare, "--json"))["mean"]["b_against_a"] == {"psnr": None, "ssim": 1}
+    assert "identical" in run(capsys, *compare)
 
 
 @pytest.mark.slow
 def test_compare_without_cameras(scene_path, potr_path, capsys):
-    assert cli.main(["compare", str(scene_path), str(potr_path)]) == 0
-    captured = capsys.readouterr()
-    assert "times smaller" in captured.out
-    assert "25 virtual views of 480 x 480 pixels" in captured.out or "30 virtual views of 600 x 600" in captured.out
-    placed = [line for line in captured.out.splitlines() if "no --cameras" in line]
+    compare = ["compare", scene_path, potr_path, "--size", 48]
+    said = run(capsys, *compare)
+    assert "times smaller" in said
+    placed = [line for line in said.splitlines() if "no --cameras" in line]
     assert len(placed) == 1
+    assert re.search("(25|30) virtual views of 48 x 48 pixels", placed[0])
     assert placed[0].endswith("files encoded with cameras look best from those")
-    report = json.loads(run(capsys, "compare", scene_path, potr_path, "--json", "--virtual-views", 2, "--size", 64))
+    report = json.loads(run(capsys, *compare, "--json", "--virtual-views", 2))
     assert (report["a"]["splats"], report["b"]["splats"]) == (200, 200)
     assert [view["name"] for view in report["views"]] == ["virtual_test_000", "virtual_test_001"]
     assert all(25 < view["b_against_a"]["psnr"] < 70 for view in report["views"])
-    turning = json.loads(run(capsys, "compare", scene_path, potr_path, "--json", "--turntable", 3, "--size", 64))
-    assert [view["name"] for view in turning["views"]] == ["turntable_000", "turntable_001", "turntable_002"]
-    one = run(capsys, "compare", scene_path, potr_path, "--turntable", 3, "--views", "1", "--size", 64)
-    assert "turntable_001" in one
-    assert "turntable_000" not in one
+    turning = json.loads(run(capsys, *compare, "--json", "--turntable", 3, "--views", "1"))
+    assert [view["name"] for view in turning["views"]] == ["turntable_001"]
     fails(capsys, ["compare", scene_path, potr_path, "--truth", "x"], 2, "--cameras")
 
 
@@ -167,28 +154,15 @@ def test_render_without_cameras_places_views(tmp_path, scene_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("option", "said"),
     [
-        (["--turntable", "0"], ["0 views"]),
-        (["--virtual-views", "100000"], ["100000 views"]),
-        (["--size", "0"], ["0 x 0"]),
-        (["--size", "99999"], ["99999 x 99999"]),
-        (["--up", "sideways"], ["'sideways' is not a direction", "--up=x|y|z|-x|-y|-z"]),
-        (["--up", "0,0,0"], ["'0,0,0' is not a direction"]),
-        (["--up", "nan,0,1"], ["is not a direction"]),
+        *(("--turntable 0", "0 views"), ("--virtual-views 100000", "100000 views")),
+        *(("--size 0", "0 x 0"), ("--size 99999", "99999 x 99999")),
     ],
 )
-def test_wrong_views_to_place(tmp_path, scene_path, cameras_path, capsys, options, words):
-    render = ["render", scene_path, "-o", tmp_path / "out"]
-    fails(capsys, [*render, *options], 2, *words)
+def test_wrong_numbers_of_views_to_place(tmp_path, scene_path, capsys, option, said):
+    fails(capsys, ["render", scene_path, "-o", tmp_path / "out", *option.split()], 2, said)
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("option", ["--turntable", "--virtual-views", "--up", "--size"])
-def test_views_are_placed_only_without_cameras(tmp_path, scene_path, cameras_path, capsys, option):
-    value = "z" if option == "--up" else "3"
-    for command in (["render", scene_path, "-o", tmp_path / "out"], ["compare", scene_path, scene_path]):
-        fails(capsys, [*command, "--cameras", cameras_path, option, value], 2, option, "without cameras")
 
 
 def test_compare_picture(tmp_path, scene_path, potr_path, cameras_path, capsys):
@@ -211,7 +185,6 @@ def test_compare_picture(tmp_path, scene_path, potr_path, cameras_path, capsys):
         )
 
 
-@pytest.mark.slow
 def test_compare_with_ground_truth(tmp_path, scene_path, potr_path, cameras_path, capsys):
     """The uncompressed scene's own pictures as photographs: 8 bits are all that A loses."""
     photos = tmp_path / "photos"
@@ -220,26 +193,15 @@ def test_compare_with_ground_truth(tmp_path, scene_path, potr_path, cameras_path
     mean = json.loads(run(capsys, *both, "--truth", photos, "--json"))["mean"]
     assert mean["a_against_truth"]["psnr"] > 55
     assert mean["b_against_truth"]["psnr"] == pytest.approx(mean["b_against_a"]["psnr"], abs=0.5)
-    assert "loss by photo" in run(capsys, *both, "--truth", photos)
-
-    picture = tmp_path / "worst.png"
-    with_truth = [*both, "--truth", photos, "-o", picture]
     fails(capsys, [*both, "--truth", tmp_path / "nowhere"], 2, "nowhere")
-    whole = (photos / "view_4.png").read_bytes()
-    (photos / "view_4.png").write_bytes(whole[: len(whole) // 2])
-    fails(capsys, with_truth, 1, "view_4.png", "damaged")
-    Image.new("RGB", (32, 64)).save(photos / "view_4.png")
-    fails(capsys, with_truth, 2, "32 x 64", "64 x 64")
-    assert not picture.exists()
     (photos / "view_4.png").unlink()
-    assert "view 'view_4' has no photograph" in run(capsys, *with_truth)
+    said = run(capsys, *both, "--truth", photos)
+    assert "loss by photo" in said
+    assert "view 'view_4' has no photograph" in said
 
 
 def test_compare_bad_calls(tmp_path, scene_path, potr_path, cameras_path, capsys):
     call = ["compare", scene_path, potr_path, "--cameras", cameras_path]
-    fails(capsys, ["compare", scene_path, tmp_path / "none.potr"], 2, "none.potr")
-    fails(capsys, ["compare", scene_path, potr_path, "--cameras", tmp_path / "none.json"], 2, "none.json")
-    fails(capsys, [*call, "-o", tmp_path], 2, "it is a directory")
     fails(capsys, [*call, "--device", "77"], 1, "'77'")
     fails(capsys, [*call, "--views", "nobody"], 2, "'nobody'")
     potr_path.write_bytes(potr_path.read_bytes()[:-20])

@@ -15,11 +15,12 @@ from potr_cl.model.camera import train_views
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.run import Run, Stopwatch
-from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.code import Code
 from potr_cl.stages.compact import Compact
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.stage import State
+from tests.cases import judging
+from tests.cases.options import as_it_is
 from tests.devices import FAMILIES, open_device
 from tests.reference.scenes import random_scene, ring_of_cameras
 
@@ -38,13 +39,6 @@ def views(plush_excerpt_cameras):
     return [c for c in plush_excerpt_cameras if c.split == "train"][:4]
 
 
-def psnr(device, a, b, cameras):
-    """Mean over views of the second scene's pictures against the first's."""
-    with Rasterizer(device, a) as first, Rasterizer(device, b) as second:
-        errors = [np.mean((first.render(c)[0] - second.render(c)[0]) ** 2) for c in cameras]
-    return float(np.mean(-10 * np.log10(errors)))
-
-
 def reduced(scene, cameras, options, device):
     """The scene after pruning and compaction, and what pruning did."""
     run = Run(options, Stopwatch(), device)
@@ -60,11 +54,12 @@ def test_pruning_and_compaction(device, plush_excerpt, views):
     left, pruned = reduced(plush_excerpt, views, FEW, device)
     assert len(left) == pruned.kept < 0.97 * len(plush_excerpt)
     assert ac_sparsity(left.sh, 51) > ac_sparsity(plush_excerpt.sh[pruned.survivors], 51) + 0.1
-    assert psnr(device, plush_excerpt, left, views) > 40
+    assert judging.psnr(device, plush_excerpt, left, views) > 40
     # All but the colours comes through untouched.
     assert np.array_equal(left.means, plush_excerpt.means[pruned.survivors])
 
 
+@pytest.mark.one_family
 def test_each_on_its_own(device, plush_excerpt, views):
     only_pruned, pruned = reduced(plush_excerpt, views, FEW.changed(compact=False), device)
     assert same(only_pruned, plush_excerpt.subset(pruned.survivors))
@@ -86,6 +81,7 @@ def test_a_small_memory_budget_gives_the_same_scene(device, plush_excerpt, views
     assert same(results[0], results[2])
 
 
+@pytest.mark.one_family
 def test_degree_0_has_nothing_to_compact(device, monkeypatch):
     monkeypatch.setattr("potr_cl.stages.compact.Compactor", None)  # would fail if it were asked
     scene = random_scene(100, 0)
@@ -125,15 +121,13 @@ def test_geometry_of_other_steps_is_not_coded():
     assert len(files) == 1
 
 
-def test_order_names_the_splats_of_the_source(device, plush_excerpt, views):
-    encoded = encode(plush_excerpt, views, FEW.changed(prune={"count": 300}), device=device)
+@pytest.mark.one_family
+def test_order_names_the_splats_of_the_source_and_progress_comes_to_an_end(device, plush_excerpt, views):
+    seen = []
+    options = FEW.changed(prune={"count": 300})
+    encoded = encode(plush_excerpt, views, options, lambda stage, done: seen.append((stage, done)), device)
     assert len(encoded.order) == 300
     assert sorted(encoded.order) == encoded.pruned.survivors.tolist()
-
-
-def test_progress_comes_to_an_end(device, plush_excerpt, views):
-    seen = []
-    encode(plush_excerpt, views, FEW, lambda stage, done: seen.append((stage, done)), device)
     assert [s for s, d in seen if d == 1] == ["prepare views", "compact", "prune", "octree", "entropy coding"]
 
 
@@ -146,15 +140,15 @@ def progress_of(scene, views, options, device) -> dict[str, list[float]]:
     return told
 
 
+@pytest.mark.one_family
 def test_progress_of_pruning_is_of_its_time(device, plush_excerpt, views):
     """The first measurement takes much of it, the last ones little; where views are made again all take as long."""
     options = EncodeOptions.for_preset("best", between=False, prune={"iterations": 10}, refit=False)
     early, late = np.array(progress_of(plush_excerpt, views, options, device)["prune"])[[1, 9]]
     assert early > 0.15
     assert late > 0.95
-    if device.family == "cpu":
-        made_again = progress_of(plush_excerpt, views, options.changed(memory=0), device)["prune"]
-        assert made_again[1:10] == pytest.approx(np.arange(1, 10) / 10)
+    made_again = progress_of(plush_excerpt, views, options.changed(memory=0), device)["prune"]
+    assert made_again[1:10] == pytest.approx(np.arange(1, 10) / 10)
 
 
 def test_progress_of_the_refit_is_of_its_time(device, plush_excerpt, views):
@@ -187,6 +181,7 @@ def test_views_that_see_nothing(device):
     assert len(left) == len(scene)
 
 
+@pytest.mark.one_family
 @pytest.mark.parametrize(
     "bad",
     [{"compact": {"at": -0.1}}, {"refit": {"at": (1.1,)}}, {"prune": {"iterations": 0}}, {"compact": {"lam": -1}}],
@@ -196,8 +191,8 @@ def test_options_out_of_range(device, plush_excerpt, views, bad):
         reduced(plush_excerpt, views, FEW.changed(**bad), device)
 
 
-def test_a_file_is_not_saved_under_the_name_of_another_kind(device, tmp_path, plush_excerpt, views):
-    encoded = encode(plush_excerpt, views, EncodeOptions.for_preset("fast", prune={"iterations": 2}), device=device)
+def test_a_file_is_not_saved_under_the_name_of_another_kind(tmp_path, plush_excerpt):
+    encoded = encode(plush_excerpt, None, as_it_is("fast"))
     for name in ("a.ply", "a.spz", "a.compressed.ply"):
         with pytest.raises(UsageError, match=r"is no name for a \.potr file: encode with to='\."):
             encoded.save(tmp_path / name)

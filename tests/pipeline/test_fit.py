@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from potr_cl.model.camera import resized, train_views
+from potr_cl.model.camera import resized
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
@@ -30,17 +30,10 @@ def device():
     assert device.allocated == 0, "an encode did not give all its memory back"
 
 
-def views_of(kind, cameras, scene):
-    if kind == "virtual":
-        return [resized(camera, 60, 60) for camera in place_cameras(scene, 12)]
-    return train_views(cameras)[:8]
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["given", "virtual"])
-def test_a_fit_that_is_left_out_says_why_and_changes_nothing(device, plush_excerpt, plush_excerpt_cameras, kind):
-    """As that of an excerpt is, whose splats are few and worth much."""
-    views = views_of(kind, plush_excerpt_cameras, plush_excerpt)
+def test_a_fit_that_is_left_out_says_why_and_changes_nothing(device, plush_excerpt):
+    """As that of an excerpt is, whose splats are few and worth much; of virtual views, a search below of given ones."""
+    views = [resized(camera, 60, 60) for camera in place_cameras(plush_excerpt, 12)]
     plain = EncodeOptions(q=0.3, cameras_anyway=True).changed(prune={"iterations": 8})
     without = encode(plush_excerpt, views, plain, device=device)
     with_it = encode(plush_excerpt, views, plain.changed(fit={"steps": 10, "rounds": 2}), device=device)
@@ -86,7 +79,7 @@ def test_time_is_told_only_of_a_fit_that_was_asked_for(device, plush_excerpt, pl
 
 
 @pytest.mark.slow
-def test_what_makes_up_for_splats_rounds_finer(device, plush_excerpt, plush_excerpt_cameras):
+def test_what_makes_up_for_splats_rounds_finer(device, plush_excerpt, plush_excerpt_cameras, half):
     options = EncodeOptions(q=0.3).changed(
         prune={"delta_mse_max": 1e-7}, fit={"steps": 80, "further": 0.2, "cycles": 1}
     )
@@ -98,10 +91,7 @@ def test_what_makes_up_for_splats_rounds_finer(device, plush_excerpt, plush_exce
     assert encoded.parameters.delta_mse_max == plain.delta_mse_max
     for q in (0, 1):
         assert options.changed(q=q).parameters == options.changed(q=q, fit=False).parameters
-
-
-@pytest.mark.slow
-def test_what_only_fits_rounds_as_q_says(half):
+    # What only fits rounds as q says.
     assert half.fitted.spared == 0
     assert half.parameters == HALF.changed(fit=False).parameters
 

@@ -58,23 +58,24 @@ def test_where_values_do_not_grow_one_goes_on(points, side):
     assert place < min(points) if side < 0 else place > max(points)
 
 
-def test_typical_values_grow():
-    for preset in PRESETS:
-        for typical in (Typical.sizes(preset, 1000), Typical.psnrs(preset)):
-            values = [typical.value(q) for q in np.linspace(0, 1, 50)]
-            assert np.all(np.diff(values) > 0)
-            for q in (0, 0.013, 0.3, 0.77, 1):
-                assert typical.quality(typical.value(q)) == pytest.approx(q, abs=1e-5)
-            assert typical.quality(values[0] - 1) == 0
-            assert typical.quality(values[-1] + 1) == 1
+SCALES = [
+    *(
+        (each.value, each.quality)
+        for preset in PRESETS
+        for each in (Typical.sizes(preset, 1000), Typical.psnrs(preset))
+    ),
+    *((each.fineness, each.quality) for each in map(FinenessAxis, (PAPER, PAPER.changed(code={"sf_sh": 7.0})))),
+]
 
 
-def test_qualities_from_fineness():
-    for axis in (FinenessAxis(PAPER), FinenessAxis(PAPER.changed(code={"sf_sh": 7.0}))):
-        for q in (0, 0.00123, 0.1, 0.5, 1):
-            assert axis.quality(axis.fineness(q)) == pytest.approx(q, abs=1e-5)
-        assert axis.quality(axis.fineness(0) - 1) == 0
-        assert axis.quality(axis.fineness(1) + 1) == 1
+@pytest.mark.parametrize(("value", "quality"), SCALES)
+def test_typical_values_and_fineness_grow_and_tell_the_quality(value, quality):
+    values = [value(q) for q in np.linspace(0, 1, 50)]
+    assert np.all(np.diff(values) > 0)
+    for q in (0, 0.00123, 0.013, 0.3, 0.77, 1):
+        assert quality(value(q)) == pytest.approx(q, abs=1e-5)
+    assert quality(values[0] - 1) == 0
+    assert quality(values[-1] + 1) == 1
 
 
 def test_steps_of_another_quality():

@@ -23,30 +23,23 @@ def view(name, psnr, ssim=0.9):
     return {"name": name, "psnr": psnr, "ssim": ssim}
 
 
+def step(left, effect, largest):
+    return {"left": left, "importance": 0.1, "effect": effect, "largest_effect": largest}
+
+
 REPORT = {
     "source": {"file": "a/scene.ply", "bytes": 58_161_747, "splats": 234_517, "sh_degree": 3},
-    "file": "scene.potr",
-    "bytes": 2_957_044,
-    "ratio": 58_161_747 / 2_957_044,
-    "splats": 155_721,
+    **{"file": "scene.potr", "bytes": 2_957_044, "ratio": 58_161_747 / 2_957_044, "splats": 155_721},
     "bytes_a_splat": 2_957_044 / 155_721,
     "properties": {"position": 1_000_000, "scale": 957_044, "colour: AC": 1_000_000},
     "quality": {
-        "against": "the uncompressed scene",
-        "kind": "test",
-        "judged_by": "4 held-out test views",
-        "psnr": 44.0,
-        "ssim": 0.9912,
-        "worst": view("left", 40.125),
+        **{"against": "the uncompressed scene", "kind": "test", "judged_by": "4 held-out test views"},
+        **{"psnr": 44.0, "ssim": 0.9912, "worst": view("left", 40.125)},
         "views": [view("front", 46.0), view("left", 40.125), view("back", 45.0), view("right", None, 1.0)],
     },
     "pruning": {
         "iterations": 3,
-        "history": [
-            {"left": 200_000, "importance": 0.1, "effect": 1e-9, "largest_effect": 1e-12},
-            {"left": 170_000, "importance": 0.1, "effect": -3e-9, "largest_effect": 1e-11},
-            {"left": 155_721, "importance": 0.1, "effect": 5e-9, "largest_effect": 1e-10},
-        ],
+        "history": [step(200_000, 1e-9, 1e-12), step(170_000, -3e-9, 1e-11), step(155_721, 5e-9, 1e-10)],
     },
     "search": None,
     "options": {"q": 0.5, "count": None, "sweep": {"turns": 1}, "background": [0.0, 0.5, 1.0], "lam": None},
@@ -104,7 +97,7 @@ def with_name(report, name):
 def test_page_says_what_the_report_says():
     page = Tags(html_report(REPORT, PAIRS))
     text = " ".join(page.text)
-    for part in (
+    parts = [
         "58.16 MB → 2.96 MB",
         "19.7 ×",
         "155,721",
@@ -114,12 +107,9 @@ def test_page_says_what_the_report_says():
         "33.8 %",
         "40.12 dB",
         "(worst)",
-        "identical",
-        "78,796 of 234,517 splats removed in 3 iterations",
-        "Some GPU",
-        "0.316228",
-        "3.2 s",
-    ):
+    ]
+    parts += ["identical", "78,796 of 234,517 splats removed in 3 iterations", "Some GPU", "0.316228", "3.2 s"]
+    for part in parts:
         assert part in text, part
 
 
@@ -195,17 +185,11 @@ def test_sizes_and_stages_as_people_say_them():
 
 
 def test_views_to_show():
-    shown = views_to_show(REPORT["quality"], "right")
-    assert [(title, entry["name"]) for title, entry in shown] == [
-        ("chosen view", "right"),
-        ("typical view", "back"),
-        ("worst view", "left"),
-    ]
-    shown = views_to_show(REPORT["quality"], "left")
-    assert [(title, entry["name"]) for title, entry in shown] == [
-        ("chosen view, worst view", "left"),
-        ("typical view", "back"),
-    ]
+    for chosen, wanted in (
+        ("right", [("chosen view", "right"), ("typical view", "back"), ("worst view", "left")]),
+        ("left", [("chosen view, worst view", "left"), ("typical view", "back")]),
+    ):
+        assert [(title, entry["name"]) for title, entry in views_to_show(REPORT["quality"], chosen)] == wanted
     assert views_to_show(REPORT["quality"], None)[-1][0] == "first view"
     one = {"views": [view("only", None)]}
     assert views_to_show(one, None) == [("typical view, worst view, first view", view("only", None))]

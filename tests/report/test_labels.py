@@ -19,7 +19,7 @@ def ink(strip: np.ndarray) -> np.ndarray:
     return strip.min(axis=-1) > 120
 
 
-@pytest.mark.parametrize(("height", "width"), [(8, 12), (64, 64), (90, 200), (400, 400), (742, 990)])
+@pytest.mark.parametrize(("height", "width"), [(8, 12), (64, 64), (742, 990)])
 def test_pictures_stay_as_they_are_below_their_labels(height, width):
     pictures = [picture(height, width, level) for level in (30, 60, 90)]
     made = labelled([(each, name) for each, name in zip(pictures, "ABC", strict=True)], "the heading")
@@ -29,7 +29,7 @@ def test_pictures_stay_as_they_are_below_their_labels(height, width):
     assert made.shape[0] > height
 
 
-@pytest.mark.parametrize("width", [40, 64, 400])
+@pytest.mark.parametrize("width", [40, 400])
 def test_every_picture_has_its_own_label_readably(width):
     made = labelled([(picture(width, width), name) for name in ("A", "B", "")])
     strip = made[:-width]
@@ -101,7 +101,7 @@ def test_the_report_says_the_same():
     assert view_label("view_4", None) == "view_4, identical"
 
 
-@pytest.mark.parametrize("count", [1, 3, 4, 6])
+@pytest.mark.parametrize("count", [1, 4, 6])
 def test_a_contact_sheet_holds_all_pictures(count):
     pictures = [(picture(300, 600, 40 + 20 * k), f"view_{k}") for k in range(count)]
     sheet = contact_sheet(pictures, "a heading")
