@@ -30,9 +30,7 @@ GOLDEN = sorted((Path(__file__).parents[1] / "data").glob("golden_*.potr"))
 ATTRIBUTES = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
 PATHS = {"numpy": "0", "native": "1"}
 #: A path is chosen by the environment: hypothesis need not undo it between its examples, as each sets it anew.
-SETTINGS = settings(
-    max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
-)
+SETTINGS = settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 
 
 @pytest.fixture
@@ -78,14 +76,7 @@ def coded(scene: Scene, preset="best", q=0.5, entropy="bundles") -> bytes:
 # The same bits --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("path", GOLDEN, ids=lambda path: path.stem)
-def test_golden_files(path, choose):
-    for threads in (1, 3):
-        assert assert_alike(path.read_bytes(), choose, threads)
-
-
-@pytest.mark.parametrize("entropy", ["bundles", "zstd"])
-@pytest.mark.parametrize("q", [0.1, 0.5, 1.0])
+@pytest.mark.parametrize(("q", "entropy"), [(0.1, "bundles"), (1.0, "zstd")])
 def test_a_real_scene(plush_excerpt, q, entropy, choose):
     assert assert_alike(coded(plush_excerpt, q=q, entropy=entropy), choose, 2)
 
@@ -105,13 +96,8 @@ def test_any_scene(splats, degree, seed, preset, entropy, q, spread, copies, cho
     """Small and large integers of every property, whole lanes and odd ones, splats in one place."""
     scene = random_scene(splats, degree, seed=seed)
     scene = scene.subset(np.repeat(np.arange(splats), np.arange(splats) % copies + 1))
-    scene = Scene(
-        scene.means,
-        scene.log_scales + np.float32(np.log(spread)),
-        scene.quaternions,
-        scene.opacity_logits,
-        scene.sh * np.float32(spread),
-    )
+    scene.log_scales[...] += np.float32(np.log(spread))
+    scene.sh[...] *= np.float32(spread)
     assert assert_alike(coded(scene, preset, q, entropy), choose, 2)
 
 
@@ -121,27 +107,16 @@ def test_more_lanes_than_a_group_and_lanes_of_many_steps(choose):
     for splats in (256 * 130 + 1, 8192 * 257 + 3):
         scene = random_scene(400, 0, seed=splats).subset(np.arange(splats) % 400)
         data = coded(scene)
+        found = []
         for path in PATHS:
             choose(path)
-            found = open_file(data, trust=True).scene(2)
-            assert len(found) == splats
-            if path == "numpy":
-                wanted = bits(found)
-        ours = bits(found)
-        assert all(np.array_equal(ours[name], wanted[name]) for name in ATTRIBUTES)
+            found.append(bits(open_file(data, trust=True).scene(2)))
+        for name in ATTRIBUTES:
+            assert len(found[0][name]) == splats
+            assert np.array_equal(found[0][name], found[1][name]), name
 
 
-@pytest.mark.parametrize("name", ["means", "log_scales", "quaternions", "opacity_logits", "sh"])
-def test_properties_one_by_one(plush_excerpt, name, choose):
-    data = coded(plush_excerpt)
-    found = {}
-    for path in PATHS:
-        choose(path)
-        found[path] = np.ascontiguousarray(getattr(open_file(data).body(0), name)())
-    assert np.array_equal(found["native"].view(np.uint32), found["numpy"].view(np.uint32))
-
-
-@pytest.mark.parametrize(("splats", "q"), [(1, 0.5), (255, 0.0), (257, 1.0), (1000, 0.5), (33_000, 0.0), (33_000, 1.0)])
+@pytest.mark.parametrize(("splats", "q"), [(1, 0.5), (257, 1.0), (1000, 0.0)])
 def test_the_encoder_writes_the_same_bytes(splats, q, choose):
     scene = random_scene(min(splats, 700), 2, seed=splats).subset(np.arange(splats) % 700)
     scene.sh[...] *= np.float32(10)
@@ -162,41 +137,43 @@ def at(data: bytes, prop: Property) -> tuple[int, int]:
     return block.offset + section.offset, block.offset + section.offset + section.stored_bytes
 
 
+@pytest.fixture(scope="module")
+def of_many_bundles() -> bytes:
+    return coded(random_scene(5 * 8192, 1, seed=4))
+
+
+def said_of(data: bytes) -> str:
+    """The only refusal, however many threads decode."""
+    (said,) = {outcome(data, threads) for threads in (1, 1, 2, 3, 4, 4, 4)}
+    return said
+
+
 @pytest.mark.parametrize(
     "what", ["checksum of one", "contexts of one, checksum of the next", "words, checksum of another"]
 )
-def test_checksums_that_threads_look_at_come_first(what, choose, monkeypatch):
+def test_checksums_that_threads_look_at_come_first(what, of_many_bundles, choose, monkeypatch):
     """As if sections were opened one after the other: what is wrong with the first of them is told."""
     choose("native")
     monkeypatch.setattr(block_values, "_LARGE", 1)
-    good = coded(random_scene(5 * 8192, 1, seed=4))
-    data = bytearray(good)
-    begin, end = at(good, Property.OPACITY)
-    if what.startswith("contexts"):
-        data[begin + 8] ^= 0xFF
-    elif what.startswith("words"):
-        data[(begin + end) // 2] ^= 0xFF
+    contexts = what.startswith("contexts")
+    data = bytearray(of_many_bundles)
+    begin, end = at(of_many_bundles, Property.OPACITY)
+    if what != "checksum of one":
+        data[begin + 8 if contexts else (begin + end) // 2] ^= 0xFF
     data = bytearray(sealed(bytes(data)))
-    data[at(good, Property.SCALE if what.startswith("contexts") else Property.SH1)[0] + 30] ^= 0xFF
-    said = {outcome(bytes(data), threads) for threads in (1, 3, 4)}
-    assert len(said) == 1
-    wanted = {"c": "section 'sh1' is damaged", "o": "section 'opacity'"}
-    assert said.pop().startswith(wanted["o" if what.startswith("contexts") else "c"])
+    data[at(of_many_bundles, Property.SCALE if contexts else Property.SH1)[0] + 30] ^= 0xFF
+    assert said_of(bytes(data)).startswith("section 'opacity'" if contexts else "section 'sh1' is damaged")
 
 
-def test_threads_name_the_damage_that_one_thread_finds_first(choose):
+def test_threads_name_the_damage_that_one_thread_finds_first(of_many_bundles, choose):
     """Several bundles are damaged, in sections that are decoded early and late."""
     choose("native")
-    good = coded(random_scene(9 * 8192, 1, seed=3))
-    data = bytearray(good)
+    data = bytearray(of_many_bundles)
     for prop, part in ((Property.SH1, 0.5), (Property.OPACITY, 0.9), (Property.ROTATION, 0.95)):
-        begin, end = at(good, prop)
+        begin, end = at(of_many_bundles, prop)
         place = begin + int((end - begin) * part)
         data[place : place + 8] = bytes(value ^ 0x5A for value in data[place : place + 8])
-    data = sealed(bytes(data))
-    said = {outcome(data, threads) for threads in (1, 1, 2, 3, 4, 4, 4, 4)}
-    assert len(said) == 1
-    assert said.pop().startswith("section 'sh1'")  # half of its words are before the damage
+    assert said_of(sealed(bytes(data))).startswith("section 'sh1'")  # half of its words are before the damage
 
 
 def files_to_change() -> list[bytes]:
@@ -227,7 +204,7 @@ def test_changed_octrees(choose):
     means = rng.normal(size=(200, 3)).astype(np.float32)
     means = np.concatenate([means, means[:20], means[:5]])
     reasons = set()
-    for number in range(500):
+    for number in range(300):
         tree, _ = octree.build(means, 1e-3, absolute=bool(number % 2))
         fields = {
             name: np.array(getattr(tree, name))
@@ -255,7 +232,7 @@ def test_changed_octrees(choose):
 
 def test_the_end_of_the_words_is_seen(choose):
     """A section whose last words are missing, in steps of every width."""
-    data = coded(random_scene(700, 0, seed=4))
+    data = coded(random_scene(300, 0, seed=4))
     refused = 0
     for k, section in enumerate(File.of(data).blocks[0].sections):
         if section.name in STREAMS:
@@ -277,10 +254,13 @@ def test_another_word_than_0_and_1_is_refused(monkeypatch):
         decode(GOLDEN[0])
 
 
-def test_without_the_library(monkeypatch, tmp_path, caplog):
+@pytest.mark.parametrize("content", [None, "this is not machine code"])
+def test_without_the_library(content, monkeypatch, tmp_path, caplog):
     """NumPy decodes, unless the user insists, and that it takes longer is said once."""
     library._tell_once.cache_clear()
-    monkeypatch.setenv(LIBRARY_VARIABLE, str(tmp_path / "nowhere.so"))
+    if content is not None:
+        (tmp_path / "a.so").write_text(content)
+    monkeypatch.setenv(LIBRARY_VARIABLE, str(tmp_path / "a.so"))
     monkeypatch.delenv(VARIABLE, raising=False)
     assert native() is None
     assert len(decode(GOLDEN[0]))
@@ -289,13 +269,6 @@ def test_without_the_library(monkeypatch, tmp_path, caplog):
     monkeypatch.setenv(VARIABLE, "1")
     with pytest.raises(UsageError, match="compiled library is missing"):
         decode(GOLDEN[0])
-
-
-def test_a_library_that_is_none(monkeypatch, tmp_path):
-    (tmp_path / "text.so").write_text("this is not machine code")
-    monkeypatch.setenv(LIBRARY_VARIABLE, str(tmp_path / "text.so"))
-    monkeypatch.delenv(VARIABLE, raising=False)
-    assert native() is None
 
 
 # Sizes are checked before C sees them ---------------------------------------------------------------------------------
