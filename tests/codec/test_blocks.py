@@ -51,12 +51,12 @@ def effects_of(scene: Scene) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return random_scene(3000, 2, seed=4)
+    return random_scene(1600, 2, seed=4)
 
 
 @pytest.fixture(scope="module")
 def data(scene) -> bytes:
-    return b"".join(in_blocks(scene, 800, effects_of(scene)).pieces)
+    return b"".join(in_blocks(scene, 400, effects_of(scene)).pieces)
 
 
 def same(one: Scene, other: Scene) -> bool:
@@ -68,7 +68,7 @@ def same(one: Scene, other: Scene) -> bool:
 
 def test_values_are_those_of_one_piece(scene):
     """But for centres, each block's octree being its own, within the tolerance of both."""
-    apart, whole = in_blocks(scene, 800), code_scene(scene, BEST, ring_of_cameras(4))
+    apart, whole = in_blocks(scene, 400), code_scene(scene, BEST, ring_of_cameras(4))
     a, b = decode(b"".join(apart.pieces)), decode(b"".join(whole.pieces))
     back_a, back_b = np.argsort(apart.order), np.argsort(whole.order)
     assert sorted(apart.order) == list(range(len(scene)))
@@ -81,7 +81,7 @@ def test_values_are_those_of_one_piece(scene):
 
 @pytest.mark.parametrize("entropy", ["bundles", "zstd"])
 def test_the_number_of_threads_changes_nothing(scene, entropy):
-    coded = [in_blocks(scene, 400, effects_of(scene), n, entropy=EntropyCoder(entropy, 3)).pieces for n in (1, 16)]
+    coded = [in_blocks(scene, 200, effects_of(scene), n, entropy=EntropyCoder(entropy, 3)).pieces for n in (1, 16)]
     assert b"".join(coded[0]) == b"".join(coded[1])
     files = [open_file(b"".join(pieces)) for pieces in coded]
     assert same(files[0].scene(threads=1), files[1].scene(threads=16))
@@ -144,7 +144,7 @@ def test_blocks_are_ranges_of_the_morton_order(most):
 
 def test_many_splats_are_written_in_blocks(monkeypatch, plush_excerpt, plush_excerpt_cameras):
     """By a whole encode, of so many splats that are left; few stay what they were, byte for byte."""
-    options = EncodeOptions.for_preset("best", between=False)
+    options = EncodeOptions.for_preset("best", between=False, prune={"iterations": 3})
     few = encode(plush_excerpt, plush_excerpt_cameras, options)
     assert len(open_file(few.data).blocks) == 1
     monkeypatch.setattr(blocks_geometry, "MOST_WHOLE", 300)
@@ -171,9 +171,9 @@ def test_blocks_of_any_size_may_be_asked_for():
 
 @pytest.mark.slow
 def test_they_cost_next_to_nothing():
-    scene = random_scene(200_000, 3, seed=9)
+    scene = random_scene(100_000, 1, seed=9)
     whole = code_scene(scene, BEST, ring_of_cameras(4))
-    assert in_blocks(scene, 100_000).nbytes < 1.005 * whole.nbytes
+    assert in_blocks(scene, 50_000).nbytes < 1.005 * whole.nbytes
 
 
 # What is read of them ------------------------------------------------------------------------------------------------
@@ -228,9 +228,7 @@ def test_a_box_of_any_file(kind, scene, data, tmp_path):
     assert same(found, whole.subset(np.flatnonzero(inside)))
 
 
-@pytest.mark.parametrize(
-    "box", [[90, 90, 90, 91, 91, 91], [1, 0, 0, 0, 1, 1], [0, 0, 0, 1, 1], [0, 0, 0, 1, 1, float("nan")]]
-)
+@pytest.mark.parametrize("box", [[90] * 3 + [91] * 3, [1, 0, 0, 0, 1, 1], [0, 0, 0, 1, 1], [0, 0, 0, 1, 1, np.nan]])
 def test_boxes_that_are_refused(box, data, scene):
     for file in (data, b"".join(code_scene(scene, BEST).pieces)):
         with pytest.raises(UsageError, match="box") as caught:
@@ -238,13 +236,15 @@ def test_boxes_that_are_refused(box, data, scene):
         assert ("NaN" in str(caught.value)) == (box[-1] != box[-1])
 
 
-@pytest.mark.parametrize("degree", range(4))
-def test_a_lower_degree(degree, data):
-    whole, part = decode(data), decode(data, sh_degree=degree)
-    assert np.array_equal(part.sh, whole.sh[:, : (min(degree, 2) + 1) ** 2])
-    assert np.array_equal(part.means, whole.means)
-    with pytest.raises(UsageError, match="SH degree 4"):
-        decode(data, sh_degree=4)
+def test_a_lower_degree(data):
+    whole = decode(data)
+    for degree, coefficients in enumerate((1, 4, 9, 9)):
+        part = decode(data, sh_degree=degree)
+        assert np.array_equal(part.sh, whole.sh[:, :coefficients])
+        assert np.array_equal(part.means, whole.means)
+    for degree in (-1, 4):
+        with pytest.raises(UsageError, match=f"SH degree {degree} is unknown"):
+            decode(data, sh_degree=degree)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes")
@@ -259,13 +259,13 @@ def test_from_a_pipe(data, tmp_path):
 def test_info_lists_the_blocks(data, tmp_path, capsys):
     (tmp_path / "a.potr").write_bytes(data)
     found = potr_cl.info(tmp_path / "a.potr")
-    assert [block["splats"] for block in found["blocks"]] == [750] * 4
-    assert found["splats"] == 3000
+    assert [block["splats"] for block in found["blocks"]] == [400] * 4
+    assert found["splats"] == 1600
     assert sum(entry["bytes"] for entry in found["sections"].values()) == len(data)
     json.dumps(found.facts)
     assert cli.main(["info", str(tmp_path / "a.potr")]) == 0
     out = capsys.readouterr().out
-    assert "blocks          4, of 750 to 750 splats" in out
+    assert "blocks          4, of 400 to 400 splats" in out
 
 
 def test_a_file_that_gets_shorter_while_it_is_open(data, tmp_path):
@@ -280,41 +280,24 @@ def test_a_file_that_gets_shorter_while_it_is_open(data, tmp_path):
         file.scene()
 
 
-def test_where_memory_is_bounded_colours_are_decoded_to_the_disk():
+@pytest.mark.parametrize(("most", "of_all"), [(3_000, 1), (12_000, 0.9)], ids=["blocks", "one piece"])
+def test_where_memory_is_bounded_colours_are_decoded_to_the_disk(most, of_all):
     """Those of all blocks together, and those of the blocks that threads decode meanwhile."""
-    scene = random_scene(20_000, 3, seed=1)
-    data = b"".join(in_blocks(scene, 5_000).pieces)
+    scene = random_scene(12_000, 3, seed=1)
+    data = b"".join(in_blocks(scene, most, entropy=EntropyCoder("zstd", 1)).pieces)
 
-    def decoded(memory: float | None) -> tuple[Scene, int]:
+    def decoded(memory: float | None) -> tuple[Scene, int, int]:
         tracemalloc.start()
         with bounded(memory):
             found = decode(data)
-        peak = tracemalloc.get_traced_memory()[1]
+        left, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
-        return found, peak
+        return found, left, peak
 
-    expected, whole = decoded(None)
-    found, little = decoded(64 * 100_000)  # arrays above 100,000 bytes are large
-    for name in ARRAYS:
-        assert np.array_equal(getattr(found, name), getattr(expected, name))
-    assert little < whole - scene.sh.nbytes
-
-
-def test_where_memory_is_bounded_colours_of_one_block_are_decoded_to_the_disk():
-    scene = random_scene(20_000, 3, seed=1)
-    data = b"".join(code_scene(scene, BEST, ring_of_cameras(4)).pieces)
-
-    def decoded(memory: float | None) -> tuple[Scene, int]:
-        tracemalloc.start()
-        with bounded(memory):
-            found = decode(data)
-        left = tracemalloc.get_traced_memory()[0]
-        tracemalloc.stop()
-        return found, left
-
-    (expected, whole), (found, little) = decoded(None), decoded(64 * 100_000)
-    assert np.array_equal(found.sh, expected.sh)
-    assert little < whole - 0.9 * scene.sh.nbytes
+    (expected, *whole), (found, *little) = decoded(None), decoded(64 * 60_000)  # larger arrays are large
+    assert same(found, expected)
+    for taken, less in zip(whole, little, strict=True):
+        assert less < taken - of_all * scene.sh.nbytes
 
 
 # Files that lie ------------------------------------------------------------------------------------------------------
@@ -340,7 +323,7 @@ def test_single_bytes_changed(data):
             decode(bytes(changed))
 
 
-@pytest.mark.parametrize("left", [0, 7, 8, 30, 47, 48, 100, 250, 1000, -1])
+@pytest.mark.parametrize("left", [0, 7, 8, 30, 48, 250, 1000, -1])
 def test_truncated(left, data, tmp_path):
     (tmp_path / "a.potr").write_bytes(data[:left])
     with pytest.raises(DataError):

@@ -211,7 +211,7 @@ def test_levels_that_no_number_holds_are_refused_alike(monkeypatch):
             splat_levels(scene, np.arange(500), HyperParameters.from_quality(0.5, "best"))
 
 
-@pytest.mark.parametrize("number", [1, 2, 999, 70_001])
+@pytest.mark.parametrize("number", [1, 2, 70_001, 200_000])
 @pytest.mark.parametrize("kind", ["normal", "alike", "sorted", "few"])
 def test_medians_are_numpys(number, kind):
     values = np.random.default_rng(number).lognormal(0, 5, number)
