@@ -97,15 +97,15 @@ def test_pieces_are_short_where_some_work_groups_have_much_more_to_do(monkeypatc
 
 @pytest.mark.slow
 @pytest.mark.parametrize("family", ["gpu", "cpu"])
-@pytest.mark.parametrize("options", [{"preset": "paper"}, {"preset": "best", "fit": {"on": True, "steps": 20}}])
+@pytest.mark.parametrize("options", [{"preset": "paper"}, {"preset": "best", "fit": {"on": True, "steps": 8}}])
 def test_an_encode_in_pieces_has_the_same_bytes(
     plush_excerpt: Scene, plush_excerpt_cameras: list[Camera], family: Family, options: dict[str, object]
 ) -> None:
-    chosen = EncodeOptions.for_preset(**options, q=0.5, prune={"iterations": 6}, cameras_anyway=True)  # type: ignore[arg-type]
+    chosen = EncodeOptions.for_preset(**options, q=0.5, prune={"iterations": 3}, cameras_anyway=True)  # type: ignore[arg-type]
 
     def made(info: DeviceInfo) -> tuple[bytes, Device]:
         device = Device(info, family=family)
-        return encode(plush_excerpt, plush_excerpt_cameras, chosen, device=device).data, device
+        return encode(plush_excerpt, plush_excerpt_cameras[:5], chosen, device=device).data, device
 
     whole, _ = made(choose_device())
     cut, device = made(dataclasses.replace(choose_device(), longest_kernel=1e-9, **SMALL))
