@@ -29,8 +29,8 @@ def test_self_check_passes(device: Device) -> None:
 
 
 def test_programs_are_built_once(device: Device) -> None:
-    assert device.program("opencl/probe.cl", LANES=1) is device.program("opencl/probe.cl", LANES=1)
-    assert device.program("opencl/probe.cl", LANES=1) is not device.program("opencl/probe.cl", LANES=4)
+    first = device.program("opencl/probe.cl", LANES=1)
+    assert device.program("opencl/probe.cl", LANES=1) is first is not device.program("opencl/probe.cl", LANES=4)
 
 
 def test_headers_are_included_once() -> None:
@@ -84,14 +84,6 @@ def test_failing_build_names_the_device(device: Device) -> None:
     assert "\n" not in str(error.value)
 
 
-def test_memory_is_accounted_for(device: Device) -> None:
-    before = device.allocated
-    buffer = device.allocate(1000, "a test")
-    assert device.allocated == before + 1000
-    device.free(buffer)
-    assert device.allocated == before
-
-
 @pytest.mark.parametrize("excess", ["buffer", "memory"])
 def test_allocation_beyond_the_device_is_refused(device: Device, excess: str) -> None:
     nbytes = device.info.largest_buffer + 1 if excess == "buffer" else device.info.memory + 1
@@ -101,24 +93,20 @@ def test_allocation_beyond_the_device_is_refused(device: Device, excess: str) ->
     assert device.allocated == before
 
 
-def test_driver_errors_become_device_errors(device: Device) -> None:
-    with pytest.raises(DeviceError, match="ran out of memory"), device.errors("failed"):
-        raise cl.MemoryError("clEnqueueNDRangeKernel failed: MEM_OBJECT_ALLOCATION_FAILURE")
-    with pytest.raises(DeviceError, match="failed to think"), device.errors("failed to think"):
-        raise cl.LogicError("clSomething failed: INVALID_VALUE\nmore")
-
-
 def test_upload_and_download(device: Device) -> None:
     array = np.arange(24, dtype=np.float32).reshape(2, 3, 4)
+    before = device.allocated
     buffer = device.upload(array.transpose(2, 0, 1), "a test")  # any strides
+    assert device.allocated == before + array.nbytes
     assert np.array_equal(device.download(buffer, (4, 2, 3), np.float32), array.transpose(2, 0, 1))
     device.free(buffer)
+    assert device.allocated == before
     nothing = device.upload(np.empty(0, np.float32), "nothing")
     assert device.download(nothing, (0,), np.float32).size == 0
     device.free(nothing)
 
 
-@pytest.mark.parametrize("count", [1, 4095, 4096, 4097, 5003])
+@pytest.mark.parametrize("count", [1, 4096, 4097, 5003])
 @pytest.mark.parametrize("value", [np.uint8(7), np.float32(-np.inf), np.int64(-3 << 40)])
 def test_large_buffers_are_filled_too(
     device: Device, count: int, value: np.generic, monkeypatch: pytest.MonkeyPatch
@@ -194,7 +182,7 @@ def test_stage_times_need_profiling(device: Device) -> None:
     assert device.stage_times() == {}
 
 
-OUT_OF_MEMORY = [
+NO_MEMORY = [
     cl.MemoryError("clEnqueueNDRangeKernel failed: MEM_OBJECT_ALLOCATION_FAILURE"),
     cl.RuntimeError("clCreateBuffer failed: OUT_OF_HOST_MEMORY"),
     cl.RuntimeError("clEnqueueNDRangeKernel failed: OUT_OF_RESOURCES"),
@@ -203,20 +191,19 @@ OUT_OF_MEMORY = [
     MemoryError("std::bad_alloc"),
     MemoryError(),
 ]
+OTHER_FAULTS = [
+    cl.LogicError("clSomething failed: INVALID_VALUE\nmore"),
+    cl.RuntimeError("clBuildProgram failed: X\n\nBuild on <A>:\n\nerror: OUT_OF_RESOURCES is no type"),
+]
 
 
-@pytest.mark.parametrize("error", OUT_OF_MEMORY, ids=str)
-def test_every_way_to_say_no_memory(device: Device, error: Exception) -> None:
-    with pytest.raises(DeviceMemoryError, match="ran out of memory") as caught, device.errors("failed"):
+@pytest.mark.parametrize("error", [*NO_MEMORY, *OTHER_FAULTS], ids=str)
+def test_driver_errors_become_device_errors(device: Device, error: Exception) -> None:
+    with pytest.raises(DeviceError) as caught, device.errors("failed to think"):
         raise error
+    assert (type(caught.value) is DeviceMemoryError) == (error in NO_MEMORY)
+    assert ("ran out of memory" if error in NO_MEMORY else "failed to think") in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_other_errors_are_not_about_memory(device: Device) -> None:
-    log = "clBuildProgram failed: BUILD_PROGRAM_FAILURE\n\nBuild on <A>:\n\nerror: OUT_OF_RESOURCES is no type"
-    with pytest.raises(DeviceError) as caught, device.errors("failed"):
-        raise cl.RuntimeError(log)
-    assert type(caught.value) is DeviceError
 
 
 def test_a_launch_that_finds_no_memory(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
