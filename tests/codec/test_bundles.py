@@ -9,10 +9,14 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
 from potr_cl.codec.bundles import encoder
 from potr_cl.codec.bundles.decoder import Reader, Wanted
+from potr_cl.codec.bundles.description import known_model
 from potr_cl.codec.bundles.sections import MAIN, ORDER, ROTATION
+from potr_cl.codec.bundles.streams import SIZES as TOKEN_SIZES
+from potr_cl.codec.bundles.streams import TOTAL, normalise
 from potr_cl.codec.decoder import open_file
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.native.library import VARIABLE, VECTORS_VARIABLE, native
@@ -184,7 +188,38 @@ def test_it_is_small():
     assert sum(len(stored[index]) for index in DEGREES) < 600
 
 
-# ------------------------------------------------------------------------------------------------ damage
+# What decoders know ---------------------------------------------------------------------------------------------------
+
+
+@given(hnp.arrays(np.int64, st.integers(1, 252), elements=st.integers(0, 10**9)))
+def test_frequencies_add_up(counts):
+    counts[0] += 1
+    frequencies = normalise(counts)
+    assert frequencies.sum() == TOTAL
+    assert ((frequencies > 0) == (counts > 0)).all()
+
+
+@pytest.mark.parametrize("tokens", [8, 32, 128, 216])
+def test_models_that_decoders_know(tokens):
+    model = known_model(tokens)
+    assert (model.frequencies.sum(axis=1) == TOTAL).all()
+    assert (model.frequencies > 0).all()
+    assert model.classes.tolist() == [size // 8 for size in range(256)]
+    # Larger ones are expected where larger ones were.
+    means = (model.frequencies * np.arange(tokens)).sum(axis=1)
+    assert (np.diff(means) >= 0).all()
+
+
+def test_sizes_of_tokens_are_exact():
+    """⌊16 log2(1 + m) + ½⌋ by whole numbers: (1 + m)³² lies between 2^(2k − 1) and 2^(2k + 1)."""
+    for signed, sizes in TOKEN_SIZES.items():
+        for token, size in enumerate(sizes.tolist()):
+            least = token if token < 128 else (4 + token % 4) << (5 + (token - 128) // 4)
+            power = (1 + ((least + 1) // 2 if signed else least)) ** 32
+            assert 1 << max(2 * size - 1, 0) <= power < 1 << (2 * size + 1)
+
+
+# Damage ---------------------------------------------------------------------------------------------------------------
 
 
 def outcome(stored: dict, splats: int, steps: ColourSteps | None):
@@ -263,7 +298,7 @@ def test_words_and_states_that_no_encoder_leaves_are_refused(paths, small, damag
             assert outcome(damaged, 400, steps) is None
 
 
-# ------------------------------------------------------------------------------------------------ files
+# Files ----------------------------------------------------------------------------------------------------------------
 
 
 @NEEDS_LIBRARY

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from decimal import Decimal, localcontext
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from potr_cl.codec import quantize
+from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.codec.native import quantising
 from potr_cl.codec.native.library import VARIABLE, native
 from potr_cl.codec.quantisers import median
@@ -159,6 +161,41 @@ def test_ac_sparsity():
     sh[:, 0] = 5  # DC does not count
     assert quantize.ac_sparsity(sh, 51) == 35 / 36
     assert quantize.ac_sparsity(sh[:, :1], 51) == 1
+
+
+# The same bits on every processor ------------------------------------------------------------------------------------
+
+
+def nearest_logarithm(value: float) -> np.float32:
+    """By decimal arithmetic with far more digits than a tie could need."""
+    with localcontext() as context:
+        context.prec = 60
+        exact = Decimal(value).ln()
+        near = np.float32(float(exact))
+        around = [np.nextafter(near, np.float32(-np.inf)), near, np.nextafter(near, np.float32(np.inf))]
+        return min(around, key=lambda candidate: abs(Decimal(float(candidate)) - exact))
+
+
+def test_the_logarithm_is_the_nearest_there_is():
+    rng = np.random.default_rng(5)
+    values = np.exp2(rng.uniform(-33, 76, 1500)).astype(np.float32)
+    near_one = 1 + rng.uniform(-1e-3, 1e-3, 300).astype(np.float32)
+    hard = [float.fromhex("0x1.bacb4ap+25"), 1, 2.0**-33, np.sqrt(0.5), np.nextafter(np.float32(1), np.float32(0))]
+    values = np.concatenate([values, near_one, np.array(hard, np.float32)]).astype(np.float32)
+    expected = np.array([nearest_logarithm(float(value)) for value in values])
+    assert np.array_equal(natural_logarithm(values), expected)
+
+
+@pytest.mark.parametrize("factor", [0.001, 1.0, 2001.0, 1e9])
+def test_levels_beyond_the_tables_are_as_those_in_them(factor):
+    """Whatever else is in a block: a table, a larger table, or none."""
+    levels = np.array([0, 1, 2, 255, 256, 257, 65535, 65536, 65537, 1 << 20, 1 << 40], np.int64)
+    for dequantise in (quantize.dequantize_scales, quantize.dequantize_opacities):
+        together = dequantise(levels, factor)
+        assert together.dtype == np.float32
+        assert np.array_equal(together, np.concatenate([dequantise(level[None], factor) for level in levels]))
+    scales = np.maximum(levels.astype(np.float32), np.float32(0.25)) / np.float32(factor)
+    assert np.array_equal(quantize.dequantize_scales(levels, factor), [nearest_logarithm(float(s)) for s in scales])
 
 
 # The loops over all splats --------------------------------------------------------------------------------------------
