@@ -41,24 +41,18 @@ def test_headers_are_included_once() -> None:
 
 def test_a_variant_takes_the_place_of_a_file(tmp_path: Path, device: Device) -> None:
     """Of a kernel file, of a header, and under a name of its own; what a variant includes comes from the package."""
-    (tmp_path / "probe.cl").write_text(
-        '#include "mine/twice.clh"\nkernel void f(global float *x) { x[0] *= TWICE * TILE; }'
-    )
-    (tmp_path / "tile.clh").write_text("#define TILE 3\n")
-    (tmp_path / "twice.clh").write_text('#include "include/subtiles.clh"\n#define TWICE 2\n')
-    changed = Device(
-        device.info,
-        variants={
-            "mine/probe.cl": tmp_path / "probe.cl",
-            "mine/twice.clh": tmp_path / "twice.clh",
-            "include/subtiles.clh": tmp_path / "tile.clh",
-        },
-    )
+    variants = {}
+    for number, (name, text) in enumerate({
+        "mine/probe.cl": '#include "mine/twice.clh"\nkernel void f(global float *x) { x[0] *= TWICE * TILE; }',
+        "mine/twice.clh": '#include "include/subtiles.clh"\n#define TWICE 2\n',
+        "include/subtiles.clh": "#define TILE 3\n",
+    }.items()):  # fmt: skip
+        variants[name] = tmp_path / str(number)
+        variants[name].write_text(text)
+    changed = Device(device.info, variants=variants)
     buffer = changed.upload(np.ones(1, np.float32), "a number")
-    kernel = changed.kernel("mine/probe.cl", "f")
-    kernel.bind(x=buffer).launch((1,))
+    changed.kernel("mine/probe.cl", "f").bind(x=buffer).launch((1,))
     assert changed.download(buffer, (1,), np.float32) == 6
-    changed.free(buffer)
     assert "#define TILE 3" not in kernel_source("raster/project.cl")
 
 
@@ -139,18 +133,10 @@ def test_the_same_memory_is_taken_again(device: Device) -> None:
         memory.close()
     assert 24_000 <= taken[0] <= taken[1] < 31_000
     assert 32_000 <= taken[2] <= taken[3] < 42_000
-    memory.give_back()
-    assert device.allocated == before
-
-
-def test_memory_for_nothing_is_a_buffer(device: Device) -> None:
-    """Kernels want one, if only to leave it alone."""
-    before = device.allocated
-    memory = Reused(device)
-    for _ in range(2):
-        assert memory.allocate(0, "a test") is not None
-        assert memory.upload(np.zeros(0, np.uint32), "a test") is not None
-        memory.close()
+    # Kernels want a buffer of nothing, too, if only to leave it alone.
+    for nothing in (memory.allocate(0, "a test"), memory.upload(np.zeros(0, np.uint32), "a test")):
+        assert nothing is not None
+    memory.close()
     memory.give_back()
     assert device.allocated == before
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from unittest.mock import Mock
 
 import numpy as np
 import pyopencl as cl
@@ -47,7 +48,7 @@ def test_rows_of_numbers(device):
     assert np.array_equal(other, wanted[3500:3508])
 
 
-@pytest.mark.parametrize("width", [10, 90, 130], ids="{} columns".format)
+@pytest.mark.parametrize("width", [10, 130], ids="{} columns".format)
 @pytest.mark.parametrize("pitch", [0, 150])
 def test_columns_of_a_matrix(device, width, pitch):
     """Also where a row is more than a piece."""
@@ -75,21 +76,16 @@ def test_what_was_sent_may_change(device):
         assert np.array_equal(device.download(buffer, (5000,), np.float32), wanted)
 
 
-class Failed:
-    """A copy that comes to nothing."""
-
-    def wait(self) -> None:
-        raise cl.RuntimeError("clWaitForEvents failed: EXEC_STATUS_ERROR_FOR_EVENTS_IN_WAIT_LIST")
-
-
 @pytest.mark.parametrize("device", [True], indirect=True, ids=["in pieces"])
 @pytest.mark.parametrize("to_device", [True, False], ids=["to the device", "to the host"])
 def test_a_device_that_fails(device, monkeypatch, to_device):
     """Whoever copies is told in the project's words; what is closed afterwards is closed."""
+    failed = cl.RuntimeError("clWaitForEvents failed: EXEC_STATUS_ERROR_FOR_EVENTS_IN_WAIT_LIST")
+    copy = Mock(wait=Mock(side_effect=failed))  # comes to nothing
     cargo = [Cargo(values(5000))]
     with Memory(device) as memory:
         buffer = memory.upload(cargo[0].values, "numbers")
         with Ferry(device) as own:
-            monkeypatch.setattr(cl, "enqueue_copy", lambda *args, **kwargs: Failed())
+            monkeypatch.setattr(cl, "enqueue_copy", lambda *args, **kwargs: copy)
             with pytest.raises(DeviceError, match="failed while computing"):
                 own.to_device(buffer, cargo) if to_device else own.to_host(cargo, buffer)

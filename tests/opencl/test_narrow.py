@@ -26,7 +26,7 @@ def integers(count, seed):
 
 @pytest.mark.parametrize("kernels", KERNELS)
 def test_integers_arrive_as_they_were(kernels):
-    for count in [1, 63, 64, 65, 128, 5000]:
+    for count in [1, 63, 64, 65, 128, 2000]:
         values = integers(count, count)
         device = open_device(kernels)
         with Memory(device) as memory, Narrowing(device) as there, Narrowing(device) as here:
@@ -42,7 +42,7 @@ def test_integers_arrive_as_they_were(kernels):
 @pytest.mark.parametrize("kernels", KERNELS)
 def test_columns_go_beside_each_other(kernels):
     """Those of a column are about as long; those of columns are not."""
-    for rows, columns in [(1, 100), (5, 64), (17, 41), (136, 192)]:
+    for rows, columns in [(1, 100), (17, 41), (36, 192)]:
         rng = np.random.default_rng(rows)
         long = rng.integers(1, 60, columns)
         values = (rng.standard_normal((rows, columns)) * 2.0**long).astype(np.int64)

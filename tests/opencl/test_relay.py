@@ -31,30 +31,28 @@ def test_all_arrives(between, monkeypatch):
     """And a part of it."""
     lender, borrower = between
     monkeypatch.setattr(relay, "_SLICE", 4096)  # many slices, and a last one that is shorter
-    for count in [1, 1000, 4096, 4097, 100_003]:
+    for count in [1, 4096, 4097, 20_003]:
         values = np.random.default_rng(count).integers(0, 2**32, count, np.uint32)
         with Memory(lender) as there, Memory(borrower) as here, Relay(borrower) as relayed:
-            lent = Lent(lender, there.upload(values, "a test"), values.nbytes)
+            lent = Lent(lender, there.upload(0 * values, "a test"), values.nbytes)
+            lent.lend(there.upload(values, "a test"))  # another buffer in its place
             target = here.upload(np.zeros(count + 1, np.uint32), "a test")
             for _ in range(2):  # the second time through memory that is there already
                 relayed.fetch(target, lent)
                 found = borrower.download(target, (count + 1,), np.uint32)
-                assert np.array_equal(found[:-1], values)
-                assert found[-1] == 0
+                assert np.array_equal(found, [*values, 0])
             if count > 10_000:
                 relayed.fetch(target, lent, 4 * 1000, 4 * 3000)
-                found = borrower.download(target, (count + 1,), np.uint32)
-                assert np.array_equal(found[:-1], np.concatenate([values[1000:4000], values[3000:]]))
+                found = borrower.download(target, (count,), np.uint32)
+                assert np.array_equal(found, np.concatenate([values[1000:4000], values[3000:]]))
 
 
 def test_it_is_lent_as_it_is_after_what_was_enqueued(between):
     """Nobody waits between a kernel and a loan: what is read is what the kernel leaves."""
     lender, borrower = between
-    count = 1 << 18
-    more = np.ones(count, np.int64)
+    count = 1 << 16
     with Memory(lender) as there, Memory(borrower) as here, Relay(borrower) as relayed:
-        totals = there.upload(np.zeros(count, np.int64), "a test")
-        ones = there.upload(more, "a test")
+        totals, ones = (there.upload(np.full(count, value, np.int64), "a test") for value in (0, 1))
         target = here.allocate(8 * count, "a test")
         add = lender.kernel("prune/add_totals.cl", "add_totals").bind(totals=totals, more=ones, count=count)
         for rounds in range(1, 6):
@@ -62,16 +60,6 @@ def test_it_is_lent_as_it_is_after_what_was_enqueued(between):
                 add.launch((count,), (64,))
             relayed.fetch(target, Lent(lender, totals, 8 * count))
             assert (borrower.download(target, (count,), np.int64) == 20 * rounds).all()
-
-
-def test_another_buffer_can_take_its_place(devices):
-    lender, borrower = devices
-    with Memory(lender) as there, Memory(borrower) as here, Relay(borrower) as relayed:
-        lent = Lent(lender, there.upload(np.zeros(10, np.int64), "a test"), 80)
-        lent.lend(there.upload(np.ones(10, np.int64), "a test"))
-        target = here.allocate(80, "a test")
-        relayed.fetch(target, lent)
-        assert borrower.download(target, (10,), np.int64).tolist() == [1] * 10
 
 
 def test_devices_are_forgotten_with_what_their_relays_left(devices):
