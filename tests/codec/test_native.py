@@ -76,11 +76,6 @@ def coded(scene: Scene, preset="best", q=0.5, entropy="bundles") -> bytes:
 # The same bits --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("q", "entropy"), [(0.1, "bundles"), (1.0, "zstd")])
-def test_a_real_scene(plush_excerpt, q, entropy, choose):
-    assert assert_alike(coded(plush_excerpt, q=q, entropy=entropy), choose, 2)
-
-
 @given(
     splats=st.sampled_from([1, 2, 3, 7, 127, 128, 129, 255, 256, 257, 511, 513, 1500]),
     degree=st.integers(0, 3),
