@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -239,35 +239,6 @@ def small():
     values = integers(400, spread=200)
     steps = steps_of(400)
     return encoder.encode(values, classes_of(values, steps)), steps
-
-
-@NEEDS_LIBRARY
-@pytest.mark.slow
-@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
-@given(data=st.data())
-def test_both_paths_say_the_same_of_damaged_sections(monkeypatch, small, data):
-    stored, steps = dict(small[0]), small[1]
-    for _ in range(data.draw(st.integers(1, 3))):
-        key = data.draw(st.sampled_from(list(stored)))
-        section = bytearray(stored[key])
-        # Often the states, counts and words, which come last.
-        at = data.draw(st.integers(0, len(section) - 1))
-        how = data.draw(st.sampled_from(["flip", "cut", "more", "set"]))
-        if how == "flip":
-            section[at] ^= 1 << data.draw(st.integers(0, 7))
-        elif how == "set":
-            section[at] = data.draw(st.integers(0, 255))
-        elif how == "cut":
-            del section[-2 * data.draw(st.integers(1, 4)) :]
-        else:
-            section += bytes(2 * data.draw(st.integers(1, 4)))
-        stored[key] = bytes(section)
-    found = []
-    for way in "01":
-        monkeypatch.setenv(VARIABLE, way)
-        found.append(outcome(stored, 400, steps))
-    assert (found[0] is None) == (found[1] is None)
-    assert found[0] is None or np.array_equal(found[0], found[1])
 
 
 def with_parts(section: bytes, first: bool, change: Callable[[bytes, int, bytes], tuple[bytes, int, bytes]]) -> bytes:

@@ -10,18 +10,15 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from potr_cl.codec import block_values, octree
+from potr_cl.codec import block_values
 from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import decode, open_file
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.native import library
-from potr_cl.codec.native import octree as native_octree
-from potr_cl.codec.native.declarations import CFunctions
 from potr_cl.codec.native.library import LIBRARY_VARIABLE, VARIABLE, native
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.codec.sections import Property
 from potr_cl.errors import DataError, UsageError
-from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import Scene
 from tests.reference.file_parts import STREAMS, File, sealed
 from tests.reference.scenes import random_scene
@@ -193,38 +190,6 @@ def test_changed_files(choose):
     assert 15 < read < 135  # both must occur for this to mean anything
 
 
-@pytest.mark.slow
-def test_changed_octrees(choose):
-    rng = np.random.default_rng(3)
-    means = rng.normal(size=(200, 3)).astype(np.float32)
-    means = np.concatenate([means, means[:20], means[:5]])
-    reasons = set()
-    for number in range(300):
-        tree, _ = octree.build(means, 1e-3, absolute=bool(number % 2))
-        fields = {
-            name: np.array(getattr(tree, name))
-            for name in ("occupancy", "several", "multiplicities", "leaf_levels", "tails")
-        }
-        name = rng.choice(list(fields))
-        values = fields[name]
-        if rng.random() < 0.3:
-            values = values[: rng.integers(0, len(values) + 1)] if rng.random() < 0.5 else np.append(values, values[:1])
-        else:
-            values[rng.integers(len(values))] = rng.choice([0, 1, 2, 3, 60, 255])
-        fields[name] = np.ascontiguousarray(values)
-        changed = octree.OctreeStreams(tree.origin, tree.side, tree.depth, **fields)
-        found = []
-        for path in PATHS:
-            choose(path)
-            try:
-                found.append(octree.parse(changed, len(means)).tobytes())
-            except DataError as error:
-                found.append(str(error))
-                reasons.add(str(error)[:30])
-        assert found[0] == found[1], name
-    assert len(reasons) >= 5
-
-
 def test_the_end_of_the_words_is_seen(choose):
     """A section whose last words are missing, in steps of every width."""
     data = coded(random_scene(300, 0, seed=4))
@@ -264,56 +229,3 @@ def test_without_the_library(content, monkeypatch, tmp_path, caplog):
     monkeypatch.setenv(VARIABLE, "1")
     with pytest.raises(UsageError, match="compiled library is missing"):
         decode(GOLDEN[0])
-
-
-# Sizes are checked before C sees them ---------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def functions(choose) -> CFunctions:
-    choose("native")
-    found = native()
-    assert found is not None
-    return found
-
-
-def test_trees_and_tails_of_other_sizes_are_refused(functions):
-    nothing = np.zeros(0, np.uint8)
-    tree = native_octree.tree(functions, nothing, nothing, 3, False)
-    assert tree is not None
-    with pytest.raises(TypeError, match="another number of splats"):
-        native_octree.Walk(functions, tree, np.zeros(1, np.uint8), np.zeros(0, np.uint64), 2, 1)
-    with pytest.raises(TypeError, match="takes 1 of uint8"):
-        native_octree.Walk(functions, tree, np.zeros(2, np.uint8), np.zeros(0, np.uint64), 1, 1)
-    walk = native_octree.Walk(functions, tree, np.full(1, 3, np.uint8), np.zeros(0, np.uint64), 1, 1)
-    with pytest.raises(TypeError, match="before their tails"):
-        walk.centres(0, np.zeros(4), np.zeros(3))
-    with pytest.raises(TypeError, match="tails of another size"):
-        walk.check_tails(np.zeros(9, np.uint8))
-    walk.leaves(0)
-    with pytest.raises(TypeError, match="tails of another size"):
-        walk.check_tails(np.zeros(8, np.uint8))
-    with pytest.raises(TypeError, match="part that is not there"):
-        walk.leaves(1)
-
-
-@pytest.mark.parametrize("absolute", [False, True])
-@pytest.mark.parametrize("smallest", [1e-2, 1e-12])
-def test_octrees_are_walked_in_parts(choose, absolute, smallest):
-    """However many threads share out the leaves; in trees whose cells fit 32 bits, and in deeper ones."""
-    rng = np.random.default_rng(5)
-    means = np.concatenate([rng.normal(size=(9000, 3)), rng.normal(size=(2000, 3)) / 50]).astype(np.float32)
-    means = np.concatenate([means, means[:500], means[:100]])
-    tree, _ = octree.build(means, smallest, absolute=absolute)
-    assert (tree.depth > 32) == (smallest < 1e-6)
-    choose("numpy")
-    expected = octree.parse(tree, len(means))
-    choose("native")
-    for parts in (1, 2, 3, 7, 40):
-        with thread_pool(3) as pool:
-            assert np.array_equal(octree.parse(tree, len(means), pool.map, parts), expected)
-        assert np.array_equal(octree.parse(tree, len(means), backwards, parts), expected)
-
-
-def backwards(work, items):
-    return [work(item) for item in reversed(items)]

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -89,17 +89,16 @@ def test_any_scene(means, tolerance):
     roundtrip(means, tolerance)
 
 
-@settings(max_examples=60)
-@given(st.data())
-def test_damaged_streams_are_refused_or_parse_to_the_right_count(data):
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_damaged_streams_are_refused_alike_or_parse_to_the_right_count(data, monkeypatch):
     means = np.vstack([SHELL[:30], np.zeros((3, 3))]).astype(np.float32)
-    streams, _ = octree.build(means, 1e-3)
+    streams, _ = octree.build(means, 1e-3, absolute=data.draw(st.booleans()))
     field = data.draw(st.sampled_from([*FIELDS, "depth"]))
-    value = getattr(streams, field)
     if field == "depth":
         damaged = data.draw(st.integers(0, 52))
     else:
-        damaged = value.copy()
+        damaged = getattr(streams, field).copy()
         how = data.draw(st.sampled_from(["change", "cut", "extend"]))
         if how == "change" and len(damaged):
             damaged[data.draw(st.integers(0, len(damaged) - 1))] = data.draw(st.integers(0, 255))
@@ -107,13 +106,18 @@ def test_damaged_streams_are_refused_or_parse_to_the_right_count(data):
             damaged = damaged[: data.draw(st.integers(0, len(damaged)))]
         else:
             damaged = np.append(damaged, np.array(data.draw(st.integers(0, 255)), damaged.dtype))
-    hostile = dataclasses.replace(streams, **{field: damaged})
-    try:
-        parsed = octree.parse(hostile, len(means))
-    except DataError:
-        return
-    assert parsed.shape == (len(means), 3)
-    assert np.isfinite(parsed).all()
+    hostile, found = dataclasses.replace(streams, **{field: damaged}), []
+    for way in "01" if native() else "0":
+        monkeypatch.setenv(VARIABLE, way)
+        try:
+            parsed = octree.parse(hostile, len(means))
+            assert parsed.shape == (len(means), 3)
+            assert np.isfinite(parsed).all()
+            found.append(parsed.tobytes())
+        except DataError as error:
+            found.append(str(error))
+    monkeypatch.delenv(VARIABLE)
+    assert found[0] == found[-1]
 
 
 def test_a_multiplicity_that_lies_takes_no_memory():
@@ -173,21 +177,52 @@ def test_what_does_not_fit_is_refused_before_c_sees_it():
         native_octree.bounds(native(), np.zeros((3, 3), np.float32), np.ones(2))
 
 
-@pytest.mark.parametrize("tolerance", [1e-1, 1e-3, 1e-7], ids=["some share leaves", "one word", "two words"])
-def test_the_same_octree(monkeypatch, tolerance):
+@NEEDS_LIBRARY
+def test_trees_and_tails_of_other_sizes_are_refused():
+    functions, nothing = native(), np.zeros(0, np.uint8)
+    tree = native_octree.tree(functions, nothing, nothing, 3, False)
+    assert tree is not None
+    with pytest.raises(TypeError, match="another number of splats"):
+        native_octree.Walk(functions, tree, np.zeros(1, np.uint8), np.zeros(0, np.uint64), 2, 1)
+    with pytest.raises(TypeError, match="takes 1 of uint8"):
+        native_octree.Walk(functions, tree, np.zeros(2, np.uint8), np.zeros(0, np.uint64), 1, 1)
+    walk = native_octree.Walk(functions, tree, np.full(1, 3, np.uint8), np.zeros(0, np.uint64), 1, 1)
+    with pytest.raises(TypeError, match="before their tails"):
+        walk.centres(0, np.zeros(4), np.zeros(3))
+    with pytest.raises(TypeError, match="tails of another size"):
+        walk.check_tails(np.zeros(9, np.uint8))
+    walk.leaves(0)
+    with pytest.raises(TypeError, match="tails of another size"):
+        walk.check_tails(np.zeros(8, np.uint8))
+    with pytest.raises(TypeError, match="part that is not there"):
+        walk.leaves(1)
+
+
+@pytest.mark.parametrize(
+    "tolerance", [1e-1, 1e-3, 1e-7, 1e-12], ids=["some share leaves", "one word", "two words", "cells beyond 32 bits"]
+)
+def test_the_same_octree_by_threads(monkeypatch, tolerance):
+    """However many share out its splats, and its leaves in whatever order."""
     rng = np.random.default_rng(5)
-    means = (rng.normal(size=(40_000, 3)) ** 3).astype(np.float32)
+    means = (rng.normal(size=(20_000, 3)) ** 3).astype(np.float32)
     means[:300] = means[300]
     wanted, wanted_order = octree.build(means, tolerance, absolute=True)
+    assert (wanted.depth > 32) == (tolerance < 1e-10)
     monkeypatch.setattr(morton, "_LARGE", 1000)
     monkeypatch.setattr(morton, "_RANGE", 1024)
     monkeypatch.setattr(native_octree, "_AT_A_TIME", 3000)
     with thread_pool(3) as pool:
         tree, its_order = octree.build(means, tolerance, absolute=True, run=pool.map)
+        walked = [octree.parse(tree, len(means), pool.map, parts) for parts in (1, 3, 40)]
+    walked += [octree.parse(tree, len(means), lambda work, items: [*map(work, items[::-1])], parts) for parts in (2, 7)]
     assert np.array_equal(wanted_order, its_order)
     assert (tree.origin, tree.side, tree.depth) == (wanted.origin, wanted.side, wanted.depth)
     for name in FIELDS:
         assert np.array_equal(getattr(tree, name), getattr(wanted, name)), name
+    monkeypatch.setenv(VARIABLE, "0")
+    centres = octree.parse(tree, len(means))
+    for each in walked:
+        assert np.array_equal(each, centres)
 
 
 def test_centres_beyond_single_precision_are_refused_as_a_decoder_does():
