@@ -65,6 +65,8 @@ def test_the_finest_level_within_a_budget(joined):
     assert [level_within(opened, budget) for budget in (1000, 400, 399, 150, 60)] == [0, 0, 1, 1, 2]
     with pytest.raises(UsageError, match="no level has 59 splats or fewer: the coarsest has 60"):
         level_within(opened, 59)
+    with pytest.raises(UsageError, match="not both"):
+        potr_cl.decode(joined, level=1, splats=100)
 
 
 def test_a_damaged_level_is_not_joined(files):
@@ -75,28 +77,25 @@ def test_a_damaged_level_is_not_joined(files):
 
 
 @pytest.mark.parametrize(
-    ("choice", "splats", "name"),
-    [([], 400, "a.ply"), (["--level", "1"], 150, "a.spz"), (["--splats", "399"], 150, "a.ply")],
+    ("choice", "name", "result"),
+    [
+        ([], "a.ply", 400),
+        (["--level", "1"], "a.spz", 150),
+        (["--splats", "399"], "a.ply", 150),
+        (["--level", "3"], "a.ply", "there is no level 3: the file has levels 0 to 2"),
+        (["--splats", "59"], "a.ply", "no level has 59 splats or fewer"),
+    ],
 )
-def test_the_command_decodes_a_level(joined, tmp_path, choice, splats, name):
+def test_the_command_decodes_a_level_or_says_that_it_is_not_there(joined, tmp_path, capsys, choice, name, result):
     file, output = tmp_path / "a.potr", tmp_path / name
     file.write_bytes(joined)
-    assert cli.main(["decode", str(file), "-o", str(output), *choice]) == 0
-    assert len(potr_cl.load_scene(output)) == splats
-
-
-def test_what_is_not_there_is_refused(joined, tmp_path, capsys):
-    file = tmp_path / "a.potr"
-    file.write_bytes(joined)
-    for choice, said in [
-        (["--level", "3"], "there is no level 3: the file has levels 0 to 2"),
-        (["--splats", "59"], "no level has 59 splats or fewer"),
-    ]:
-        assert cli.main(["decode", str(file), "-o", str(tmp_path / "a.ply"), *choice]) == 2
-        assert said in capsys.readouterr().err
-    assert not (tmp_path / "a.ply").exists()
-    with pytest.raises(UsageError, match="not both"):
-        potr_cl.decode(joined, level=1, splats=100)
+    code = cli.main(["decode", str(file), "-o", str(output), *choice])
+    if code == 0:
+        assert len(potr_cl.load_scene(output)) == result
+    else:
+        assert code == 2
+        assert result in capsys.readouterr().err
+        assert not output.exists()
 
 
 def test_info_shows_the_levels(joined, tmp_path, capsys):
