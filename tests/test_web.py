@@ -9,9 +9,7 @@ import json
 import os
 import random
 import shutil
-import struct
 import subprocess
-import zlib
 from pathlib import Path
 
 import pytest
@@ -19,6 +17,7 @@ import pytest
 import potr_cl
 from potr_cl.pipeline.options import EncodeOptions
 from tests.cases.web import GOLDEN, WEB, judged
+from tests.reference.file_parts import sealed
 from tests.reference.scenes import random_scene
 
 NODE = shutil.which("node")
@@ -56,38 +55,12 @@ def test_large_sections(build: str, preset: str, tmp_path: Path) -> None:
     assert json.loads(run("test/judge.mjs", build, str(tmp_path / "large.potr"))) == [judged(encoded.data)]
 
 
-def with_sums(data: bytearray) -> bytearray:
-    """With checksums that are right, so that what they would find reaches the decoder."""
-    (size,) = struct.unpack_from("<I", data, 12)
-    if not 36 <= size <= len(data):
-        return data
-    at, offset = 32, size
-
-    def entries(number: int) -> None:
-        nonlocal at, offset
-        for _ in range(number):
-            if at + 16 > size - 4:
-                return
-            (stored,) = struct.unpack_from("<I", data, at + 4)
-            struct.pack_into("<I", data, at + 12, zlib.crc32(data[offset : offset + stored]))
-            at, offset = at + 16, offset + stored
-
-    entries(data[29])
-    for _ in range(min(struct.unpack_from("<I", data, 24)[0], 1000)):
-        if at + 76 > size - 4:
-            break
-        at += 76
-        entries(data[at - 73])
-    struct.pack_into("<I", data, size - 4, zlib.crc32(data[: size - 4]))
-    return data
-
-
 def changed(data: bytes, chance: random.Random) -> bytes:
     out = bytearray(data)
     place = chance.randrange(min(len(out), 400) if chance.random() < 0.4 else len(out))
     for _ in range(chance.randint(1, 3)):
         out[(place + chance.randrange(16)) % len(out)] = chance.choice([0, 1, 127, 128, 255, chance.randrange(256)])
-    return bytes(with_sums(out) if chance.random() < 0.8 else out)
+    return sealed(bytes(out)) if chance.random() < 0.8 else bytes(out)
 
 
 def frame_differs(ours: str, theirs: str) -> bool:

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
 from potr_cl.codec.bundles import encoder
 from potr_cl.codec.bundles.decoder import Reader, Wanted
+from potr_cl.codec.bundles.description import known_model
 from potr_cl.codec.bundles.sections import MAIN, ORDER, ROTATION
+from potr_cl.codec.bundles.streams import SIZES as TOKEN_SIZES
+from potr_cl.codec.bundles.streams import TOTAL, normalise
 from potr_cl.codec.decoder import open_file
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.native.library import VARIABLE, VECTORS_VARIABLE, native
@@ -20,22 +25,24 @@ from potr_cl.codec.sections import SH, Coder, Property
 from potr_cl.codec.steps.rule import KNOTS, ColourSteps
 from potr_cl.errors import DataError
 
-PATHS = {"numpy": "0", "native": "1", "native, without wide vectors": "1"}
 DEGREES = {prop: prop.streams for prop in SH[1:]}
-NONE = lambda: None  # noqa: E731
 #: Around where bundles and lanes begin and end.
 SIZES = (1, 2, 255, 256, 257, 300, 7937, 8191, 8192, 8193, 8448, 16385)
+NEEDS_LIBRARY = pytest.mark.skipif(native() is None, reason="the compiled library is not there")
 
 
-@pytest.fixture(params=PATHS)
-def path(request, monkeypatch):
-    monkeypatch.delenv(VARIABLE, raising=False)
-    if request.param != "numpy" and native() is None:
-        pytest.skip("the compiled library is not there: python -m tools.make.native, or pip install -e .")
-    monkeypatch.setenv(VARIABLE, PATHS[request.param])
-    if request.param == "native, without wide vectors":
-        monkeypatch.setenv(VECTORS_VARIABLE, "0")
-    return request.param
+@pytest.fixture
+def paths(monkeypatch) -> Callable[[], Iterator[None]]:
+    """Goes through the ways to decode, each chosen by the environment: NumPy, native with wide vectors and without."""
+
+    def chosen() -> Iterator[None]:
+        for way, vectors in (("0", "1"), *([("1", "1"), ("1", "0")] if native() else [])):
+            with monkeypatch.context() as patch:
+                patch.setenv(VARIABLE, way)
+                patch.setenv(VECTORS_VARIABLE, vectors)
+                yield
+
+    return chosen
 
 
 def integers(splats: int, seed: int = 1, density: float = 0.1, spread: int = 20) -> dict:
@@ -92,64 +99,59 @@ def assert_same(values: dict, levels) -> None:
             assert np.array_equal(levels.coefficient(m)[c], wanted)
 
 
-@pytest.mark.parametrize(("splats", "adapted"), [(splats, number % 2 == 0) for number, splats in enumerate(SIZES)])
-def test_integers_come_back(path, splats, adapted):
-    values = integers(splats, splats)
-    steps = steps_of(splats) if adapted else None
+def check_comes_back(paths, values: dict, steps: ColourSteps | None = None) -> dict:
+    """By every path; returns what is stored, which is the same by all (test_table.py)."""
+    splats = len(values[MAIN[0]][0])
     stored = encoder.encode(values, classes_of(values, steps))
-    reader = reader_of(stored, splats, steps)
-    assert_same(values, reader.levels(0, reader.bundles.number))
+    for _ in paths():
+        reader = reader_of(stored, splats, steps)
+        assert_same(values, reader.levels(0, reader.bundles.number))
+    return stored
 
 
-@pytest.mark.parametrize("largest", [127, 128, 1 << 12, (1 << 29) - 1, 1 << 29, (1 << 37) - 1])
-def test_large_integers_come_back(path, largest):
+@pytest.mark.parametrize(("splats", "adapted"), [(splats, number % 2 == 0) for number, splats in enumerate(SIZES)])
+def test_integers_come_back(paths, splats, adapted):
+    """A section begins with the size of its description, which is nothing where it does not pay."""
+    stored = check_comes_back(paths, integers(splats, splats), steps_of(splats) if adapted else None)
+    assert splats > 300 or stored[MAIN[0]][:4] == bytes(4)
+    assert splats > 1 or sum(map(len, stored.values())) < 160
+
+
+@pytest.mark.parametrize("largest", [128, (1 << 29) - 1, 1 << 29, (1 << 37) - 1])
+def test_large_integers_come_back(paths, largest):
     """Those that one path leaves to the other too."""
-    values = integers(700)
+    values = integers(300)
     rng = np.random.default_rng(2)
     for key, streams in values.items():
         for stream in streams:
-            where = rng.integers(0, 700, 9)
+            where = rng.integers(0, 300, 9)
             stream[where] = rng.integers(largest // 2, largest + 1, 9)
             if key not in MAIN[:2]:
                 stream[where[:4]] *= -1
-    stored = encoder.encode(values, np.zeros(700, np.int8))
-    assert_same(values, reader_of(stored, 700).levels(0, 1))
-
-
-def test_integers_beyond_38_bits_are_left_to_others(path):
-    values = integers(40)
+    check_comes_back(paths, values)
     values[ROTATION][1][7] = -(1 << 37) - 1
-    assert encoder.encode(values, np.zeros(40, np.int8)) is None
+    for _ in paths():
+        assert encoder.encode(values, np.zeros(300, np.int8)) is None  # left to others
 
 
-@pytest.mark.parametrize(
-    "left", [(), (0, 1), (0, 6), (0, 3), (0, 2, 4), (0, 1, 2, 3, 4, 6)], ids=lambda left: "".join(map(str, left)) or "o"
-)
-def test_sections_may_be_absent(path, left):
-    values = {key: streams for number, (key, streams) in enumerate(ordered(integers(900))) if number in {0, *left}}
-    stored = encoder.encode(values, classes_of(values, steps_of(900)))
-    assert set(stored) == set(values)
-    assert_same(values, reader_of(stored, 900, steps_of(900)).levels(0, 1))
-
-
-def ordered(values: dict) -> list:
-    return [(key, values[key]) for key in ORDER]
+@pytest.mark.parametrize("left", [{0}, {0, 1}, {0, 6}, {0, 3}, {0, 2, 4}, {0, 1, 2, 3, 4, 6}])
+def test_sections_may_be_absent(paths, left):
+    values = integers(300)
+    values = {key: values[key] for number, key in enumerate(ORDER) if number in left}
+    assert check_comes_back(paths, values, steps_of(300)).keys() == values.keys()
 
 
 @pytest.mark.parametrize("density", [0.0, 0.001, 1.0])
-def test_channels_without_a_value_and_full_ones(path, density):
-    values = integers(600, density=density)
+def test_channels_without_a_value_and_full_ones(paths, density):
+    values = integers(300, density=density)
     values[Property.SH2][4][:] = 0
     values[Property.SH2][4][77] = 3
-    stored = encoder.encode(values, np.zeros(600, np.int8))
-    assert_same(values, reader_of(stored, 600).levels(0, 1))
+    check_comes_back(paths, values)
 
 
+@NEEDS_LIBRARY
 def test_streams_that_several_threads_ask_for_first(monkeypatch):
     """Each may get its own, as where blocks are coded side by side; the bytes are the same."""
-    monkeypatch.delenv(VARIABLE, raising=False)
-    if native() is None:
-        pytest.skip("the compiled library is not there")
     values = integers(400, spread=200)
     classes = classes_of(values, steps_of(400))
     expected = encoder.encode(values, classes)
@@ -157,19 +159,19 @@ def test_streams_that_several_threads_ask_for_first(monkeypatch):
     assert encoder.encode(values, classes) == expected
 
 
-def test_a_part_of_the_bundles_and_of_the_sections(path):
+def test_a_part_of_the_bundles_and_of_the_sections(paths):
     """Bundles need no other, and chains are read as far as one likes: what is behind is not opened."""
-    splats = 3 * 8192 + 100
+    splats = 2 * 8192 + 100
     values = integers(splats, spread=5)
     stored = encoder.encode(values, np.zeros(splats, np.int8))
     del stored[ROTATION], stored[MAIN[4]], stored[MAIN[5]]
-    reader = reader_of(stored, splats)
-    levels = reader.levels(1, 3, Wanted(4, False))
-    own = slice(8192, 3 * 8192)
-    assert np.array_equal(levels.opacities, values[MAIN[0]][0][own])
-    assert np.array_equal(levels.dc[2], values[MAIN[2]][2][own])
-    assert levels.rotations is None
-    assert np.array_equal(levels.coefficient(2)[1], values[MAIN[3]][4][own])
+    own = slice(8192, splats)
+    for _ in paths():
+        levels = reader_of(stored, splats).levels(1, 3, Wanted(4, False))
+        assert np.array_equal(levels.opacities, values[MAIN[0]][0][own])
+        assert np.array_equal(levels.dc[2], values[MAIN[2]][2][own])
+        assert levels.rotations is None
+        assert np.array_equal(levels.coefficient(2)[1], values[MAIN[3]][4][own])
 
 
 def test_it_is_small():
@@ -186,18 +188,38 @@ def test_it_is_small():
     assert sum(len(stored[index]) for index in DEGREES) < 600
 
 
-@pytest.mark.parametrize("splats", [1, 12, 300])
-def test_few_splats_need_no_models_of_their_own(path, splats):
-    """A section begins with the size of its description, which is nothing where it does not pay."""
-    values = integers(splats, 3)
-    stored = encoder.encode(values, np.zeros(splats, np.int8))
-    assert stored[MAIN[0]][:4] == bytes(4)
-    assert_same(values, reader_of(stored, splats).levels(0, 1))
-    if splats == 1:
-        assert sum(map(len, stored.values())) < 160
+# What decoders know ---------------------------------------------------------------------------------------------------
 
 
-# ------------------------------------------------------------------------------------------------ damage
+@given(hnp.arrays(np.int64, st.integers(1, 252), elements=st.integers(0, 10**9)))
+def test_frequencies_add_up(counts):
+    counts[0] += 1
+    frequencies = normalise(counts)
+    assert frequencies.sum() == TOTAL
+    assert ((frequencies > 0) == (counts > 0)).all()
+
+
+@pytest.mark.parametrize("tokens", [8, 32, 128, 216])
+def test_models_that_decoders_know(tokens):
+    model = known_model(tokens)
+    assert (model.frequencies.sum(axis=1) == TOTAL).all()
+    assert (model.frequencies > 0).all()
+    assert model.classes.tolist() == [size // 8 for size in range(256)]
+    # Larger ones are expected where larger ones were.
+    means = (model.frequencies * np.arange(tokens)).sum(axis=1)
+    assert (np.diff(means) >= 0).all()
+
+
+def test_sizes_of_tokens_are_exact():
+    """⌊16 log2(1 + m) + ½⌋ by whole numbers: (1 + m)³² lies between 2^(2k − 1) and 2^(2k + 1)."""
+    for signed, sizes in TOKEN_SIZES.items():
+        for token, size in enumerate(sizes.tolist()):
+            least = token if token < 128 else (4 + token % 4) << (5 + (token - 128) // 4)
+            power = (1 + ((least + 1) // 2 if signed else least)) ** 32
+            assert 1 << max(2 * size - 1, 0) <= power < 1 << (2 * size + 1)
+
+
+# Damage ---------------------------------------------------------------------------------------------------------------
 
 
 def outcome(stored: dict, splats: int, steps: ColourSteps | None):
@@ -219,96 +241,47 @@ def small():
     return encoder.encode(values, classes_of(values, steps)), steps
 
 
-@pytest.mark.slow
-@settings(
-    max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
-)
-@given(data=st.data())
-def test_both_paths_say_the_same_of_damaged_sections(monkeypatch, small, data):
-    monkeypatch.delenv(VARIABLE, raising=False)
-    if native() is None:
-        pytest.skip("the compiled library is not there")
-    stored, steps = dict(small[0]), small[1]
-    for _ in range(data.draw(st.integers(1, 3))):
-        key = data.draw(st.sampled_from(list(stored)))
-        section = bytearray(stored[key])
-        # Often the states, counts and words, which come last.
-        at = data.draw(st.integers(0, len(section) - 1))
-        how = data.draw(st.sampled_from(["flip", "cut", "more", "set"]))
-        if how == "flip":
-            section[at] ^= 1 << data.draw(st.integers(0, 7))
-        elif how == "set":
-            section[at] = data.draw(st.integers(0, 255))
-        elif how == "cut":
-            del section[-2 * data.draw(st.integers(1, 4)) :]
-        else:
-            section += bytes(2 * data.draw(st.integers(1, 4)))
-        stored[key] = bytes(section)
-    found = []
-    for way in "01":
-        monkeypatch.setenv(VARIABLE, way)
-        found.append(outcome(stored, 400, steps))
-    assert (found[0] is None) == (found[1] is None)
-    assert found[0] is None or np.array_equal(found[0], found[1])
+def with_parts(section: bytes, first: bool, change: Callable[[bytes, int, bytes], tuple[bytes, int, bytes]]) -> bytes:
+    """A section of a file of one bundle whose states, count of words, and words are changed."""
+    at = 4 + struct.unpack_from("<I", section)[0]
+    end = at + (4 * 2 if first else 0)
+    states, count, words = change(section[at:end], struct.unpack_from("<I", section, end)[0], section[end + 4 :])
+    return section[:at] + states + struct.pack("<I", count) + words
 
 
-def taken_apart(section: bytes, first: bool) -> list[bytes]:
-    """Of a file of one bundle: description, states, count of words, words."""
-    (described,) = struct.unpack_from("<I", section)
-    at = 4 + described
-    states = 4 * 2 if first else 0
-    parts = [section[4:at], section[at : at + states], section[at + states : at + states + 4]]
-    return [*parts, section[at + states + 4 :]]
+DAMAGE = {
+    "a word less": lambda states, count, words: (states, count - 1, words[:-2]),
+    "a word more": lambda states, count, words: (states, count + 1, words + b"\0\0"),
+    "a count less": lambda states, count, words: (states, count - 1, words),
+    "a count more": lambda states, count, words: (states, count + 1, words),
+    "a state too low": lambda states, count, words: (struct.pack("<I", 0xFFFF) + states[4:], count, words),
+    "a start that ends elsewhere": lambda states, *rest: (states[:2] + bytes([states[2] ^ 0x10]) + states[3:], *rest),
+}
 
 
-def put_together(parts: list[bytes]) -> bytes:
-    return struct.pack("<I", len(parts[0])) + b"".join(parts)
-
-
-def test_words_too_few_or_too_many_are_refused(path, small):
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_words_and_states_that_no_encoder_leaves_are_refused(paths, small, damage):
     stored, steps = small
-    for key in ORDER:
-        described, states, count, words = taken_apart(stored[key], key in (MAIN[0], ROTATION))
-        (number,) = struct.unpack("<I", count)
-        for change in (-1, 1):
-            part = words[:-2] if change < 0 else words + b"\0\0"
-            counted = struct.pack("<I", number + change)
-            damaged = {**stored, key: put_together([described, states, counted, part])}
-            assert outcome(damaged, 400, steps) is None
-            # A count that the words contradict.
-            damaged[key] = put_together([described, states, counted, words])
+    with_states = (MAIN[0], ROTATION)
+    for key in with_states if "state" in damage or "start" in damage else (*with_states, MAIN[1], MAIN[2], MAIN[-1]):
+        damaged = {**stored, key: with_parts(stored[key], key in with_states, DAMAGE[damage])}
+        for _ in paths():
             assert outcome(damaged, 400, steps) is None
 
 
-def test_states_that_no_encoder_leaves_are_refused(path, small):
-    stored, steps = small
-    for key in (MAIN[0], ROTATION):
-        described, states, count, words = taken_apart(stored[key], True)
-        low = struct.pack("<I", 0xFFFF) + states[4:]
-        assert outcome({**stored, key: put_together([described, low, count, words])}, 400, steps) is None
-        # Another start ends elsewhere.
-        (state,) = struct.unpack_from("<I", states)
-        other = struct.pack("<I", state ^ 0x00100000) + states[4:]
-        assert outcome({**stored, key: put_together([described, other, count, words])}, 400, steps) is None
+# Files ----------------------------------------------------------------------------------------------------------------
 
 
-# ------------------------------------------------------------------------------------------------ files
-
-
+@NEEDS_LIBRARY
 def test_levels_beyond_what_is_looked_up(monkeypatch, plush_excerpt):
     """Scales and opacities of so many steps that the native path leaves some values to NumPy."""
-    monkeypatch.delenv(VARIABLE, raising=False)
-    if native() is None:
-        pytest.skip("the compiled library is not there")
     parameters = HyperParameters.from_quality(0.5, "best", sf_scale=1e5, sf_opacity=1e4)
-    data = b"".join(code_scene(plush_excerpt, parameters).pieces)
-    file = open_file(data)
+    file = open_file(b"".join(code_scene(plush_excerpt.subset(np.arange(300)), parameters).pieces))
     assert file.blocks[0].coder == Coder.BUNDLES
     scenes = []
     for way in "01":
         monkeypatch.setenv(VARIABLE, way)
-        scenes.append(open_file(data).scene(1))
+        scenes.append(file.scene(1))
     for name in ("log_scales", "quaternions", "opacity_logits", "sh"):
         assert np.array_equal(getattr(scenes[0], name), getattr(scenes[1], name))
-    largest = np.exp(scenes[0].log_scales.max()) * file.blocks[0].sf_scale
-    assert largest > 1 << 16
+    assert np.exp(scenes[0].log_scales.max()) * file.blocks[0].sf_scale > 1 << 16

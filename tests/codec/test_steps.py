@@ -65,25 +65,21 @@ def colour_bytes(data: bytes) -> int:
 
 @pytest.fixture(params=["0", "1"], ids=["numpy", "native"])
 def path(request, monkeypatch):
-    if request.param == "1":
-        skip_without_library(monkeypatch)
+    if request.param == "1" and native() is None:
+        pytest.skip("the compiled library is not there")
     monkeypatch.setenv(VARIABLE, request.param)
 
 
-def skip_without_library(monkeypatch):
-    monkeypatch.delenv(VARIABLE, raising=False)
-    if native() is None:
-        pytest.skip("the compiled library is not there")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("degree", "splats", "entropy"), [(3, 700, "bundles"), (1, 900, "zstd"), (0, 300, "zstd")])
-def test_the_independent_decoder_agrees(degree, splats, entropy, path):
-    scene = random_scene(splats, degree, seed=degree)
-    geometry = adapted(scene)
-    assert len(np.unique(geometry.colour_classes()[0])) > 5
+@pytest.mark.parametrize(
+    ("degree", "entropy", "own_steps"), [(1, "bundles", True), (0, "zstd", True), (1, "zstd", False)]
+)
+def test_the_independent_decoder_agrees(degree, entropy, own_steps, path):
+    scene = random_scene(300, degree, seed=degree)
+    geometry = adapted(scene) if own_steps else quantise_geometry(scene, BEST, ())
     data = file_of(scene, geometry, entropy)
     file, wanted = open_file(data), oracle.decode(data)
+    assert (file.blocks[0].find(Property.STEPS) is not None) == own_steps
+    assert not own_steps or len(np.unique(geometry.colour_classes()[0])) > 5
     for threads in (1, 3):
         got = file.scene(threads)
         assert np.allclose(got.sh, wanted["sh"], rtol=1e-6, atol=1e-7)
@@ -91,6 +87,7 @@ def test_the_independent_decoder_agrees(degree, splats, entropy, path):
         assert np.allclose(np.exp(got.log_scales), wanted["scales"], rtol=1e-5)
     assert np.array_equal(file.body(0).sh(), got.sh)
     assert np.array_equal(file.body(0).sh(0), got.sh[:, :1])
+    assert own_steps or np.abs(got.sh[:, 0] - scene.sh[geometry.order, 0]).max() <= 1.5 / BEST.sf_dc + 1e-6
 
 
 def test_colours_are_within_half_of_each_splats_own_step():
@@ -105,18 +102,9 @@ def test_colours_are_within_half_of_each_splats_own_step():
             assert (np.abs(wanted - got) <= 0.5 / factor + 1e-5).all()
 
 
-def test_without_steps_all_are_alike(path):
-    scene = random_scene(500, 1, seed=4)
-    geometry = quantise_geometry(scene, BEST, ())
-    data = file_of(scene, geometry)
-    assert open_file(data).blocks[0].find(Property.STEPS) is None
-    assert np.allclose(decode(data).sh, oracle.decode(data)["sh"], rtol=1e-6, atol=1e-7)
-    assert np.abs(decode(data).sh[:, 0] - scene.sh[geometry.order, 0]).max() <= 1.5 / BEST.sf_dc + 1e-6
-
-
 def test_the_same_error_costs_fewer_bits():
     """The error that the steps add stays as it was, with steps that are coarser on average."""
-    scene = random_scene(20000, 0, seed=6)
+    scene = random_scene(8000, 0, seed=6)
     geometry = quantise_geometry(scene, BEST, ())
     effects = effects_of(geometry)[geometry.order]
     adapted_geometry = geometry.with_steps(effects_of(geometry))
@@ -141,8 +129,7 @@ def test_a_scene_of_which_nothing_is_known_has_no_steps():
 def test_steps_of_any_scale_factor(sf_opacity):
     parameters = dataclasses.replace(BEST, sf_opacity=sf_opacity)
     scene = random_scene(400, 0, seed=9)
-    geometry = adapted(scene, parameters)
-    data = file_of(scene, geometry, "zstd", parameters)
+    data = file_of(scene, adapted(scene, parameters), "zstd", parameters)
     assert np.allclose(decode(data).sh, oracle.decode(data)["sh"], rtol=1e-6, atol=1e-7)
 
 
@@ -150,8 +137,7 @@ def test_steps_come_back_from_their_bytes():
     for splats in (25, 28):
         back = ColourSteps.from_bytes(STEPS.to_bytes(), splats)
         assert np.array_equal(back.groups, STEPS.groups)
-        for name in (field.name for field in dataclasses.fields(STEPS) if field.name != "groups"):
-            assert getattr(back, name) == getattr(STEPS, name)
+        assert dataclasses.replace(back, groups=STEPS.groups) == STEPS
 
 
 @pytest.mark.parametrize(
@@ -172,24 +158,23 @@ def test_bytes_that_say_nothing_are_refused(raw):
         ColourSteps.from_bytes(raw, 28)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 def test_hostile_rules_give_what_the_page_says(seed):
     """Numbers at the ends of their ranges, and levels of 64 bits."""
     rng = np.random.default_rng(seed)
     n = 40
     ends = np.array([-32768, 32767])
+    group_bits = int(rng.integers(0, 7))
     steps = ColourSteps(
-        group_bits=int(rng.integers(0, 7)),
+        group_bits=group_bits,
         knot_shift=int(rng.choice([0, 3, 40])),
         first_knot=int(rng.choice([0, 255])),
         powers=(int(rng.choice([0, 8, 255])), 255),
         offsets=(int(rng.choice(ends)), int(rng.choice(ends))),
         scales=tuple(rng.choice(ends, 3).tolist()),
         opacities=tuple(rng.choice(ends, KNOTS).tolist()),
-        groups=np.zeros(0, np.int8),
+        groups=rng.choice(np.array([-128, 127], np.int8), -(-n >> group_bits)),
     )
-    groups = rng.choice(np.array([-128, 127], np.int8), -(-n >> steps.group_bits))
-    steps = dataclasses.replace(steps, groups=groups)
     levels = [
         (rng.integers(0, 2**63, n, dtype=np.uint64) * 2 + 1) >> rng.integers(0, 64, n, dtype=np.uint64)
         for _ in range(4)
@@ -201,8 +186,8 @@ def test_hostile_rules_give_what_the_page_says(seed):
     assert [part.tolist() for part in got] == list(wanted)
 
 
-@pytest.mark.parametrize("n", [1, 3, 255, 256, 257, 1030])
-@pytest.mark.parametrize("bits", [4, 20, 63])
+@pytest.mark.parametrize("n", [1, 3, 256, 1030])
+@pytest.mark.parametrize("bits", [4, 63])
 def test_predictions_are_undone(n, bits, path):
     """Also where products wrap round."""
     rng = np.random.default_rng(n)

@@ -1,15 +1,20 @@
-"""An open device: programs, variants of kernels, memory and what is accounted for, errors."""
+"""An open device: programs, variants of kernels, memory and what is accounted for, errors; one opened ahead."""
 
 from __future__ import annotations
 
 import dataclasses
+import gc
+from collections import defaultdict, deque
+from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pyopencl as cl
 import pytest
 
 from potr_cl.errors import DeviceError, DeviceMemoryError
+from potr_cl.opencl import ahead
 from potr_cl.opencl import device as opencl_device
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import choose_device
@@ -29,8 +34,8 @@ def test_self_check_passes(device: Device) -> None:
 
 
 def test_programs_are_built_once(device: Device) -> None:
-    assert device.program("opencl/probe.cl", LANES=1) is device.program("opencl/probe.cl", LANES=1)
-    assert device.program("opencl/probe.cl", LANES=1) is not device.program("opencl/probe.cl", LANES=4)
+    first = device.program("opencl/probe.cl", LANES=1)
+    assert device.program("opencl/probe.cl", LANES=1) is first is not device.program("opencl/probe.cl", LANES=4)
 
 
 def test_headers_are_included_once() -> None:
@@ -41,24 +46,18 @@ def test_headers_are_included_once() -> None:
 
 def test_a_variant_takes_the_place_of_a_file(tmp_path: Path, device: Device) -> None:
     """Of a kernel file, of a header, and under a name of its own; what a variant includes comes from the package."""
-    (tmp_path / "probe.cl").write_text(
-        '#include "mine/twice.clh"\nkernel void f(global float *x) { x[0] *= TWICE * TILE; }'
-    )
-    (tmp_path / "tile.clh").write_text("#define TILE 3\n")
-    (tmp_path / "twice.clh").write_text('#include "include/subtiles.clh"\n#define TWICE 2\n')
-    changed = Device(
-        device.info,
-        variants={
-            "mine/probe.cl": tmp_path / "probe.cl",
-            "mine/twice.clh": tmp_path / "twice.clh",
-            "include/subtiles.clh": tmp_path / "tile.clh",
-        },
-    )
+    variants = {}
+    for number, (name, text) in enumerate({
+        "mine/probe.cl": '#include "mine/twice.clh"\nkernel void f(global float *x) { x[0] *= TWICE * TILE; }',
+        "mine/twice.clh": '#include "include/subtiles.clh"\n#define TWICE 2\n',
+        "include/subtiles.clh": "#define TILE 3\n",
+    }.items()):  # fmt: skip
+        variants[name] = tmp_path / str(number)
+        variants[name].write_text(text)
+    changed = Device(device.info, variants=variants)
     buffer = changed.upload(np.ones(1, np.float32), "a number")
-    kernel = changed.kernel("mine/probe.cl", "f")
-    kernel.bind(x=buffer).launch((1,))
+    changed.kernel("mine/probe.cl", "f").bind(x=buffer).launch((1,))
     assert changed.download(buffer, (1,), np.float32) == 6
-    changed.free(buffer)
     assert "#define TILE 3" not in kernel_source("raster/project.cl")
 
 
@@ -84,14 +83,6 @@ def test_failing_build_names_the_device(device: Device) -> None:
     assert "\n" not in str(error.value)
 
 
-def test_memory_is_accounted_for(device: Device) -> None:
-    before = device.allocated
-    buffer = device.allocate(1000, "a test")
-    assert device.allocated == before + 1000
-    device.free(buffer)
-    assert device.allocated == before
-
-
 @pytest.mark.parametrize("excess", ["buffer", "memory"])
 def test_allocation_beyond_the_device_is_refused(device: Device, excess: str) -> None:
     nbytes = device.info.largest_buffer + 1 if excess == "buffer" else device.info.memory + 1
@@ -101,24 +92,20 @@ def test_allocation_beyond_the_device_is_refused(device: Device, excess: str) ->
     assert device.allocated == before
 
 
-def test_driver_errors_become_device_errors(device: Device) -> None:
-    with pytest.raises(DeviceError, match="ran out of memory"), device.errors("failed"):
-        raise cl.MemoryError("clEnqueueNDRangeKernel failed: MEM_OBJECT_ALLOCATION_FAILURE")
-    with pytest.raises(DeviceError, match="failed to think"), device.errors("failed to think"):
-        raise cl.LogicError("clSomething failed: INVALID_VALUE\nmore")
-
-
 def test_upload_and_download(device: Device) -> None:
     array = np.arange(24, dtype=np.float32).reshape(2, 3, 4)
+    before = device.allocated
     buffer = device.upload(array.transpose(2, 0, 1), "a test")  # any strides
+    assert device.allocated == before + array.nbytes
     assert np.array_equal(device.download(buffer, (4, 2, 3), np.float32), array.transpose(2, 0, 1))
     device.free(buffer)
+    assert device.allocated == before
     nothing = device.upload(np.empty(0, np.float32), "nothing")
     assert device.download(nothing, (0,), np.float32).size == 0
     device.free(nothing)
 
 
-@pytest.mark.parametrize("count", [1, 4095, 4096, 4097, 5003])
+@pytest.mark.parametrize("count", [1, 4096, 4097, 5003])
 @pytest.mark.parametrize("value", [np.uint8(7), np.float32(-np.inf), np.int64(-3 << 40)])
 def test_large_buffers_are_filled_too(
     device: Device, count: int, value: np.generic, monkeypatch: pytest.MonkeyPatch
@@ -151,18 +138,10 @@ def test_the_same_memory_is_taken_again(device: Device) -> None:
         memory.close()
     assert 24_000 <= taken[0] <= taken[1] < 31_000
     assert 32_000 <= taken[2] <= taken[3] < 42_000
-    memory.give_back()
-    assert device.allocated == before
-
-
-def test_memory_for_nothing_is_a_buffer(device: Device) -> None:
-    """Kernels want one, if only to leave it alone."""
-    before = device.allocated
-    memory = Reused(device)
-    for _ in range(2):
-        assert memory.allocate(0, "a test") is not None
-        assert memory.upload(np.zeros(0, np.uint32), "a test") is not None
-        memory.close()
+    # Kernels want a buffer of nothing, too, if only to leave it alone.
+    for nothing in (memory.allocate(0, "a test"), memory.upload(np.zeros(0, np.uint32), "a test")):
+        assert nothing is not None
+    memory.close()
     memory.give_back()
     assert device.allocated == before
 
@@ -194,7 +173,7 @@ def test_stage_times_need_profiling(device: Device) -> None:
     assert device.stage_times() == {}
 
 
-OUT_OF_MEMORY = [
+NO_MEMORY = [
     cl.MemoryError("clEnqueueNDRangeKernel failed: MEM_OBJECT_ALLOCATION_FAILURE"),
     cl.RuntimeError("clCreateBuffer failed: OUT_OF_HOST_MEMORY"),
     cl.RuntimeError("clEnqueueNDRangeKernel failed: OUT_OF_RESOURCES"),
@@ -203,20 +182,19 @@ OUT_OF_MEMORY = [
     MemoryError("std::bad_alloc"),
     MemoryError(),
 ]
+OTHER_FAULTS = [
+    cl.LogicError("clSomething failed: INVALID_VALUE\nmore"),
+    cl.RuntimeError("clBuildProgram failed: X\n\nBuild on <A>:\n\nerror: OUT_OF_RESOURCES is no type"),
+]
 
 
-@pytest.mark.parametrize("error", OUT_OF_MEMORY, ids=str)
-def test_every_way_to_say_no_memory(device: Device, error: Exception) -> None:
-    with pytest.raises(DeviceMemoryError, match="ran out of memory") as caught, device.errors("failed"):
+@pytest.mark.parametrize("error", [*NO_MEMORY, *OTHER_FAULTS], ids=str)
+def test_driver_errors_become_device_errors(device: Device, error: Exception) -> None:
+    with pytest.raises(DeviceError) as caught, device.errors("failed to think"):
         raise error
+    assert (type(caught.value) is DeviceMemoryError) == (error in NO_MEMORY)
+    assert ("ran out of memory" if error in NO_MEMORY else "failed to think") in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_other_errors_are_not_about_memory(device: Device) -> None:
-    log = "clBuildProgram failed: BUILD_PROGRAM_FAILURE\n\nBuild on <A>:\n\nerror: OUT_OF_RESOURCES is no type"
-    with pytest.raises(DeviceError) as caught, device.errors("failed"):
-        raise cl.RuntimeError(log)
-    assert type(caught.value) is DeviceError
 
 
 def test_a_launch_that_finds_no_memory(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -266,3 +244,73 @@ def test_the_narrowest_sub_groups_are_found_by_trial(monkeypatch: pytest.MonkeyP
     assert builds == [8, 16, 16]
     program = wide.program("opencl/probe.cl", LANES=1)
     assert "-DSUB_GROUP=16" in program.get_build_info(info.handle, cl.program_build_info.OPTIONS)
+
+
+# Opened before somebody asks for it -----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def contexts(monkeypatch):
+    """The devices of which contexts are made, in their order."""
+    made = []
+    real = ahead.new_context
+
+    def counted(handle):
+        made.append(handle)
+        return real(handle)
+
+    gc.collect()  # devices of other tests leave their contexts now
+    monkeypatch.setattr(ahead, "_begun", None)
+    monkeypatch.setattr(ahead, "new_context", counted)
+    monkeypatch.setattr(ahead, "_left", defaultdict(lambda: deque(maxlen=0)))  # nothing of other tests
+    return made
+
+
+def test_who_opens_a_device_again_and_again_has_one_context(contexts, monkeypatch):
+    """Drivers never give back all that they take for one."""
+    monkeypatch.setattr(ahead, "_left", defaultdict(lambda: deque(maxlen=1)))
+    for _ in range(3):
+        device = Device()
+        device.shared_kernel("opencl/fill.cl", "fill")
+        del device
+    assert len(contexts) == 1
+    with suppress(DeviceError), Device().errors("has failed"):
+        raise cl.RuntimeError("of the device")
+    Device()
+    assert len(contexts) == 2  # that of a device that has failed is left to nobody
+
+
+def test_what_was_begun_is_taken_once(contexts):
+    info = choose_device()
+    ahead.begin_to_open(None)
+    first, second = Device(), Device()
+    assert contexts == [info.handle] * 2
+    assert first.context.devices == second.context.devices == [info.handle]
+    assert first.context != second.context
+
+
+@pytest.mark.parametrize("spec", ["no such device", "all", "0,1", None])
+def test_whatever_was_begun_a_device_opens(spec, contexts):
+    """Also where nothing has begun because the name fits no device, or several."""
+    ahead.begin_to_open(spec, whole=spec is not None)
+    device = Device()
+    assert device.context.devices == [device.info.handle]
+    with pytest.raises(DeviceError, match="no such device"):
+        Device("no such device")
+
+
+def test_a_context_of_another_device_is_left_alone(contexts):
+    ahead.begin_to_open(None)
+    other = SimpleNamespace(handle=object())
+    with pytest.raises(AttributeError):  # an object is no device: it was asked all the same
+        ahead.context_of(other)
+    assert contexts == [choose_device().handle, other.handle]
+
+
+def test_several_devices_are_begun_together(contexts, monkeypatch):
+    info = choose_device()
+    monkeypatch.setattr(ahead, "choose_devices", lambda spec: [info, info])
+    ahead.begin_to_open("all")
+    devices = [Device(info) for _ in range(3)]
+    assert contexts == [info.handle] * 3  # two that were begun, and one more
+    assert len({device.context.int_ptr for device in devices}) == 3

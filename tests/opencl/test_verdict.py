@@ -123,7 +123,7 @@ def test_the_trial_builds_every_kernel_of_encodes_and_this_machines_device_passe
     tried, used = Device(), Device()
     trial.try_encodes(tried)
     for preset in PRESETS:
-        options = EncodeOptions.for_preset(preset, prune={"iterations": 4}, fit={"on": True, "steps": 20})
+        options = EncodeOptions.for_preset(preset, prune={"iterations": 2}, fit={"on": True, "steps": 4})
         encode(plush_excerpt, plush_excerpt_cameras, options, device=used)
     assert set(used._programs) <= set(tried._programs)
 
