@@ -44,5 +44,5 @@ def usual_device():
 
 @pytest.fixture
 def case(device):
-    with Case(device, visible_scene(40), visible_scene(60, 2, seed=7), ring_of_cameras(4, size=40)) as case:
+    with Case(device, visible_scene(20), visible_scene(60, 2, seed=7), ring_of_cameras(3, size=40)) as case:
         yield case
