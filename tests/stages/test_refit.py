@@ -250,7 +250,7 @@ def test_a_greater_price_keeps_fewer(case):
      {"drop": np.inf}, {"chroma_factor": -1}, {"selection_lam": 1e13}, {"slices": 0}],
 )  # fmt: skip
 def test_options_out_of_range(bad):
-    with pytest.raises(UsageError, match="re-fit|slices"):
+    with pytest.raises(UsageError, match=r"re-fit|slices"):
         RefitOptions(**bad)
 
 

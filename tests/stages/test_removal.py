@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from contextlib import contextmanager
 
 import numpy as np
@@ -10,24 +11,18 @@ import pytest
 
 from potr_cl.errors import DeviceMemoryError, UsageError
 from potr_cl.model.camera import Camera
-from potr_cl.model.scene import Scene
+from potr_cl.model.scene import LOW_PASS, MIP_SPLATTING_LOW_PASS, Scene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
+from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS, ViewWeights
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions, prune
 from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.views.budget import default_memory
-from tests.devices import KERNELS, open_device
+from tests.cases.scenes import antialiased
 from tests.reference import raster as reference
 from tests.reference.removal import BruteForce
 from tests.reference.scenes import ring_of_cameras, visible_scene
-
-
-@pytest.fixture(scope="module", params=KERNELS)
-def device(request):
-    device = open_device(request.param)
-    yield device
-    assert device.allocated == 0, "a sweep did not give all its memory back"
 
 
 def without(scene: Scene, gone) -> Scene:
@@ -67,16 +62,34 @@ def sweep(device, scene, cameras, tolerance=0.0, background=(0.0, 0.0, 0.0)):
         yield removal
 
 
-def test_single_removals(device):
-    scene, background = visible_scene(60, 1), (1.0, 0.3, 0.0)
-    cameras = ring_of_cameras(3, size=48)
-    with sweep(device, scene, cameras, background=background) as removal:
+COLOURFUL = (1.0, 0.3, 0.0)
+CLASSIC = visible_scene(60, 1)
+VIEWS = ring_of_cameras(3, size=48)
+
+
+@functools.cache
+def true_effects(low_pass):
+    """Of every third splat, and how much of each picture the splats cover."""
+    scene = CLASSIC if low_pass is None else antialiased(CLASSIC, low_pass)
+    targets = renders(scene, VIEWS, COLOURFUL)
+    covered = [1 - reference.render(scene, camera, INRIA).transmittance.mean() for camera in VIEWS]
+    return scene, brute_force(scene, VIEWS, targets, range(0, 60, 3), background=COLOURFUL), covered
+
+
+@pytest.mark.parametrize("low_pass", [None, LOW_PASS, MIP_SPLATTING_LOW_PASS])
+def test_single_removals(device, low_pass):
+    """Of a classic scene, and of an antialiased one, whose splats are about a pixel large."""
+    scene, true, covered = true_effects(low_pass)
+    with sweep(device, scene, VIEWS, background=COLOURFUL) as removal:
         effect, importance = removal.measure()
-    targets = renders(scene, cameras, background)
-    close(effect, brute_force(scene, cameras, targets, range(60), background=background))
+        weights = ViewWeights.from_importances(len(scene), removal.view_importances())
+    close(effect[::3], true)
     assert (effect >= 0).all()  # nothing is better than the target itself
-    transmittances = [reference.render(scene, c, INRIA).transmittance for c in cameras]
-    assert importance.sum() == pytest.approx(np.mean([1 - t.mean() for t in transmittances]), rel=1e-5)
+    # The compaction's weights: the mean of T alpha over each view's pixels, which add up to what is not background.
+    assert importance.sum() == pytest.approx(np.mean(covered), rel=1e-5)
+    for number, share in enumerate(covered):
+        total = weights.weights[weights.views == number].sum(dtype=np.float64) / REFERENCE_PIXELS
+        assert total == pytest.approx(share, rel=1e-5)
 
 
 def test_single_removals_when_others_are_gone(device):
@@ -120,12 +133,12 @@ def test_alpha_at_the_cap_behind_hundreds_of_layers(device):
 
 def test_same_bits_every_time(device, plush_excerpt, plush_excerpt_cameras):
     results = []
-    for _ in range(3):
+    for _ in range(2):
         with sweep(device, plush_excerpt, plush_excerpt_cameras[:3]) as removal:
             removal.measure()
             removal.remove(np.arange(0, 1500, 7))
             results.append(np.concatenate(removal.measure()).tobytes())
-    assert len(set(results)) == 1
+    assert results[0] == results[1]
 
 
 def test_sums_kept_over_removals_are_those_of_a_new_sweep(device, plush_excerpt, plush_excerpt_cameras):
@@ -224,30 +237,16 @@ def test_options_out_of_range(bad):
         SweepOptions(**bad)
 
 
-def test_a_view_that_sees_nothing_changes_only_the_mean(device):
+def test_views_count_the_same_whatever_their_size_and_what_they_see(device):
     scene = visible_scene(30, 0)
-    cameras = ring_of_cameras(1, size=48)
-    away = dataclasses.replace(cameras[0], name="away", translation=np.array([0, 0, -50.0]))
-    with sweep(device, scene, cameras) as removal:
-        one = removal.measure()
-    with sweep(device, scene, [*cameras, away]) as removal:
-        two = removal.measure()
-    for a, b in zip(one, two, strict=True):
-        assert np.allclose(a, 2 * b, rtol=1e-6, atol=1e-14)
-
-
-def test_views_of_different_sizes_count_the_same(device):
-    scene = visible_scene(30, 0)
-    large = ring_of_cameras(2, size=96)[0]
-    small = ring_of_cameras(2, size=48)[1]
-    separate = []
-    for camera in (large, small):
-        with sweep(device, scene, [camera]) as removal:
-            separate.append(removal.measure())
-    with sweep(device, scene, [large, small]) as removal:
-        together = removal.measure()
-    for i in range(2):
-        assert np.allclose(together[i], (separate[0][i] + separate[1][i]) / 2, rtol=1e-5, atol=1e-13)
+    views = [ring_of_cameras(2, size=96)[0], ring_of_cameras(2, size=48)[1]]
+    views.append(dataclasses.replace(views[0], name="away", translation=np.array([0, 0, -50.0])))
+    found = []
+    for some in ([views[0]], [views[1]], views):
+        with sweep(device, scene, some) as removal:
+            found.append(removal.measure())
+    for large, small, together in zip(*found, strict=True):
+        assert np.allclose(together, (large + small) / 3, rtol=1e-5, atol=1e-13)
 
 
 @pytest.mark.slow
@@ -270,7 +269,7 @@ def test_the_memory_budget_is_used_and_not_exceeded(device):
         nothing, _ = measured(0)
         everything, expected = measured(None)
         left = np.arange(1500) % 3 > 0
-        for share in (0.2, 0.3, 0.5, 0.7, 0.95):
+        for share in (0.2, 0.5, 0.95):
             budget = int(share * (everything - nothing))
             taken, effects = measured(budget)
             assert 0.9 * budget <= taken - nothing <= 1.001 * budget, share
@@ -278,7 +277,7 @@ def test_the_memory_budget_is_used_and_not_exceeded(device):
 
 
 @pytest.mark.one_runtime
-@pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.99])
+@pytest.mark.parametrize("share", [0.1, 0.9])
 def test_a_failure_gives_all_memory_back(device, monkeypatch, share):
     """Wherever the device's memory ends while a sweep is made."""
     cameras, keep_all = ring_of_cameras(5, size=48), SweepOptions(memory=1 << 40)
@@ -297,8 +296,7 @@ def test_a_failure_gives_all_memory_back(device, monkeypatch, share):
 
 def test_identical_splats_share_their_effect(device):
     scene = visible_scene(1, 0).subset(np.zeros(40, np.int64))
-    cameras = ring_of_cameras(2, size=48)
-    with sweep(device, scene, cameras) as removal:
+    with sweep(device, scene, ring_of_cameras(2, size=48)) as removal:
         effect, importance = removal.measure()
     assert np.isfinite(effect).all()
     # Nearer by number: the first is in front of all others.
