@@ -6,8 +6,10 @@ from collections.abc import Iterator
 
 import pytest
 
+from potr_cl.model.camera import resized, train_views
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import choose_device
+from tests.cases.ridges import COMPACTING, compacting_device
 from tests.devices import FAMILIES, KERNELS, shared_device
 from tests.reference.refit_cases import Case
 from tests.reference.scenes import ring_of_cameras, visible_scene
@@ -40,6 +42,19 @@ def gpu(request):
 def usual_device():
     """The device that is taken by default, as it is."""
     yield from _watched(shared_device(choose_device().family))
+
+
+@pytest.fixture(scope="module", params=COMPACTING)
+def compacting(request):
+    """Devices that the compaction runs on."""
+    with compacting_device(request.param) as device:
+        yield device
+
+
+@pytest.fixture(scope="session")
+def small_views(plush_excerpt_cameras):
+    """The training views of the excerpt, in pictures of 120 x 90."""
+    return [resized(camera, 120, 90) for camera in train_views(plush_excerpt_cameras)]
 
 
 @pytest.fixture

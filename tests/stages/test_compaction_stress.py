@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -15,10 +14,8 @@ from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor
 from tests.cases.ridges import (
-    COMPACTING,
     channels,
     check_optimal,
-    compacting_device,
     dense_weights,
     on_a_sphere,
     sparse_weights,
@@ -27,12 +24,6 @@ from tests.reference.ridge import (
     weighted_basis,
 )
 from tests.reference.scenes import random_scene
-
-
-@pytest.fixture(scope="module", params=COMPACTING)
-def device(request: pytest.FixtureRequest) -> Iterator[Device]:
-    with compacting_device(request.param) as device:
-        yield device
 
 
 def clustered(views: int, spread: float, seed: int) -> NDArray[np.float64]:
@@ -56,20 +47,20 @@ def bounded(scene: Scene, compacted: Scene) -> bool:
     )
 
 
-@pytest.mark.parametrize("spread", [1.0, 0.1, 1e-2, 1e-3, 1e-5, 0.0])
-def test_ill_conditioned_systems(device: Device, spread: float) -> None:
+@pytest.mark.parametrize("spread", [1.0, 1e-2, 1e-5, 0.0])
+def test_ill_conditioned_systems(compacting: Device, spread: float) -> None:
     for alpha in [0.9, 1.0]:
-        for lam in [0.0, 1e-6, 1.0, 1e6, 1e12]:
-            scene = random_scene(24, seed=9)
+        for lam in [0.0, 1e-6, 1.0, 1e12]:
+            scene = random_scene(12, seed=9)
             scene = replace(scene, means=np.zeros_like(scene.means))
             centres = clustered(40, spread, seed=9)
             rng = np.random.default_rng(9)
             # From all weights alike to 18 decades among them: condition numbers from 1 to far beyond 1e14.
-            dense = 10 ** rng.uniform(-1, 1, (24, 40)) ** np.repeat([0, 1, 3], 8)[:, None]
-            dense[16:] = 10 ** rng.uniform(-12, 6, (8, 40))
+            dense = 10 ** rng.uniform(-1, 1, (12, 40)) ** np.repeat([0, 1, 3], 4)[:, None]
+            dense[8:] = 10 ** rng.uniform(-12, 6, (4, 40))
             dense = dense.astype(np.float32)
             options = CompactionOptions(lam=lam, alpha=alpha)
-            compacted = Compactor(device).compact(scene, centres, dense_weights(dense), options)
+            compacted = Compactor(compacting).compact(scene, centres, dense_weights(dense), options)
             assert bounded(scene, compacted)
             check_optimal(scene, compacted, centres, dense, options)
 
@@ -80,8 +71,8 @@ def test_the_stress_reaches_condition_numbers_of_1e14() -> None:
     assert np.linalg.cond(basis / np.linalg.norm(basis, axis=0)) > 1e7  # of the Gram matrix: the square
 
 
-@pytest.mark.parametrize("views", ["one", "opposite", "same place", "ring", "sphere"])
-def test_extreme_weights(device: Device, views: str) -> None:
+@pytest.mark.parametrize("views", ["one", "opposite", "same place", "ring"])
+def test_extreme_weights(compacting: Device, views: str) -> None:
     for lam in [0.0, 1.0, 1e12]:
         for weight in [1e-12, 1.0, 1e6]:
             centres = {
@@ -89,25 +80,24 @@ def test_extreme_weights(device: Device, views: str) -> None:
                 "opposite": np.array([[0.0, 6, 0], [0, -6, 0]]),
                 "same place": np.tile(on_a_sphere(1), (7, 1)),
                 "ring": np.stack([6 * np.cos(np.arange(9)), 6 * np.sin(np.arange(9)), np.zeros(9)], axis=1),
-                "sphere": on_a_sphere(50),
             }[views]
-            scene = random_scene(10, seed=10)
-            scene = replace(scene, means=(0.01 * scene.means * (np.arange(10) > 4)[:, None]).astype(np.float32))
-            dense = np.full((10, len(centres)), weight, np.float32)
+            scene = random_scene(6, seed=10)
+            scene = replace(scene, means=(0.01 * scene.means * (np.arange(6) > 2)[:, None]).astype(np.float32))
+            dense = np.full((6, len(centres)), weight, np.float32)
             for alpha in (0.7, 1.0):
                 options = CompactionOptions(lam=lam, alpha=alpha)
-                compacted = Compactor(device).compact(scene, centres, dense_weights(dense), options)
+                compacted = Compactor(compacting).compact(scene, centres, dense_weights(dense), options)
                 assert bounded(scene, compacted)
                 check_optimal(scene, compacted, centres, dense, options)
 
 
-def test_a_splat_in_a_camera_stays_finite(device: Device) -> None:
+def test_a_splat_in_a_camera_stays_finite(compacting: Device) -> None:
     scene = random_scene(4, seed=11)
     centres = np.concatenate([scene.means.astype(np.float64), on_a_sphere(3)])
-    assert bounded(scene, Compactor(device).compact(scene, centres, dense_weights(np.ones((4, 7)))))
+    assert bounded(scene, Compactor(compacting).compact(scene, centres, dense_weights(np.ones((4, 7)))))
 
 
-def test_far_from_the_origin(device: Device) -> None:
+def test_far_from_the_origin(compacting: Device) -> None:
     """Directions come from differences of positions with all their digits."""
     scene = random_scene(20, seed=12)
     offset = np.array([3e5, -2e5, 1e5])
@@ -117,12 +107,12 @@ def test_far_from_the_origin(device: Device) -> None:
     weights = dense_weights(sparse_weights(20, 30, seed=12))
     options = CompactionOptions(lam=0.1, two_pass=False)
     results = [
-        Compactor(device).compact(s, c, weights, options).sh for s, c in ((near, centres), (far, centres + offset))
+        Compactor(compacting).compact(s, c, weights, options).sh for s, c in ((near, centres), (far, centres + offset))
     ]
     np.testing.assert_allclose(*results, atol=1e-4)
 
 
-def test_a_solution_that_grows_too_much_is_refused(device: Device) -> None:
+def test_a_solution_that_grows_too_much_is_refused(compacting: Device) -> None:
     """Views on a short arc: many columns are parallel to y's, which would have to stand in for all of them."""
     angle = 1e-3 * np.arange(-5, 6)
     centres = -6 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
@@ -135,7 +125,7 @@ def test_a_solution_that_grows_too_much_is_refused(device: Device) -> None:
     sh[:, parallel] = np.where(np.arange(2) == 0, 40, 0.01)[:, None, None] * in_terms_of_y[parallel, None]
     scene = replace(scene, sh=sh, means=np.zeros((2, 3), np.float32))
     options = CompactionOptions(lam=0, two_pass=False, colour_model="rgb")
-    compacted = Compactor(device).compact(scene, centres, dense_weights(np.ones((2, 11))), options)
+    compacted = Compactor(compacting).compact(scene, centres, dense_weights(np.ones((2, 11))), options)
     np.testing.assert_array_equal(compacted.sh[0], scene.sh[0])
     assert np.count_nonzero(compacted.sh[1, :, 0]) <= 3
 
@@ -150,7 +140,7 @@ def test_a_solution_that_grows_too_much_is_refused(device: Device) -> None:
     spread=st.floats(0, 1),
     degree=st.integers(1, 3),
 )
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=20)
 def test_any_system_is_bounded_and_optimal(
     seed: int, views: int, log_lam: float, alpha: float, decades: float, spread: float, degree: int
 ) -> None:

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from potr_cl.model.camera import resized, train_views
+from potr_cl.model.camera import resized
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.forecast import fit_bytes, memory_needed
 from potr_cl.pipeline.options import EncodeOptions
@@ -44,11 +44,6 @@ def many_splats(plush_excerpt):
     return dataclasses.replace(scene, means=moved)
 
 
-@pytest.fixture(scope="module")
-def views(plush_excerpt_cameras):
-    return [resized(camera, 120, 90) for camera in train_views(plush_excerpt_cameras)]
-
-
 def peak(device, source, scene, views, memory):
     """Bytes of the device that a fit of a few steps took at its peak."""
     device.most = 0
@@ -59,22 +54,22 @@ def peak(device, source, scene, views, memory):
 
 
 @pytest.mark.one_family
-def test_the_peak_is_what_is_said(device, many_splats, views):
+def test_the_peak_is_what_is_said(device, many_splats, small_views):
     scene = many_splats.subset(np.arange(20_000))
     with Rasterizer(device, scene) as rasterizer:
         before = device.allocated
-        with rasterizer.prepare_set(views[:1]):
+        with rasterizer.prepare_set(small_views[:1]):
             view = device.allocated - before
     together = 4 if device.family == "gpu" else 1
-    said = fit_bytes(20_000, 30_000, 48, together, len(views), view, 120 * 90, 1e9)
-    assert 0.85 * said < peak(device, many_splats, scene, views, 10**9) < 1.15 * said
+    said = fit_bytes(20_000, 30_000, 48, together, len(small_views), view, 120 * 90, 1e9)
+    assert 0.85 * said < peak(device, many_splats, scene, small_views, 10**9) < 1.15 * said
 
 
 @pytest.mark.slow
 @pytest.mark.one_family
-def test_a_budget_of_memory_is_kept(device, many_splats, views):
+def test_a_budget_of_memory_is_kept(device, many_splats, small_views):
     """What is kept of views is no more than the budget."""
-    larger, some = [resized(view, 240, 180) for view in views], many_splats.subset(np.arange(3000))
+    larger, some = [resized(view, 240, 180) for view in small_views], many_splats.subset(np.arange(3000))
     picture = 12 * 240 * 180
     least = peak(device, some, some, larger, 0)
     assert peak(device, some, some, larger, 4 * picture + 100) <= least + 4 * picture + 100
@@ -84,13 +79,13 @@ def test_a_budget_of_memory_is_kept(device, many_splats, views):
 
 @pytest.mark.one_family
 @pytest.mark.parametrize("own", [False, True], ids=["the host's memory", "memory of its own"])
-def test_the_forecast_knows_of_the_fit(device, own, many_splats, views):
+def test_the_forecast_knows_of_the_fit(device, own, many_splats, small_views):
     """Where no view is kept; what kept views take may be more than the fit, which begins when they are gone."""
     info = dataclasses.replace(device.info, kind="gpu" if own else "cpu", integrated=not own)
     opened = Device(info, family=device.family)
 
     def memory(**changes):
-        return memory_needed(many_splats, views, EncodeOptions().changed(**changes), opened)
+        return memory_needed(many_splats, small_views, EncodeOptions().changed(**changes), opened)
 
     without, with_it = memory(memory=0), memory(memory=0, fit={"steps": 1000})
     assert with_it - without > 30_000 * 59 * 4 * 3
