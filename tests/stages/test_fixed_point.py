@@ -26,8 +26,9 @@ def tiles(camera: Camera) -> int:
     return -(-camera.width // TILE) * -(-camera.height // TILE)
 
 
-@given(SIZES)
-def test_the_largest_sums_in_all_tiles_of_all_views_fit(sizes):
+@given(SIZES, st.integers(-(2**62), 2**62), st.integers(0, 2**62))
+def test_the_largest_sums_fit_and_values_are_totals_in_their_units(sizes, effect, importance):
+    """Effects of 16 a pixel and channel are not cut."""
     views = cameras(sizes)
     units = FixedPoint.of_views(views)
     largest = 0.0
@@ -36,6 +37,11 @@ def test_the_largest_sums_in_all_tiles_of_all_views_fit(sizes):
         cut_at, scale = units.bound / weight, units.scale * weight  # as the kernels take them
         largest += tiles(view) * cut_at * scale
     assert largest <= 2.0**62 * (1 + 1e-12)
+    assert units.bound == 16 * 3 * TILE * TILE
+    assert np.log2(units.scale) % 1 == 0
+    effects, importances = units.values(np.array([[effect, importance]], np.int64))
+    assert effects[0] == pytest.approx(effect * units.units[0], rel=1e-14)
+    assert importances[0] == pytest.approx(importance * units.units[1], rel=1e-14)
 
 
 @given(SIZES)
@@ -44,21 +50,6 @@ def test_no_bit_is_wasted_where_all_views_are_of_a_size(sizes):
     area = (views[0].width + TILE - 1) * (views[0].height + TILE - 1)
     units = FixedPoint.of_views(views)
     assert 48.0 * area * len(views) * units.scale > 2.0**61
-
-
-@given(SIZES)
-def test_effects_of_16_a_pixel_and_channel_are_not_cut(sizes):
-    units = FixedPoint.of_views(cameras(sizes))
-    assert units.bound == 16 * 3 * TILE * TILE
-    assert np.log2(units.scale) % 1 == 0
-
-
-@given(SIZES, st.integers(-(2**62), 2**62), st.integers(0, 2**62))
-def test_values_are_totals_in_their_units(sizes, effect, importance):
-    units = FixedPoint.of_views(cameras(sizes))
-    effects, importances = units.values(np.array([[effect, importance]], np.int64))
-    assert effects[0] == pytest.approx(effect * units.units[0], rel=1e-14)
-    assert importances[0] == pytest.approx(importance * units.units[1], rel=1e-14)
 
 
 def test_a_pixel_of_any_view_counts_by_its_share_of_the_view():
