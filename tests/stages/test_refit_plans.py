@@ -190,23 +190,28 @@ def test_slices_change_no_bit(device, degree, count):
 
 @pytest.mark.one_family
 @pytest.mark.one_runtime
-@pytest.mark.parametrize("own", [False, True], ids=["the host's memory", "memory of its own"])
-def test_little_memory_is_enough(device, own, monkeypatch):
+@pytest.mark.parametrize(
+    ("kind", "on"),
+    [
+        pytest.param({"kind": "cpu"}, False, id="the host's memory"),
+        pytest.param({"kind": "gpu", "integrated": False}, False, id="memory of its own"),
+        pytest.param({"kind": "gpu", "integrated": False}, True, id="views with splats of their own"),
+    ],
+)
+def test_little_memory_is_enough(device, picked, kind, on, monkeypatch):
     """Vectors that are too large for the memory that is given do not come to the device: most of them are not there."""
     monkeypatch.setattr(coefficients, "_ANYWAY", 0)
     monkeypatch.setattr(coefficients, "_LEAST_SLICE", 512)
-    kind = {"kind": "gpu", "integrated": False} if own else {"kind": "cpu"}
     device = Device(dataclasses.replace(device.info, **kind), family=device.family)
-    count = 4000
-    one_piece = 3400 * count
-    peaks = []
-    with case_of(device, 3, count) as case:
-        free = device.allocated
+    found = []
+    with crowded_case(device, 3, splats=1500) as case:
+        free, one_piece = device.allocated, 3400 * len(case.scene)
         for memory in (None, one_piece // 2):
+            picked(on and memory is not None)
             with ColourRefit(device, case.scene, case.cameras, memory=memory) as refit:
                 result = refit.solve(case.scene.sh, case.targets, RefitOptions(steps=1, gain=0, memory=memory))
-                peaks.append((device.allocated - free, result))
-    (whole, one), (sliced, other) = peaks
+                found.append((device.allocated - free, result))
+    (whole, one), (sliced, other) = found
     assert same(one, other)
     assert sliced < 0.6 * one_piece < whole
 
@@ -251,33 +256,6 @@ def test_which_splats_are_reached(device, monkeypatch):
                 got, _ = alone.composite(views)
             assert np.array_equal(got, wanted)
         assert sum(map(len, found)) < 0.9 * sum(map(len, drawn)) < 0.5 * len(scene) * len(cameras)
-
-
-def test_fewer_views_together_where_the_device_has_no_room(device, monkeypatch):
-    if device.family == "cpu":
-        pytest.skip("kernels for CPUs do one view at a time")
-    monkeypatch.setattr(reached, "LEAST_SPLATS", 1)
-    monkeypatch.setattr(reached, "WORTH_IT", 1.0)
-    scene, cameras = crowded(200)
-    prepare = Rasterizer.prepare_set
-    together, found = [], []
-
-    def failing(self, some, *args):
-        together.append(len(some))
-        if len(some) > 3:
-            raise DeviceMemoryError("no room")
-        return prepare(self, some, *args)
-
-    with Rasterizer(device, scene) as rasterizer:
-        for full in (False, True):
-            if full:
-                monkeypatch.setattr(Rasterizer, "prepare_set", failing)
-            reach = reached_splats(rasterizer, cameras, range(len(cameras)))
-            assert reach is not None
-            found.append(reach.of)
-    assert max(together) > 3
-    for number in range(len(cameras)):
-        assert np.array_equal(found[0][number], found[1][number])
 
 
 def test_not_where_views_reach_much(device, monkeypatch):
@@ -328,29 +306,26 @@ def test_products(device, picked):
 
 
 @pytest.mark.parametrize("on", [False, True], ids=["all splats", "own splats"])
-def test_launches_are_halved_where_the_device_has_no_room(device, picked, monkeypatch, on):
-    if device.family == "cpu":
-        pytest.skip("kernels for CPUs do one view at a time")
-    case = crowded_case(device)
-    prepare = Rasterizer.prepare_set
-    together = []
+def test_fewer_views_together_where_the_device_has_no_room(gpu, picked, monkeypatch, on):
+    """Also where it is looked which splats they reach. Kernels for CPUs do one view at a time anyway."""
+    prepare, together, found = Rasterizer.prepare_set, [], []
 
     def failing(self, some, *args):
-        if isinstance(self.parameters, IndexSubset) == on:
-            together.append(len(some))
-            if len(some) > 1:
-                raise DeviceMemoryError("no room")
+        together.append((isinstance(self.parameters, IndexSubset), len(some)))
+        if len(some) > 1:
+            raise DeviceMemoryError("no room")
         return prepare(self, some, *args)
 
-    picked(on)
-    with case:
-        found = []
+    made = picked(on)
+    with crowded_case(gpu) as case:
         for full in (False, True):
             if full:
                 monkeypatch.setattr(Rasterizer, "prepare_set", failing)
             with Linearised(case) as linear:
                 found.append((linear.error, linear.gradient))
-    assert max(together) > 1
+    assert len(made) == 2 * on
+    assert max(views for _, views in together) > 1
+    assert {of_own for of_own, _ in together} == ({False, True} if on else {False})
     assert found[0][0] == found[1][0] > 0
     assert np.array_equal(found[0][1], found[1][1])
 
@@ -364,29 +339,6 @@ def test_more_views_stay(device, picked):
             with ColourRefit(device, case.scene, case.cameras, memory=10**8) as refit:
                 room[on] = refit.colour_map.own.room
     assert 10**8 - room[True] < 0.6 * (10**8 - room[False])
-
-
-@pytest.mark.slow
-@pytest.mark.one_family
-@pytest.mark.one_runtime
-def test_little_memory_is_enough_for_views_with_splats_of_their_own(device, picked, monkeypatch):
-    """What lies on the device keeps to what is given, as soon as that is more than the least."""
-    monkeypatch.setattr(coefficients, "_ANYWAY", 0)
-    monkeypatch.setattr(coefficients, "_LEAST_SLICE", 512)
-    device = Device(dataclasses.replace(device.info, kind="gpu", integrated=False), family=device.family)
-    scene, cameras = crowded(5000, degree=3)
-    one_piece = 3400 * len(scene)
-    memory = int(0.3 * one_piece)
-    results = []
-    with Case(device, scene, dataclasses.replace(scene, sh=-scene.sh), cameras) as case:
-        free = device.allocated
-        for on, given in ((False, None), (True, memory)):
-            picked(on)
-            with ColourRefit(device, scene, cameras, memory=given) as refit:
-                results.append(refit.solve(scene.sh, case.targets, RefitOptions(steps=2, gain=0, drop=1e-7)))
-                taken = device.allocated - free
-    assert taken < memory
-    assert same(*results)
 
 
 @pytest.mark.one_family
@@ -404,23 +356,6 @@ def test_the_same_file(device, plush_excerpt, plush_excerpt_cameras, monkeypatch
     sliced = encode(plush_excerpt, small, options, device=device)
     assert sliced.data == whole.data
     assert sliced.refitted.errors == whole.refitted.errors
-
-
-@pytest.mark.slow
-@pytest.mark.one_family
-def test_the_same_file_of_views_with_splats_of_their_own(device, picked):
-    """Of a whole encode, on one device and on two."""
-    scene, cameras = crowded(400)
-    options = EncodeOptions.for_preset("best", cameras_anyway=True).changed(prune={"iterations": 4})
-    picked(False)
-    wanted = encode(scene, cameras, options, device=device)
-    made = picked(True)
-    assert encode(scene, cameras, options, device=device).data == wanted.data
-    assert len(made) == 1
-    made.clear()
-    with HostPool([device, shared_device(device.family, 1)]) as pool:
-        assert encode(scene, cameras, options, device=device, pool=pool).data == wanted.data
-    assert len(made) == 2
 
 
 @pytest.mark.parametrize("own_splats", [False, True])
