@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import potr_cl
-from potr_cl.model.camera import train_views
 from potr_cl.model.scene import LOW_PASS, MIP_SPLATTING_LOW_PASS, Scene
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
@@ -61,24 +60,3 @@ def test_a_file_keeps_how_its_scene_is_rendered(device, preset, low_pass):
         pictures = [reference.render(each, view, INRIA).image for view in cameras[:2] for each in (scene, candidate)]
         errors.append(np.mean(np.square(np.subtract(pictures[0::2], pictures[1::2]))))
     assert errors[0] < 0.2 * errors[1]
-
-
-@pytest.mark.slow
-@pytest.mark.one_family
-def test_encoded_as_antialiased_it_looks_better_than_encoded_as_classic(device, plush_excerpt, plush_excerpt_cameras):
-    """The same scene at about the same bytes, judged by antialiased pictures of views that no encoder has seen."""
-    options = EncodeOptions.for_preset("fast", q=0.5)
-    judged = [view for view in plush_excerpt_cameras if view.split == "test"]
-    found = {}
-    marked = plush_excerpt.rendered(True)
-    with Rasterizer(device, marked) as rasterizer:
-        targets = [rasterizer.render(view)[0] for view in judged]
-    for kind in (True, False):
-        encoded = encode(plush_excerpt.rendered(kind), train_views(plush_excerpt_cameras), options, device=device)
-        back = potr_cl.codec.decoder.open_file(b"".join(encoded.pieces)).scene()
-        with Rasterizer(device, back.rendered(True)) as rasterizer:
-            pictures = [rasterizer.render(view)[0] for view in judged]
-        error = np.mean([np.mean(np.square(a - b)) for a, b in zip(pictures, targets, strict=True)])
-        found[kind] = (encoded.nbytes, -10 * np.log10(error))
-    assert found[True][0] < 1.05 * found[False][0]
-    assert found[True][1] > found[False][1] + 1

@@ -244,16 +244,6 @@ def test_a_greater_price_keeps_fewer(case):
     assert kept[0] > kept[-1] == 0
 
 
-@pytest.mark.parametrize(
-    "bad",
-    [{"steps": -1}, {"selection_steps": -1}, {"gain": 1}, {"gain": -0.1}, {"lam": -1}, {"prior": np.nan},
-     {"drop": np.inf}, {"chroma_factor": -1}, {"selection_lam": 1e13}, {"slices": 0}],
-)  # fmt: skip
-def test_options_out_of_range(bad):
-    with pytest.raises(UsageError, match=r"re-fit|slices"):
-        RefitOptions(**bad)
-
-
 @pytest.mark.one_runtime
 def test_no_view_is_an_error(device):
     with pytest.raises(UsageError, match="at least one view"):

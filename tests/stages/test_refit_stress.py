@@ -2,23 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 
-from potr_cl.model.camera import Camera
+from potr_cl.model.camera import resized
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from tests.reference.refit import to_ycocg
 from tests.reference.refit_cases import Case, Linearised
 from tests.reference.scenes import plain_splats, ring_of_cameras, straight_camera, visible_scene
-
-
-def of_size(camera: Camera, width: int, height: int) -> Camera:
-    factor = width / camera.width
-    return dataclasses.replace(
-        camera, width=width, height=height, fx=factor * camera.fx, fy=factor * camera.fy, cx=width / 2, cy=height / 2
-    )
 
 
 @pytest.mark.one_family
@@ -136,7 +127,7 @@ def test_absurd_targets(device):
 
 def test_views_of_different_sizes(device):
     cameras = ring_of_cameras(4, size=40)
-    cameras = [cameras[0], of_size(cameras[1], 61, 33), of_size(cameras[2], 16, 16), of_size(cameras[3], 7, 90)]
+    cameras = [cameras[0], resized(cameras[1], 61, 33), resized(cameras[2], 16, 16), resized(cameras[3], 7, 90)]
     with Case(device, visible_scene(30, 1), visible_scene(60, 2, 7), cameras) as case:
         options = RefitOptions(steps=200, gain=0, prior=10)
         x = solve_and_check(case, options)
