@@ -25,6 +25,7 @@ from potr_cl.views.shares import HelpFrom
 from potr_cl.views.subsets import ListedSplats
 from potr_cl.workers.host import HostPool
 from tests.cases.elsewhere import ElsewherePool
+from tests.cases.memory import taken_of
 from tests.cases.streets import street
 from tests.devices import shared_device
 from tests.reference.refit_cases import Case, Linearised, Pictures
@@ -35,37 +36,19 @@ from tests.reference.scenes import ring_of_cameras, visible_scene
 SLICES = 256
 
 
-@dataclasses.dataclass(frozen=True)
-class Plan:
-    """How a re-fit goes.
-
-    Attributes:
-        slices: splats of a slice of vectors on the host; None: they lie on the device.
-        resident: vectors that lie there even so.
-        picked: each view has the splats that it reaches, and no others.
-        memory: bytes for views.
-        workers: who share the views out.
-        elsewhere: these know nothing but what they are sent, and the master does no views.
-    """
-
-    slices: int | None = None
-    resident: int = 1
-    picked: bool = False
-    memory: int | None = None
-    workers: int = 1
-    elsewhere: bool = False
-
-
+#: Of a slice of vectors on the host, and how many vectors lie on the device even so; whether views have only the splats
+#: that they reach; bytes for views; who share the views out, and whether these know nothing but what they are sent, and
+#: the master does no views.
 PLANS = {
-    "slices": Plan(SLICES, 0),
-    "slices, three vectors on the device": Plan(SLICES, 3),
-    "slices, all vectors on the device, no view kept": Plan(SLICES, 7, memory=0),
-    "own splats, some views kept": Plan(picked=True, memory=200_000),
-    "own splats, slices": Plan(SLICES, picked=True),
-    "two devices": Plan(workers=2),
-    "two devices, own splats": Plan(workers=2, picked=True),
-    "a cluster of three": Plan(workers=4, elsewhere=True),
-    "a cluster of three, own splats, no view kept": Plan(workers=4, elsewhere=True, picked=True, memory=0),
+    "slices": {"slices": SLICES, "resident": 0},
+    "slices, three vectors on the device": {"slices": SLICES, "resident": 3},
+    "slices, all vectors on the device, no view kept": {"slices": SLICES, "resident": 7, "memory": 0},
+    "own splats, some views kept": {"picked": True, "memory": 200_000},
+    "own splats, slices": {"picked": True, "slices": SLICES},
+    "two devices": {"workers": 2},
+    "two devices, own splats": {"workers": 2, "picked": True},
+    "a cluster of three": {"workers": 4, "elsewhere": True},
+    "a cluster of three, own splats, no view kept": {"workers": 4, "elsewhere": True, "picked": True, "memory": 0},
 }
 #: What becomes of the solution: left as it is, rounded in rounds, or by somebody who asks what coefficients are worth.
 WAYS = ("solve", "colour_grid", "fix_ac")
@@ -121,24 +104,18 @@ def coarse(sh, refit):
     return np.concatenate([sh[:, :1], np.round(sh[:, 1:] * 10 + refit.worth()[:, 1:, None]) / 10], axis=1)
 
 
-def fitted(device, plan: Plan, way: str):
+def fitted(device, way: str, slices=None, memory=None, workers=1, elsewhere=False):
     """By two parts of the views."""
     case = crowded_case(device)
-    rounding = {
-        "colour_grid": {"colour_grid": lambda effects: grid_of(len(case.scene))},
-        "fix_ac": {"fix_ac": coarse},
-        "solve": {},
-    }[way]
-    options = RefitOptions(steps=4, gain=0, drop=1e-7, selection_lam=0.3, slices=plan.slices, memory=plan.memory)
+    grid, other = grid_of(len(case.scene)), dataclasses.replace(case.scene, sh=case.scene.sh[::-1].copy())
+    rounding = {"solve": {}, "colour_grid": {"colour_grid": lambda effects: grid}, "fix_ac": {"fix_ac": coarse}}[way]
+    options = RefitOptions(steps=4, gain=0, drop=1e-7, selection_lam=0.3, slices=slices, memory=memory)
     active = np.random.default_rng(1).random(case.scene.sh.shape) < 0.8
     with case, ExitStack() as stack:
         help_from = None
-        if plan.workers > 1:
-            devices = [device, *(shared_device(device.family, number) for number in range(1, plan.workers))]
-            kind = ElsewherePool if plan.elsewhere else HostPool
-            help_from = HelpFrom(
-                stack.enter_context(kind(devices)), dataclasses.replace(case.scene, sh=case.scene.sh[::-1].copy())
-            )
+        if workers > 1:
+            devices = [device, *(shared_device(device.family, number) for number in range(1, workers))]
+            help_from = HelpFrom(stack.enter_context((ElsewherePool if elsewhere else HostPool)(devices)), other)
         return refit_colours(
             device, case.scene, case.cameras, case.targets, options, active, case.background,
             help_from=help_from, **rounding,
@@ -150,7 +127,7 @@ def plain(device):
     """Solutions with everything on one device, and all splats in each view."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(own_views, "ENOUGH", 4)
-        return {way: fitted(device, Plan(), way) for way in WAYS}
+        return {way: fitted(device, way) for way in WAYS}
 
 
 #: Each plan with one of them; slices, own splats, devices and a cluster with two at least.
@@ -163,12 +140,13 @@ SLOW = [("two devices", "solve"), ("a cluster of three", "fix_ac")]
     [*TOGETHER, *(pytest.param(*both, marks=[pytest.mark.slow, pytest.mark.one_family]) for both in SLOW)],
 )
 def test_the_same_solution(device, plain, picked, plan, way, monkeypatch):
-    plan = PLANS[plan]
+    plan = dict(PLANS[plan])
+    on = plan.pop("picked", False)
     monkeypatch.setattr(own_views, "ENOUGH", 4)
-    monkeypatch.setattr(coefficients, "_FEWEST", plan.resident)
-    made = picked(plan.picked)
-    found = fitted(device, plan, way)
-    assert bool(made) == plan.picked
+    monkeypatch.setattr(coefficients, "_FEWEST", plan.pop("resident", 1))
+    made = picked(on)
+    found = fitted(device, way, **plan)
+    assert bool(made) == on
     assert same(found, plain[way])
     assert found.steps > 3
 
@@ -233,10 +211,9 @@ def test_memory_is_that_of_vectors_and_views_together(device, monkeypatch):
     assert room[0] < 3 * one_piece
 
 
-def test_which_splats_are_reached(device, monkeypatch):
+def test_which_splats_are_reached(device, picked):
     """All that are drawn but some that stand behind others; the picture of these alone is the picture of all."""
-    monkeypatch.setattr(reached, "LEAST_SPLATS", 1)
-    monkeypatch.setattr(reached, "WORTH_IT", 1.0)
+    picked(True)
     scene, cameras = crowded(800, houses=4)
     with Rasterizer(device, scene) as rasterizer:
         reach = reached_splats(rasterizer, cameras, range(len(cameras)))
@@ -359,7 +336,7 @@ def test_the_same_file(device, plush_excerpt, plush_excerpt_cameras, monkeypatch
 
 
 @pytest.mark.parametrize("own_splats", [False, True])
-def test_pictures_are_kept_in_what_streamed_views_leave(device, picked, own_splats, monkeypatch):
+def test_pictures_are_kept_in_what_streamed_views_leave(device, picked, own_splats):
     """Streamed views take their memory last: what is given for less than one of them is not filled with pictures."""
     scene, cameras = crowded(400)
     picked(own_splats)
@@ -368,18 +345,11 @@ def test_pictures_are_kept_in_what_streamed_views_leave(device, picked, own_spla
         with ColourRefit(device, scene, cameras, memory=10**9) as refit:
             every = int(10**9 - refit.colour_map.own.room)
         for memory in (0, every // 20):
-            with monkeypatch.context() as patch, ColourRefit(device, scene, cameras, memory=memory) as refit:
+            with ColourRefit(device, scene, cameras, memory=memory) as refit:
                 x, result = (refit.coefficients.vector() for _ in range(2))
                 for each in (x, result):
                     refit.coefficients.zero(each)
-                taken, allocate = [], device.allocate
-
-                def noted(*given, allocate=allocate, taken=taken):
-                    buffer = allocate(*given)
-                    taken.append(device.allocated)
-                    return buffer
-
-                patch.setattr(device, "allocate", noted)
-                refit.colour_map.gradient(x, pictures, result)
-                peaks.append(max(taken))
+                with taken_of(device) as taken:
+                    refit.colour_map.gradient(x, pictures, result)
+                peaks.append(max(in_all for _, in_all in taken))
     assert peaks[0] == peaks[1]

@@ -164,27 +164,19 @@ def test_buffers_too_small_for_all_views_change_nothing(device, plush_excerpt, p
 
 
 @pytest.mark.one_runtime
-def test_views_in_turns(device, plush_excerpt, plush_excerpt_cameras):
-    with (
-        Rasterizer(device, plush_excerpt) as rasterizer,
-        RemovalSweep(rasterizer, plush_excerpt_cameras[:4], SweepOptions(-1, turns=2)) as removal,
-    ):
-        for _ in range(3):
-            removal.measure()
-        assert removal.sweeps == pytest.approx(1 + 0.5 + 0.5)
-
-
-@pytest.mark.one_runtime
-def test_tolerance_saves_sweeps(device, plush_excerpt, plush_excerpt_cameras):
+def test_tolerance_and_turns_save_sweeps(device, plush_excerpt, plush_excerpt_cameras):
     sweeps = []
-    for tolerance in (-1, 0, 0.05):
-        with sweep(device, plush_excerpt, plush_excerpt_cameras[:2], tolerance) as removal:
-            for start in range(4):
-                removal.measure()
-                removal.remove(np.arange(start, 1500, 100))
-            sweeps.append(removal.sweeps)
-    assert sweeps[0] == pytest.approx(4)
-    assert sweeps[0] > sweeps[1] > sweeps[2] >= 1
+    with Rasterizer(device, plush_excerpt) as rasterizer:
+        for tolerance, turns in ((-1, 1), (-1, 2), (0, 1), (0.05, 1)):
+            with RemovalSweep(rasterizer, plush_excerpt_cameras[:2], SweepOptions(tolerance, turns=turns)) as removal:
+                for start in range(4):
+                    removal.measure()
+                    removal.remove(np.arange(start, 1500, 100))
+                sweeps.append(removal.sweeps)
+    every, in_turns, changed, tolerant = sweeps
+    assert every == pytest.approx(4)
+    assert in_turns == pytest.approx(1 + 3 * 0.5)
+    assert every > changed > tolerant >= 1
 
 
 def test_a_removal_lets_pixels_go_on(device):
