@@ -19,10 +19,11 @@ from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions, prune
 from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.views.budget import default_memory
+from tests.cases.judging import mean_error
 from tests.cases.scenes import antialiased
 from tests.reference import raster as reference
 from tests.reference.removal import BruteForce
-from tests.reference.scenes import ring_of_cameras, visible_scene
+from tests.reference.scenes import plain_splats, ring_of_cameras, visible_scene
 
 
 def without(scene: Scene, gone) -> Scene:
@@ -113,14 +114,11 @@ def test_single_removals_when_others_are_gone(device):
 def test_alpha_at_the_cap_behind_hundreds_of_layers(device):
     """No digits are lost where the paper's formula divides by 1 - alpha and subtracts what the layers in front add."""
     layers, opaque = 320, 300
-    logits = np.full(layers, -4.6, np.float32)  # alpha 0.01; a twentieth of the light is left at the opaque one
+    logits = np.full(layers, -4.6)  # alpha 0.01; a twentieth of the light is left at the opaque one
     logits[opaque] = 12  # alpha 0.99
-    means = np.zeros((layers, 3), np.float32)
-    means[:, 0] = np.linspace(-2, 2, layers)
-    quaternions = np.zeros((layers, 4), np.float32)
-    quaternions[:, 0] = 1
-    dc = np.random.default_rng(0).normal(size=(layers, 1, 3)).astype(np.float32)
-    scene = Scene(means, np.full((layers, 3), 0.5, np.float32), quaternions, logits, dc)
+    means = np.linspace([-2, 0, 0], [2, 0, 0], layers)
+    colours = 0.5 + 0.28 * np.random.default_rng(0).normal(size=(layers, 3))
+    scene = plain_splats(means, sigma=np.exp(0.5), logit=logits, colour=colours)
     camera_centre = np.array([-8.0, 0, 0])
     rotation = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
     cameras = [Camera("along", 16, 16, 60, 60, 8, 8, rotation, -rotation @ camera_centre)]
@@ -276,11 +274,11 @@ def test_pruning_keeps_the_picture_better_than_importance(device, plush_excerpt,
         pruned = prune(removal, 1500, PruningOptions(0, 12, count=750))
     by_importance = np.sort(np.argsort(importance)[-750:])
 
-    def error(kept):
-        with Rasterizer(device, plush_excerpt) as whole, Rasterizer(device, plush_excerpt.subset(kept)) as other:
-            return sum(np.mean((other.render(c)[0] - whole.render(c)[0]) ** 2) for c in cameras)
-
-    assert error(pruned.survivors) < 0.5 * error(by_importance)
+    ours, theirs = (
+        mean_error(device, plush_excerpt, plush_excerpt.subset(kept), cameras)
+        for kept in (pruned.survivors, by_importance)
+    )
+    assert ours < 0.5 * theirs
 
 
 @pytest.mark.one_runtime
@@ -293,8 +291,7 @@ def test_no_view_is_an_error(device):
 @pytest.mark.parametrize(
     ("kind", "integrated", "share"), [("gpu", False, 0.5), ("gpu", True, 0.3), ("cpu", True, 0.3), ("cpu", False, 0.3)]
 )
-def test_views_take_less_of_memory_that_is_the_hosts(device, kind, integrated, share):
-    before = device.info
-    device.info = dataclasses.replace(before, memory=10**10, kind=kind, integrated=integrated)
+def test_views_take_less_of_memory_that_is_the_hosts(device, monkeypatch, kind, integrated, share):
+    info = dataclasses.replace(device.info, memory=10**10, kind=kind, integrated=integrated)
+    monkeypatch.setattr(device, "info", info)
     assert default_memory(device) == share * 10**10
-    device.info = before
