@@ -46,13 +46,9 @@ def on_device(device, survivors) -> list[int]:
     return device.download(survivors.buffer, (8,), np.uint8).tolist()
 
 
-def test_all_are_alive_at_first(usual_device, survivors, waits):
+def test_a_removal_is_news_to_the_device_until_it_is_settled(usual_device, survivors, waits):
     assert survivors.alive.tolist() == [True] * 5
     assert on_device(usual_device, survivors) == [ALIVE] * 8
-    assert waits == []
-
-
-def test_a_removal_is_news_to_the_device_until_it_is_settled(usual_device, survivors, waits):
     survivors.remove(np.array([1, 3]))
     just = [ALIVE, JUST_REMOVED, ALIVE, JUST_REMOVED, *[ALIVE] * 4]
     assert on_device(usual_device, survivors) == just
