@@ -142,10 +142,7 @@ def test_a_closed_rasterizer_leaves_the_scene_to_its_owner(device, plush_excerpt
 
 def test_a_scene_on_another_device_is_refused(device):
     other = Device(device.info, family=device.family)
-    with (
-        potr_cl.decode_to_device(coded(20), other) as scene,
-        pytest.raises(DeviceError, match="the scene lies on"),
-    ):
+    with potr_cl.decode_to_device(coded(20), other) as scene, pytest.raises(DeviceError, match="the scene lies on"):
         Rasterizer(device, scene)
 
 

@@ -15,13 +15,7 @@ from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor
 from potr_cl.stages.compaction.view_weights import ViewWeights
-from tests.cases.ridges import (
-    channels,
-    check_optimal,
-    dense_weights,
-    on_a_sphere,
-    sparse_weights,
-)
+from tests.cases.ridges import channels, check_optimal, dense_weights, on_a_sphere, sparse_weights
 from tests.devices import shared_device
 from tests.reference.ridge import (
     Ridges,

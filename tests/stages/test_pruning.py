@@ -51,11 +51,7 @@ def test_budget_and_order_by_hand():
     assert sorted(choose(effect, weight, np.arange(6), 1, options)) == [0, 1, 2, 4, 5]
 
 
-@given(
-    hnp.arrays(float, st.integers(1, 60), elements=st.floats(-1, 2)),
-    st.integers(1, 10),
-    st.data(),
-)
+@given(hnp.arrays(float, st.integers(1, 60), elements=st.floats(-1, 2)), st.integers(1, 10), st.data())
 def test_budget_is_reached_and_not_passed_by_more_than_one_splat(effect, remaining, data):
     weight = data.draw(hnp.arrays(float, len(effect), elements=st.floats(1e-3, 10)))
     options = PruningOptions(0.7, 10)

@@ -161,10 +161,7 @@ def test_solutions_of_one_map_do_not_depend_on_each_other(case):
     options = RefitOptions(steps=3, gain=0, drop=1e-7)
     wanted = case.solve(options)
     black = [np.zeros_like(picture) for picture in case.pictures]
-    with (
-        ColourRefit(case.device, case.scene, case.cameras) as refit,
-        Pictures(case.device, black) as others,
-    ):
+    with ColourRefit(case.device, case.scene, case.cameras) as refit, Pictures(case.device, black) as others:
         dimmed = dataclasses.replace(case.scene, sh=0.5 * case.scene.sh)
         wanted_others = refit_colours(case.device, dimmed, case.cameras, others, RefitOptions(steps=1))
         for _ in range(2):
