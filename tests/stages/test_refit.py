@@ -156,21 +156,29 @@ def test_it_stops_when_a_step_gains_too_little_and_tells_of_each(case):
     assert told == [(1, 3), (2, 3), (3, 3)]
 
 
-def test_solutions_of_one_map_do_not_depend_on_each_other(case):
-    """Other targets, other options, other starts in between: the same bytes as on its own."""
-    options = RefitOptions(steps=3, gain=0, drop=1e-7)
-    wanted = case.solve(options)
-    black = [np.zeros_like(picture) for picture in case.pictures]
-    with ColourRefit(case.device, case.scene, case.cameras) as refit, Pictures(case.device, black) as others:
-        dimmed = dataclasses.replace(case.scene, sh=0.5 * case.scene.sh)
-        wanted_others = refit_colours(case.device, dimmed, case.cameras, others, RefitOptions(steps=1))
-        for _ in range(2):
-            for solved, alone in (
-                (refit.solve(case.scene.sh, case.targets, options), wanted),
-                (refit.solve(dimmed.sh, others, RefitOptions(steps=1)), wanted_others),
-            ):
-                assert np.array_equal(solved.sh, alone.sh)
-                assert solved.errors == alone.errors
+@pytest.mark.parametrize("coming", [False, True], ids=["a scene that is there", "a scene that is still to come"])
+def test_solutions_of_one_map_do_not_depend_on_each_other(case, coming):
+    """Other targets, options and starts in between, the first of them the scene's or not: the same bytes as by itself.
+
+    Of a scene that is still to come the colours are on the device before its geometry is there.
+    """
+    options, few = RefitOptions(steps=3, gain=0, drop=1e-7), RefitOptions(steps=1)
+    dimmed = dataclasses.replace(case.scene, sh=0.5 * case.scene.sh)
+    scene, begun = case.scene, threading.Event()
+    if coming:
+        scene = ComingScene(case.scene.sh, lambda: begun.wait(300) and case.scene)
+        threading.Timer(0.2, begun.set).start()
+    with Pictures(case.device, [np.zeros_like(picture) for picture in case.pictures]) as others:
+        ways = [
+            (case.scene.sh, case.targets, options, case.solve(options)),
+            (dimmed.sh, others, few, refit_colours(case.device, dimmed, case.cameras, others, few)),
+        ]
+        for order in (ways * 2, ways[::-1]):
+            with ColourRefit(case.device, scene, case.cameras) as refit:
+                for sh, targets, how, alone in order:
+                    solved = refit.solve(sh, targets, how)
+                    assert np.array_equal(solved.sh, alone.sh)
+                    assert solved.errors == alone.errors
 
 
 def test_the_target_itself_is_left_alone(device):
@@ -279,29 +287,6 @@ def test_nobody_waits_for_a_device_that_others_read_from(case, monkeypatch):
         assert error == linear.error
     assert waited
     assert not any(waited)
-
-
-def test_a_scene_that_is_still_to_come(case):
-    """Its colours are on the device before its geometry is there, and a second solution starts from its own."""
-    options, dark = RefitOptions(steps=3, gain=0, drop=1e-7), 0.5 * case.scene.sh
-    wanted = case.solve(options).sh
-    with ColourRefit(case.device, case.scene, case.cameras, background=case.background) as refit:
-        dimmed = refit.solve(dark, case.targets, options).sh
-    begun = threading.Event()
-
-    def make() -> Scene:
-        begun.wait(300)
-        return case.scene
-
-    threading.Timer(0.2, begun.set).start()
-    scene = ComingScene(case.scene.sh, make)
-    with ColourRefit(case.device, scene, case.cameras, background=case.background) as refit:
-        assert np.array_equal(refit.solve(case.scene.sh, case.targets, options).sh, wanted)
-        assert np.array_equal(refit.solve(dark, case.targets, options).sh, dimmed)
-        assert np.array_equal(refit.solve(case.scene.sh, case.targets, options).sh, wanted)
-    # What the device has already is of no account where a solution begins elsewhere.
-    with ColourRefit(case.device, scene, case.cameras, background=case.background) as refit:
-        assert np.array_equal(refit.solve(dark, case.targets, options).sh, dimmed)
 
 
 def test_a_scene_that_never_comes(case):
