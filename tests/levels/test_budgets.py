@@ -185,7 +185,7 @@ def test_files_are_read_as_they_are_shown(files: tuple[Path, Path]) -> None:
     ("change", "message"),
     [
         (lambda leaf: leaf.pop("bound"), "damaged"),
-        (lambda leaf: leaf["bound"].update(min=[0] * 6, max=[1] * 6), "damaged"),
+        (lambda leaf: leaf.update(lods={"0": leaf["lods"]["0"]}, bound={"min": [0] * 6, "max": [1] * 6}), "damaged"),
         (lambda leaf: leaf["bound"].update(min=[1e9, 0, 0]), "a box is invalid"),
         (lambda leaf: leaf.update(errors=[0, 1]), "damaged"),
         (lambda leaf: leaf.update(errors=[0, 1, float("nan")]), "errors of levels are invalid"),

@@ -196,16 +196,17 @@ def compiled():
 
 
 @pytest.mark.one_family
-@pytest.mark.parametrize(("beside", "threads", "pinned"), [(0, 1, True), (0, 3, False), (1, 2, True)])
-def test_memory_that_bundles_take_turns_in(beside, threads, pinned, device, monkeypatch, compiled):
+@pytest.mark.parametrize(
+    ("beside", "threads", "pinned", "bundles"), [(0, 1, True, 3), (0, 3, False, 9), (1, 2, True, 3), (1, 3, True, 9)]
+)
+def test_memory_that_bundles_take_turns_in(beside, threads, pinned, bundles, device, monkeypatch, compiled):
     """Less of it than there are bundles: those that come late wait until others are on the device."""
     monkeypatch.setattr(block_values, "_ROOMS_BESIDE", beside)
     if pinned:
         monkeypatch.setattr(decode, "_WORTH_PINNING", 1)
-    for splats in (4 * 8192 + 77, 3 * 8192):
-        file = open_file(coded(splats, 2))
-        with uploaded(device, file.scene()) as wanted, decode_to_device(file, device, threads=threads) as got:
-            assert bits(wanted) == bits(got)
+    file = open_file(coded(bundles * 8192 + 77, 2))
+    with uploaded(device, file.scene()) as wanted, decode_to_device(file, device, threads=threads) as got:
+        assert bits(wanted) == bits(got)
 
 
 def test_a_device_that_fails_among_bundles_ends_all_threads(device, monkeypatch, compiled):

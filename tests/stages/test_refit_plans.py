@@ -15,7 +15,7 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.picked_splats import IndexSubset
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages import refit as refit_stage
-from potr_cl.stages.refitting import coefficients, own_views
+from potr_cl.stages.refitting import coefficients, helpers, own_views
 from potr_cl.stages.refitting.colour_refit import ColourRefit
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
@@ -26,6 +26,7 @@ from potr_cl.views.subsets import ListedSplats
 from potr_cl.workers.host import HostPool
 from tests.cases.elsewhere import ElsewherePool
 from tests.cases.memory import taken_of
+from tests.cases.noting import noted
 from tests.cases.streets import street
 from tests.devices import shared_device
 from tests.reference.refit_cases import Case, Linearised, Pictures
@@ -57,12 +58,7 @@ WAYS = ("solve", "colour_grid", "fix_ac")
 @pytest.fixture
 def picked(monkeypatch):
     """Have views pick their splats, and note which views did."""
-    made: list[ListedSplats] = []
-
-    class Noting(ListedSplats):
-        def __init__(self, *args: object) -> None:
-            made.append(self)
-            super().__init__(*args)  # type: ignore[arg-type]
+    made = noted(monkeypatch, own_views, "ListedSplats")
 
     def switch(on: bool) -> list[ListedSplats]:
         monkeypatch.setattr(reached, "LEAST_SPLATS", 1 if on else 1 << 60)
@@ -70,11 +66,10 @@ def picked(monkeypatch):
         made.clear()
         return made
 
-    monkeypatch.setattr(own_views, "ListedSplats", Noting)
     return switch
 
 
-def crowded(splats: int = 200, degree: int = 1, houses: int = 3):
+def crowded(splats: int = 200, degree: int = 1, houses: int = 4):
     """A street of which some splats stand behind others that nothing is seen through; views of two sizes."""
     scene, cameras = street(houses, splats)
     logits = np.where(np.arange(len(scene)) % 2, 6, -1).astype(np.float32)
@@ -144,8 +139,9 @@ def test_the_same_solution(device, plain, picked, plan, way, monkeypatch):
     on = plan.pop("picked", False)
     monkeypatch.setattr(own_views, "ENOUGH", 4)
     monkeypatch.setattr(coefficients, "_FEWEST", plan.pop("resident", 1))
-    made = picked(on)
+    made, rows = picked(on), noted(monkeypatch, helpers, "DrawnRows")
     found = fitted(device, way, **plan)
+    assert bool(rows) == bool(plan.get("elsewhere")), "workers elsewhere get the coefficients that they draw"
     assert bool(made) == on
     assert same(found, plain[way])
     assert found.steps > 3
@@ -214,7 +210,7 @@ def test_memory_is_that_of_vectors_and_views_together(device, monkeypatch):
 def test_which_splats_are_reached(device, picked):
     """All that are drawn but some that stand behind others; the picture of these alone is the picture of all."""
     picked(True)
-    scene, cameras = crowded(800, houses=4)
+    scene, cameras = crowded(800)
     with Rasterizer(device, scene) as rasterizer:
         reach = reached_splats(rasterizer, cameras, range(len(cameras)))
         assert reach is not None
@@ -251,14 +247,7 @@ def test_not_where_views_reach_much(device, monkeypatch):
 @pytest.mark.parametrize("slices", [None, 256], ids=["in one piece", "in slices"])
 def test_what_views_reach_is_found_once(device, monkeypatch, slices):
     """Also where it is not worth it."""
-    made = []
-
-    class Noting(reached.Picker):
-        def __init__(self, *args: object) -> None:
-            made.append(self)
-            super().__init__(*args)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(reached, "Picker", Noting)
+    made = noted(monkeypatch, reached, "Picker")
     monkeypatch.setattr(reached, "LEAST_SPLATS", 1)
     monkeypatch.setattr(reached, "WORTH_IT", 0.0)
     scene, cameras = crowded(200)
@@ -309,7 +298,7 @@ def test_fewer_views_together_where_the_device_has_no_room(gpu, picked, monkeypa
 
 def test_more_views_stay(device, picked):
     """In the memory that two thirds of them fit with all splats."""
-    with crowded_case(device, splats=800, houses=4) as case:
+    with crowded_case(device, splats=800) as case:
         room = {}
         for on in (False, True):
             picked(on)

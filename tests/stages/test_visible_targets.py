@@ -16,9 +16,9 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
 from potr_cl.raster.scene_buffers import uploaded
 from potr_cl.views import targets, visibility
-from potr_cl.views.pictures import SeenRasterizer
 from potr_cl.views.targets import RenderedTargets, targets_of
 from potr_cl.views.visibility import Visibility
+from tests.cases.noting import noted
 from tests.cases.streets import street
 
 
@@ -88,15 +88,8 @@ def test_a_refit_takes_them_and_the_bytes_stay(gpu, monkeypatch):
     options = EncodeOptions.for_preset("best", cameras_anyway=True)
     options = options.changed(prune={"iterations": 2}, refit={"steps": 2})
     wanted = encode(scene, cameras, options, device=gpu)
-    made = []
-
-    class Noting(SeenRasterizer):
-        def __init__(self, *args: object, **named: object) -> None:
-            made.append(self)
-            super().__init__(*args, **named)  # type: ignore[arg-type]
-
     monkeypatch.setattr(visibility, "LEAST_SPLATS", 1)
-    monkeypatch.setattr(targets, "SeenRasterizer", Noting)
+    made = noted(monkeypatch, targets, "SeenRasterizer")
     assert encode(scene, cameras, options, device=gpu).data == wanted.data
     assert len(made) == 2  # there is room, so pictures are rendered ahead besides
     made.clear()
