@@ -66,3 +66,12 @@ def open_device(kernels: str) -> Device:
     if family == "cpu" and info.family == "gpu" and info.kind == "cpu":
         pytest.skip(f"{info} does not run the row kernels: it ends long loops early")
     return Device(info, family=cast(Family, family))
+
+
+@functools.cache
+def shared_device(kernels: str, number: int = 0) -> Device:
+    """The same as :func:`open_device`, but one for all tests of a process that ask for this number.
+
+    So its programs are built once; who takes memory there gives it back.
+    """
+    return open_device(kernels)

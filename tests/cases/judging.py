@@ -1,4 +1,4 @@
-"""How close one scene comes to another: :func:`psnr`."""
+"""How close one scene comes to another: :func:`psnr`, :func:`mean_error`."""
 
 from __future__ import annotations
 
@@ -20,3 +20,9 @@ def psnr(device: Device, scene: Scene, other: Scene, views: Sequence[Camera]) ->
         all_views = [metrics.psnr(b.render(view)[0], a.render(view)[0]) for view in views]
     finite = [each for each in all_views if math.isfinite(each)]
     return float(np.mean(finite)) if finite else math.inf
+
+
+def mean_error(device: Device, scene: Scene, other: Scene, views: Sequence[Camera]) -> float:
+    """Mean squared difference of two scenes' pictures."""
+    with Rasterizer(device, scene) as a, Rasterizer(device, other) as b:
+        return float(np.mean([np.mean((a.render(view)[0] - b.render(view)[0]) ** 2) for view in views]))

@@ -14,7 +14,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import DeviceInfo
 from potr_cl.stages.compaction.ridge import CompactionOptions
 from potr_cl.stages.compaction.view_weights import ViewWeights
-from tests.devices import KERNELS, open_device
+from tests.devices import KERNELS, shared_device
 from tests.reference.ridge import (
     YCOCG,
     objective,
@@ -33,7 +33,7 @@ ROUNDING = 2e-6
 def compacting_device(kernels: str) -> Iterator[Device]:
     """The device of one of :data:`COMPACTING`, which has to have all its memory back in the end."""
     family, _, shared = kernels.partition(", ")
-    device = open_device(family)
+    device = shared_device(family)
     with patch.object(DeviceInfo, "indexes_in_memory", bool(shared)):
         yield device
     assert device.allocated == 0, "a compactor did not give all its memory back"

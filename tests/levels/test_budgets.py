@@ -185,6 +185,7 @@ def test_files_are_read_as_they_are_shown(files: tuple[Path, Path]) -> None:
     ("change", "message"),
     [
         (lambda leaf: leaf.pop("bound"), "damaged"),
+        (lambda leaf: leaf.update(lods={"0": leaf["lods"]["0"]}, bound={"min": [0] * 6, "max": [1] * 6}), "damaged"),
         (lambda leaf: leaf["bound"].update(min=[1e9, 0, 0]), "a box is invalid"),
         (lambda leaf: leaf.update(errors=[0, 1]), "damaged"),
         (lambda leaf: leaf.update(errors=[0, 1, float("nan")]), "errors of levels are invalid"),
@@ -199,14 +200,6 @@ def test_what_is_damaged_is_told(change: Any, message: str, files: tuple[Path, P
     change(leaf)
     (tmp_path / "lod-meta.json").write_text(json.dumps(meta))
     with pytest.raises(DataError, match=message):
-        StreamedScene(tmp_path)
-
-
-def test_a_leaf_has_one_box(files: tuple[Path, Path], tmp_path: Path) -> None:
-    meta = json.loads(files[0].read_text())
-    leaf = {"lods": {"0": {"file": 0, "offset": 0, "count": 1}}, "bound": {"min": [0] * 6, "max": [1] * 6}}
-    (tmp_path / "lod-meta.json").write_text(json.dumps(meta | {"tree": leaf, "lodErrors": False}))
-    with pytest.raises(DataError, match="damaged"):
         StreamedScene(tmp_path)
 
 

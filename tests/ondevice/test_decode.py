@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import functools
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
@@ -20,7 +20,7 @@ from potr_cl.codec.decoder import PotrFile, open_file
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.native.library import native
 from potr_cl.codec.native.values import BundleShare
-from potr_cl.codec.quantize import HyperParameters
+from potr_cl.codec.quantize import HyperParameters, Preset
 from potr_cl.errors import DataError, DeviceError, DeviceMemoryError, UsageError
 from potr_cl.model.sightings import looked_at
 from potr_cl.ondevice import decode
@@ -28,17 +28,19 @@ from potr_cl.ondevice.decode import StagedBundles, decode_to_device
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers, uploaded
-from tests.devices import KERNELS, open_device
+from tests.devices import KERNELS, shared_device
 from tests.reference.file_parts import File
 from tests.reference.scenes import random_scene
 
-GOLDEN = sorted((Path(__file__).parents[1] / "data").glob("golden_*.potr"))
+DATA = Path(__file__).parents[1] / "data"
+GOLDEN = sorted(DATA.glob("golden_*.potr"))
+ZSTD = EntropyCoder("zstd", 3)
 PARAMETERS = ("means", "scales", "quaternions", "log2_opacities", "sh")
 
 
 @pytest.fixture(scope="module", params=KERNELS)
 def device(request: pytest.FixtureRequest) -> Iterator[Device]:
-    device = open_device(request.param)
+    device = shared_device(request.param)
     yield device
     assert device.allocated == 0, "a decoded scene did not give all its memory back"
 
@@ -60,18 +62,27 @@ def assert_as_uploaded(file: PotrFile, device: Device, sh_degree: int | None = N
     assert [name for name in PARAMETERS if a[name] != b[name]] == []
 
 
-def coded(splats: int, preset: str, entropy: EntropyCoder | None = None, q: float = 0.5, degree: int = 3) -> bytes:
-    parameters = HyperParameters.from_quality(q, preset)  # type: ignore[arg-type]
-    return b"".join(code_scene(random_scene(splats, degree, seed=splats), parameters, entropy=entropy).pieces)
-
-
-def of_bundles(splats: int, degree: int, factor: float | None = None) -> bytes:
-    """Of coder BUNDLES, however few splats there are; with all scale factors the same, if one is given."""
-    parameters = HyperParameters.from_quality(0.5, "best")
+@functools.cache
+def coded(
+    splats: int,
+    degree: int = 3,
+    preset: Preset = "best",
+    entropy: EntropyCoder | None = None,
+    q: float = 0.5,
+    factor: float | None = None,
+) -> bytes:
+    """A file, of coder BUNDLES unless another is given; with all scale factors the same, if one is given."""
+    parameters = HyperParameters.from_quality(q, preset)
     if factor is not None:
         names = ("sf_dc", "sf_sh", "sf_opacity", "sf_rotation", "sf_scale")
         parameters = replace(parameters, **dict.fromkeys(names, factor))
-    return b"".join(code_scene(random_scene(splats, degree, seed=splats), parameters).pieces)
+    return b"".join(code_scene(random_scene(splats, degree, seed=splats), parameters, entropy=entropy).pieces)
+
+
+@functools.cache
+def of_excerpt(q: float = 0.3) -> bytes:
+    excerpt = potr_cl.load_scene(DATA / "plush_excerpt.ply")
+    return b"".join(code_scene(excerpt, HyperParameters.from_quality(q, "best")).pieces)
 
 
 @pytest.mark.parametrize("path", GOLDEN, ids=lambda path: path.stem)
@@ -79,47 +90,35 @@ def test_golden_files_have_the_bits_of_the_host(path, device):
     assert_as_uploaded(open_file(path), device)
 
 
-@pytest.mark.parametrize("native", ["0", ""])
 @pytest.mark.parametrize(
-    ("preset", "entropy", "q"),
-    [
-        ("best", None, 0.5),
-        ("best", EntropyCoder("zstd", 3), 0.9),
-        ("fast", EntropyCoder("zstd", 3), 0.2),
-        ("paper", EntropyCoder("zstd", 3), 0.5),
-    ],
-)
+    ("preset", "entropy", "q", "native"),
+    [("best", None, 0.5, "0"), ("best", None, 0.5, ""), ("best", ZSTD, 0.9, "0"), ("fast", ZSTD, 0.2, ""),
+     ("paper", ZSTD, 0.5, "")],
+)  # fmt: skip
 def test_coded_scenes_have_the_bits_of_the_host(preset, entropy, q, native, device, monkeypatch):
     """More splats than a work-group has, and not a multiple of it."""
     monkeypatch.setenv("POTR_CL_NATIVE", native)
-    assert_as_uploaded(open_file(coded(701, preset, entropy, q)), device)
+    assert_as_uploaded(open_file(coded(701, 3, preset, entropy, q)), device)
 
 
 @pytest.mark.parametrize("factor", [1e3, 1e5, 1e9])
 def test_levels_of_any_size_have_the_bits_of_the_host(factor, device):
     """Of one, two and more bytes, and beyond all tables."""
-    parameters = replace(
-        HyperParameters.from_quality(0.5, "best"),
-        sf_dc=factor, sf_sh=factor, sf_opacity=factor, sf_rotation=factor, sf_scale=factor,
-    )  # fmt: skip
-    pieces = code_scene(random_scene(700, 2, seed=1), parameters, entropy=EntropyCoder("zstd", 3)).pieces
-    assert_as_uploaded(open_file(b"".join(pieces)), device)
+    assert_as_uploaded(open_file(coded(700, 2, entropy=ZSTD, factor=factor)), device)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_a_lower_degree_has_the_bits_of_the_host(degree, device):
-    assert_as_uploaded(open_file(coded(500, "best")), device, degree)
+    assert_as_uploaded(open_file(coded(500)), device, degree)
 
 
 def test_an_unknown_degree_is_refused(device):
     with pytest.raises(UsageError, match="SH degree 4"):
-        decode_to_device(open_file(coded(20, "best")), device, 4)
+        decode_to_device(open_file(coded(20)), device, 4)
 
 
-def test_pictures_are_those_of_the_scene(device, plush_excerpt, plush_excerpt_cameras):
-    camera = plush_excerpt_cameras[0]
-    pieces = code_scene(plush_excerpt, HyperParameters.from_quality(0.5, "best")).pieces
-    data = b"".join(pieces)
+def test_pictures_are_those_of_the_scene(device, plush_excerpt_cameras):
+    camera, data = plush_excerpt_cameras[0], of_excerpt()
     for antialiased in (None, True):
         wanted = potr_cl.render(potr_cl.decode(data).rendered(antialiased), camera, device)
         with (
@@ -133,7 +132,7 @@ def test_pictures_are_those_of_the_scene(device, plush_excerpt, plush_excerpt_ca
 
 
 def test_a_closed_rasterizer_leaves_the_scene_to_its_owner(device, plush_excerpt_cameras):
-    with potr_cl.decode_to_device(coded(300, "best"), device) as scene:
+    with potr_cl.decode_to_device(coded(300), device) as scene:
         before = bits(scene)
         for _ in range(2):
             with Rasterizer(device, scene) as rasterizer:
@@ -143,16 +142,14 @@ def test_a_closed_rasterizer_leaves_the_scene_to_its_owner(device, plush_excerpt
 
 def test_a_scene_on_another_device_is_refused(device):
     other = Device(device.info, family=device.family)
-    with (
-        potr_cl.decode_to_device(coded(20, "best"), other) as scene,
-        pytest.raises(DeviceError, match="the scene lies on"),
-    ):
+    with potr_cl.decode_to_device(coded(20), other) as scene, pytest.raises(DeviceError, match="the scene lies on"):
         Rasterizer(device, scene)
 
 
+@pytest.mark.one_family
 def test_what_the_host_refuses_is_refused_and_leaves_nothing(device):
     """Bytes changed in turn: a checksum tells of each, at whatever depth."""
-    data = coded(40, "best", degree=1)
+    data = coded(40, 1)
     before = device.allocated
     for place in range(0, len(data), 13):
         damaged = bytearray(data)
@@ -163,55 +160,33 @@ def test_what_the_host_refuses_is_refused_and_leaves_nothing(device):
 
 
 def test_a_scene_that_does_not_fit_leaves_nothing(device, monkeypatch):
-    data, before = coded(3000, "best"), device.allocated
+    data, before = coded(3000), device.allocated
     monkeypatch.setattr(device, "info", replace(device.info, memory=before + 300_000))
     with pytest.raises(DeviceMemoryError):
         potr_cl.decode_to_device(data, device)
     assert device.allocated == before
 
 
+@pytest.mark.one_family
 def test_a_path_is_named_in_errors(tmp_path, device):
     path = tmp_path / "scene.potr"
-    data = bytearray(coded(40, "best"))
+    data = bytearray(coded(40))
     data[-3] ^= 1
     path.write_bytes(bytes(data))
     with pytest.raises(DataError, match=r"scene\.potr': section"):
         potr_cl.decode_to_device(path, device)
 
 
+@pytest.mark.one_family
 def test_comparing_files_says_what_comparing_scenes_says(tmp_path, device, plush_excerpt, plush_excerpt_cameras):
     path = tmp_path / "b.potr"
-    path.write_bytes(b"".join(code_scene(plush_excerpt, HyperParameters.from_quality(0.3, "best")).pieces))
+    path.write_bytes(of_excerpt())
     views = plush_excerpt_cameras[:2]
-    of_file = potr_cl.compare(plush_excerpt, path, views, device=device)
-    of_scene = potr_cl.compare(plush_excerpt, potr_cl.decode(path), views, device=device)
+    of_file, of_scene = (
+        potr_cl.compare(plush_excerpt, other, views, device=device) for other in (path, potr_cl.decode(path))
+    )
     assert of_file.psnr == of_scene.psnr
     assert of_file.report()["views"] == of_scene.report()["views"]
-
-
-@pytest.mark.slow
-def test_the_commands_say_the_same_of_a_file_and_of_its_scene(tmp_path, monkeypatch, capsys, plush_excerpt):
-    """Render and compare read the file into the device; as a PLY file it takes the way by the host."""
-    from potr_cl import cli
-
-    data = Path(__file__).parents[1] / "data"
-    cameras = str(data / "plush_excerpt_cameras.json")
-    files = {"potr": tmp_path / "b.potr", "ply": tmp_path / "b.ply"}
-    pieces = code_scene(plush_excerpt, HyperParameters.from_quality(0.3, "best")).pieces
-    files["potr"].write_bytes(b"".join(pieces))
-    potr_cl.save(potr_cl.decode(files["potr"]), files["ply"])
-    pictures, told = {}, {}
-    for kind, path in files.items():
-        folder = tmp_path / kind
-        assert cli.main(["render", str(path), "--cameras", cameras, "--views", "0", "1", "-o", str(folder)]) == 0
-        pictures[kind] = {picture.name: picture.read_bytes() for picture in folder.iterdir()}
-        capsys.readouterr()
-        arguments = ["compare", str(data / "plush_excerpt.ply"), str(path), "--cameras", cameras, "--views", "0", "1"]
-        assert cli.main([*arguments, "--json"]) == 0
-        told[kind] = json.loads(capsys.readouterr().out)["mean"]
-    assert len(pictures["potr"]) == 2
-    assert pictures["potr"] == pictures["ply"]
-    assert told["potr"] == told["ply"]
 
 
 @pytest.fixture
@@ -221,16 +196,17 @@ def compiled():
 
 
 @pytest.mark.one_family
-@pytest.mark.parametrize(("beside", "threads", "pinned"), [(0, 1, True), (0, 3, False), (1, 2, True)])
-def test_memory_that_bundles_take_turns_in(beside, threads, pinned, device, monkeypatch, compiled):
+@pytest.mark.parametrize(
+    ("beside", "threads", "pinned", "bundles"), [(0, 1, True, 3), (0, 3, False, 9), (1, 2, True, 3), (1, 3, True, 9)]
+)
+def test_memory_that_bundles_take_turns_in(beside, threads, pinned, bundles, device, monkeypatch, compiled):
     """Less of it than there are bundles: those that come late wait until others are on the device."""
     monkeypatch.setattr(block_values, "_ROOMS_BESIDE", beside)
     if pinned:
         monkeypatch.setattr(decode, "_WORTH_PINNING", 1)
-    for splats in (9 * 8192 + 77, 3 * 8192):
-        file = open_file(of_bundles(splats, 2))
-        with uploaded(device, file.scene()) as wanted, decode_to_device(file, device, threads=threads) as got:
-            assert bits(wanted) == bits(got)
+    file = open_file(coded(bundles * 8192 + 77, 2))
+    with uploaded(device, file.scene()) as wanted, decode_to_device(file, device, threads=threads) as got:
+        assert bits(wanted) == bits(got)
 
 
 def test_a_device_that_fails_among_bundles_ends_all_threads(device, monkeypatch, compiled):
@@ -245,7 +221,7 @@ def test_a_device_that_fails_among_bundles_ends_all_threads(device, monkeypatch,
     monkeypatch.setattr(StagedBundles, "take", fail)
     before, others = device.allocated, set(threading.enumerate())
     with pytest.raises(DeviceError, match="gone"):
-        decode_to_device(open_file(of_bundles(6 * 8192, 1)), device, threads=2)
+        decode_to_device(open_file(coded(6 * 8192, 1)), device, threads=2)
     assert taken == [0, 8192]
     assert device.allocated == before
     assert not set(threading.enumerate()) - others
@@ -257,19 +233,19 @@ def test_threads_that_get_no_memory_are_told_of(device, monkeypatch, compiled):
 
     monkeypatch.setattr(BundleShare, "do", no_memory)
     with pytest.raises(DataError, match="more memory than the host has"):
-        decode_to_device(open_file(of_bundles(3 * 8192, 0)), device, threads=2)
+        decode_to_device(open_file(coded(3 * 8192, 0)), device, threads=2)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("native", [pytest.param("0", marks=pytest.mark.one_family), ""])
 def test_bundles_beyond_all_tables_have_the_bits_of_the_host(native, device, monkeypatch):
     monkeypatch.setenv("POTR_CL_NATIVE", native)
-    assert_as_uploaded(open_file(of_bundles(300 if native == "0" else 8192 + 700, 2, 1e5)), device)
+    assert_as_uploaded(open_file(coded(300 if native == "0" else 8192 + 700, 2, factor=1e5)), device)
 
 
 def test_a_damaged_bundle_among_good_ones_leaves_nothing(device, compiled):
     """Words of the last bundle are changed, and their checksums made right."""
-    file = File.of(of_bundles(4 * 8192 + 5, 1))
+    file = File.of(coded(4 * 8192 + 5, 1))
     section = next(section for section in file.blocks[0].sections if section.name == b"SHC1")
     section.stored = section.stored[:-20] + bytes(20)
     data = file.bytes()
@@ -282,16 +258,15 @@ def test_a_damaged_bundle_among_good_ones_leaves_nothing(device, compiled):
     assert device.allocated == before
 
 
-@pytest.mark.parametrize("antialiased", [None, True])
-def test_cameras_are_judged_by_what_is_on_the_device_already(device, antialiased, monkeypatch):
+def test_cameras_are_judged_by_what_is_on_the_device_already(device, monkeypatch):
     """The file is decoded once, and what is read back is the scene."""
-    data, decoded = coded(70_000, "best", degree=1), []
+    data, decoded = coded(70_000, 1), []
     decode_into = Body.decode_into
     monkeypatch.setattr(Body, "decode_into", lambda *args, **kwargs: decoded.append(decode_into(*args, **kwargs)))
-    with drawable_to_judge(data, device, antialiased=antialiased) as (buffers, judged):
+    with drawable_to_judge(data, device, antialiased=True) as (buffers, judged):
         assert len(decoded) == 1
         assert len(buffers) == 70_000
-    whole = open_file(data).scene().rendered(antialiased)
+    whole = open_file(data).scene().rendered(True)
     wanted = whole.subset(looked_at(len(whole)))
     assert 0 < len(judged) == len(wanted) < 70_000
     assert (judged.antialiased, judged.low_pass) == (wanted.antialiased, wanted.low_pass)

@@ -191,7 +191,7 @@ class Reference:
         operator = LinearOperator((rows, columns), matvec=apply, rmatvec=apply_transposed, dtype=np.float64)
         data = [(root * r).ravel() for root, r in zip(roots, self.residuals(), strict=True)]
         wanted = np.concatenate([*data, -ridge * self.start[active], np.zeros(columns)])
-        change: Array = lsmr(operator, wanted, atol=1e-12, btol=1e-12, conlim=0, maxiter=20000)[0]
+        change: Array = lsmr(operator, wanted, atol=1e-9, btol=1e-9, conlim=0, maxiter=20000)[0]
         x: Array = self.start.copy()
         x[active] += change
         return x

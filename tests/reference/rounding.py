@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.outputs.output import ColourGrid
+
 Array = NDArray[np.float64]
 
 
@@ -54,3 +56,10 @@ def rounded_in_turn(
     index, held = np.flatnonzero(left), np.flatnonzero(free & ~left)
     y[index] = x[index] - np.linalg.solve(block[np.ix_(index, index)], block[np.ix_(index, held)] @ (y[held] - x[held]))
     return y, margin
+
+
+def grid_of(count: int, step: float = 0.1) -> ColourGrid:
+    """Steps that differ by splat, in an order that is not the scene's."""
+    rng = np.random.default_rng(0)
+    steps = (step * 2.0 ** rng.uniform(-1, 1, (2, count))).astype(np.float32)
+    return ColourGrid(steps[0], steps[1], rng.permutation(count))

@@ -1,4 +1,4 @@
-"""Antialiased scenes through the stages: effects of removals, weights, the re-fit, and the file, against float64."""
+"""Antialiased scenes: what the compaction weighs their splats with, and files of them, against float64."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import potr_cl
-from potr_cl.model.camera import train_views
 from potr_cl.model.scene import LOW_PASS, MIP_SPLATTING_LOW_PASS, Scene
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
@@ -16,62 +15,13 @@ from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS, ViewWeights
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.sweep import SweepOptions
 from tests.cases.scenes import antialiased
-from tests.devices import KERNELS, open_device
 from tests.reference import raster as reference
-from tests.reference.refit_cases import Case, Linearised
-from tests.reference.removal import BruteForce
 from tests.reference.scenes import ring_of_cameras, visible_scene
-
-LOW_PASSES = [LOW_PASS, MIP_SPLATTING_LOW_PASS]
-
-
-@pytest.fixture(scope="module", params=KERNELS)
-def device(request):
-    device = open_device(request.param)
-    yield device
-    assert device.allocated == 0, "a stage did not give all its memory back"
 
 
 def small(splats: int, degree: int = 1, seed: int = 0, low_pass: float = LOW_PASS) -> Scene:
     """Splats of about a pixel, where the factor is 0.2 to 0.9."""
     return antialiased(visible_scene(splats, degree, seed), low_pass)
-
-
-def exact_effects(scene, cameras):
-    """ΔMSE of removing each splat by itself, from float64."""
-    effects = np.zeros(len(scene))
-    for view in cameras:
-        view_effects = BruteForce(reference.project(scene, view, INRIA), view, INRIA).effects(
-            range(len(scene)), [INRIA.transmittance_threshold]
-        )[1, 0]
-        effects += view_effects / (3 * view.width * view.height * len(cameras))
-    return effects
-
-
-def relative(a, b) -> float:
-    return float(np.linalg.norm(a - b) / np.linalg.norm(b))
-
-
-@pytest.mark.parametrize("low_pass", LOW_PASSES)
-def test_effects_of_removals(device, low_pass):
-    scene, cameras = small(60, low_pass=low_pass), ring_of_cameras(3, size=48)
-    with (
-        Rasterizer(device, scene) as rasterizer,
-        RemovalSweep(rasterizer, cameras, SweepOptions(0.0, turns=1)) as removal,
-    ):
-        effect, importance = removal.measure()
-        weights = ViewWeights.from_importances(len(scene), removal.view_importances())
-    true = exact_effects(scene, cameras)
-    assert relative(effect, true) < 1e-3
-    classic = exact_effects(scene.rendered(False), cameras)
-    assert relative(classic, true) > 0.2  # who measures them as a classic scene's is far off
-    # The compaction's weights: the mean of T alpha over each view's pixels, which add up to what is not background.
-    pictures = [reference.render(scene, view, INRIA) for view in cameras]
-    covered = [1 - picture.transmittance.mean() for picture in pictures]
-    for number, share in enumerate(covered):
-        total = weights.weights[weights.views == number].sum(dtype=np.float64) / REFERENCE_PIXELS
-        assert total == pytest.approx(share, rel=1e-5)
-    assert importance.sum() == pytest.approx(np.mean(covered), rel=1e-5)
 
 
 def test_the_compaction_weighs_each_splat_by_what_it_shows(device):
@@ -93,17 +43,6 @@ def test_the_compaction_weighs_each_splat_by_what_it_shows(device):
         assert np.abs(dense[:, number] / REFERENCE_PIXELS - true).max() < 1e-5 * true.max()
 
 
-@pytest.mark.parametrize("low_pass", LOW_PASSES)
-def test_the_map_that_the_refit_inverts(device, low_pass):
-    scene, cameras = small(40, seed=1, low_pass=low_pass), ring_of_cameras(3, size=40)
-    direction = np.random.default_rng(0).normal(size=scene.sh.shape)
-    with Case(device, scene, small(40, seed=2, low_pass=low_pass), cameras) as case:
-        exact = case.reference()
-        with Linearised(case) as linear:
-            product = linear.normal(direction)
-        assert relative(product, exact.transposed(exact.forward(direction))) < 1e-5
-
-
 @pytest.mark.one_family
 @pytest.mark.parametrize(("preset", "low_pass"), [("paper", LOW_PASS), ("best", MIP_SPLATTING_LOW_PASS)])
 def test_a_file_keeps_how_its_scene_is_rendered(device, preset, low_pass):
@@ -121,24 +60,3 @@ def test_a_file_keeps_how_its_scene_is_rendered(device, preset, low_pass):
         pictures = [reference.render(each, view, INRIA).image for view in cameras[:2] for each in (scene, candidate)]
         errors.append(np.mean(np.square(np.subtract(pictures[0::2], pictures[1::2]))))
     assert errors[0] < 0.2 * errors[1]
-
-
-@pytest.mark.slow
-@pytest.mark.one_family
-def test_encoded_as_antialiased_it_looks_better_than_encoded_as_classic(device, plush_excerpt, plush_excerpt_cameras):
-    """The same scene at about the same bytes, judged by antialiased pictures of views that no encoder has seen."""
-    options = EncodeOptions.for_preset("fast", q=0.5)
-    judged = [view for view in plush_excerpt_cameras if view.split == "test"]
-    found = {}
-    marked = plush_excerpt.rendered(True)
-    with Rasterizer(device, marked) as rasterizer:
-        targets = [rasterizer.render(view)[0] for view in judged]
-    for kind in (True, False):
-        encoded = encode(plush_excerpt.rendered(kind), train_views(plush_excerpt_cameras), options, device=device)
-        back = potr_cl.codec.decoder.open_file(b"".join(encoded.pieces)).scene()
-        with Rasterizer(device, back.rendered(True)) as rasterizer:
-            pictures = [rasterizer.render(view)[0] for view in judged]
-        error = np.mean([np.mean(np.square(a - b)) for a, b in zip(pictures, targets, strict=True)])
-        found[kind] = (encoded.nbytes, -10 * np.log10(error))
-    assert found[True][0] < 1.05 * found[False][0]
-    assert found[True][1] > found[False][1] + 1

@@ -13,22 +13,15 @@ from potr_cl.codec.quantize import HyperParameters
 from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.given_views import GivenViews
 from potr_cl.model.scene import Scene
-from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.encoded import Encoded
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.search import encode_to_target
 from potr_cl.pipeline.target import Target
-from potr_cl.quality.metrics import psnr
-from potr_cl.raster.rasterizer import Rasterizer
+from tests.cases.judging import psnr
 
 #: So far apart that no copy's views show another one, in world units.
 APART = 200.0
-
-
-@pytest.fixture(scope="module")
-def device():
-    return Device()
 
 
 def row(scene: Scene, cameras: Sequence[Camera], copies: int) -> tuple[Scene, list[Camera]]:
@@ -58,15 +51,9 @@ def twelve(plush_excerpt, plush_excerpt_cameras):
 
 
 @pytest.fixture(scope="module")
-def weighed(device, twelve):
+def weighed(usual_device, twelve):
     """What they are encoded to."""
-    return encoded(device, *twelve)
-
-
-def match(device, scene, cameras, file: Encoded) -> float:
-    """Mean PSNR of some views."""
-    with Rasterizer(device, scene) as source, Rasterizer(device, decode(file.data)) as decoded:
-        return float(np.mean([psnr(source.render(c)[0], decoded.render(c)[0]) for c in cameras[::5]]))
+    return encoded(usual_device, *twelve)
 
 
 def test_the_part_of_the_views_that_shows_a_splat(plush_excerpt, plush_excerpt_cameras):
@@ -98,14 +85,15 @@ def test_views_that_show_nothing_tell_nothing(plush_excerpt, plush_excerpt_camer
 
 
 @pytest.mark.slow
-def test_copies_keep_about_as_many_splats_as_one(device, plush_excerpt, plush_excerpt_cameras, twelve, weighed):
-    alone = len(encoded(device, plush_excerpt, train_views(plush_excerpt_cameras)).order)
+def test_copies_keep_about_as_many_splats_as_one(usual_device, plush_excerpt, plush_excerpt_cameras, twelve, weighed):
+    alone = len(encoded(usual_device, plush_excerpt, train_views(plush_excerpt_cameras)).order)
     scene, cameras = twelve
-    before = encoded(device, scene, cameras, weigh=False)
+    before = encoded(usual_device, scene, cameras, weigh=False)
     lost_before, lost = (alone - len(each.order) / 12 for each in (before, weighed))
     assert lost_before > 0.1 * alone, (alone, lost_before, lost)
     assert lost < 0.5 * lost_before, (alone, lost_before, lost)
-    assert match(device, scene, cameras, weighed) > match(device, scene, cameras, before) + 0.3
+    near, far = (psnr(usual_device, scene, decode(each.data), cameras[::5]) for each in (weighed, before))
+    assert near > far + 0.3
 
 
 def test_the_thresholds_follow_the_part_of_the_views_that_show_a_splat(weighed):
@@ -119,23 +107,23 @@ def test_the_thresholds_follow_the_part_of_the_views_that_show_a_splat(weighed):
 
 @pytest.mark.slow
 def test_scenes_that_are_seen_whole_and_the_papers_preset_stay_as_they_are(
-    device, plush_excerpt, plush_excerpt_cameras, twelve
+    usual_device, plush_excerpt, plush_excerpt_cameras, twelve
 ):
     given = train_views(plush_excerpt_cameras)
-    files = {encoded(device, plush_excerpt, given, weigh=weigh).data for weigh in (True, False)}
+    files = {encoded(usual_device, plush_excerpt, given, weigh=weigh).data for weigh in (True, False)}
     assert len(files) == 1
     scene, cameras = twelve
     options = EncodeOptions.for_preset("paper", cameras_anyway=True, prune={"iterations": 2})
-    paper = encode(scene, cameras, options, device=device)
+    paper = encode(scene, cameras, options, device=usual_device)
     assert paper.parameters == HyperParameters.from_quality(0.5, "paper")
 
 
 @pytest.mark.slow
-def test_a_search_and_an_encode_with_what_it_found_are_the_same(device, plush_excerpt, plush_excerpt_cameras):
+def test_a_search_and_an_encode_with_what_it_found_are_the_same(usual_device, plush_excerpt, plush_excerpt_cameras):
     scene, cameras = row(plush_excerpt, train_views(plush_excerpt_cameras), 4)
     options = EncodeOptions.for_preset("best", cameras_anyway=True, prune={"iterations": 4}, refit={"steps": 2})
     options = options.changed(between={"views": 0})
-    found = encode_to_target(scene, cameras, Target(max_bytes=100_000), options, device=device)
-    again = encode(scene, cameras, found.options, device=device)
+    found = encode_to_target(scene, cameras, Target(max_bytes=100_000), options, device=usual_device)
+    again = encode(scene, cameras, found.options, device=usual_device)
     assert again.parameters.delta_mse_max < HyperParameters.from_quality(found.options.q, "best").delta_mse_max
     assert again.data == found.encoded.data

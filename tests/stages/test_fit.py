@@ -10,35 +10,22 @@ import pytest
 
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import UsageError
-from potr_cl.model.camera import resized
 from potr_cl.model.views_between import views_between
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fit import Fit
 from potr_cl.stages.fitting.fit import FitOptions, batches, fit_scene, held_out_error
-from potr_cl.stages.fitting.fitted import Fitted, LeftOut
+from potr_cl.stages.fitting.fitted import File, Fitted, LeftOut, TwoFiles
 from potr_cl.stages.held_out import share_out
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.stage import Results, State, Workbench
 from potr_cl.views.targets import RenderedTargets
+from tests.cases.judging import mean_error
 from tests.cases.surfaces import sphere
-from tests.devices import FAMILIES, KERNELS, open_device
 from tests.reference.refit_cases import Pictures
 from tests.reference.scenes import ring_of_cameras, visible_scene
 
 PARAMETERS = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
 STEPS = FitOptions(steps=200, rounds=5)
-
-
-@pytest.fixture(scope="module", params=KERNELS)
-def device(request):
-    device = open_device(request.param)
-    yield device
-    assert device.allocated == 0, "a fit did not give all its memory back"
-
-
-@pytest.fixture(scope="module", params=FAMILIES)
-def family_device(request):
-    return open_device(request.param)
 
 
 def shaken(scene, seed=0, only=PARAMETERS):
@@ -58,11 +45,6 @@ def fitted_to(device, source, scene, cameras, options=STEPS, **more):
         return fit_scene(device, scene, cameras, RenderedTargets(rasterizer, cameras), options, **more)
 
 
-def mean_error(device, source, scene, cameras):
-    with Rasterizer(device, source) as one, Rasterizer(device, scene) as other:
-        return np.mean([np.mean((one.render(c)[0] - other.render(c)[0]) ** 2) for c in cameras])
-
-
 def test_views_that_judge_find_the_mean_squared_error(device):
     """Of views of several sizes, each counting the same; also of colours beyond 1."""
     source = visible_scene(60, 2, seed=3)
@@ -78,41 +60,39 @@ def test_views_that_judge_find_the_mean_squared_error(device):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "only",
-    [*(pytest.param((name,), marks=pytest.mark.one_family) for name in PARAMETERS), PARAMETERS],
-    ids=lambda names: "+".join(names),
+    ("only", "antialiased"),
+    [
+        *(pytest.param((name,), False, marks=pytest.mark.one_family, id=name) for name in PARAMETERS),
+        pytest.param(PARAMETERS, True, id="all, antialiased"),
+    ],
 )
-def test_errors_of_every_kind_are_mended(device, only):
+def test_errors_of_every_kind_are_mended(device, only, antialiased):
     """On views that the fit has not seen, too."""
-    source = visible_scene(60, 2, seed=3)
+    source = dataclasses.replace(visible_scene(60, 2, seed=3), antialiased=antialiased)
     cameras = ring_of_cameras(16, size=48)
-    result = fitted_to(device, source, shaken(source, only=only), cameras[::2])
+    start = shaken(source, only=only)
+    result = fitted_to(device, source, start, cameras[::2])
+    assert result.scene.antialiased == antialiased
     assert result.errors[-1] < 0.3 * result.errors[0]
-    unseen = cameras[1::2]
-    assert mean_error(device, source, result.scene, unseen) < 0.5 * mean_error(
-        device, source, shaken(source, only=only), unseen
-    )
+    after, before = (mean_error(device, source, scene, cameras[1::2]) for scene in (result.scene, start))
+    assert after < 0.5 * before
 
 
-@pytest.mark.slow
-def test_an_antialiased_scene_is_mended(family_device):
-    source = dataclasses.replace(visible_scene(60, 1, seed=3), antialiased=True)
-    result = fitted_to(family_device, source, shaken(source), ring_of_cameras(8, size=48))
-    assert result.scene.antialiased
-    assert result.errors[-1] < 0.3 * result.errors[0]
+SOURCE, CAMERAS = visible_scene(60, 1, seed=3), ring_of_cameras(8, size=40)
 
 
 @pytest.mark.one_family
 def test_the_errors_are_those_of_the_views_held_out(family_device):
-    source = visible_scene(60, 1, seed=3)
-    cameras = ring_of_cameras(9, size=40)
-    start = shaken(source)
-    result = fitted_to(family_device, source, start, cameras)
+    """With views of several sizes."""
+    cameras = [*ring_of_cameras(9, size=40)[::2], *ring_of_cameras(9, size=72)[1::2]]
+    start = shaken(SOURCE)
+    result = fitted_to(family_device, SOURCE, start, cameras)
     _, held_out = share_out(len(cameras), 0)
     judges = [cameras[number] for number in held_out]
     assert result.held_out == len(judges) > 0
-    assert result.errors[0] == pytest.approx(mean_error(family_device, source, start, judges), rel=1e-5)
-    assert min(result.errors) == pytest.approx(mean_error(family_device, source, result.scene, judges), rel=1e-4)
+    assert result.errors[0] == pytest.approx(mean_error(family_device, SOURCE, start, judges), rel=1e-5)
+    assert min(result.errors) == pytest.approx(mean_error(family_device, SOURCE, result.scene, judges), rel=1e-4)
+    assert result.errors[-1] < 0.3 * result.errors[0]
 
 
 @pytest.mark.one_family
@@ -132,10 +112,8 @@ def test_splats_that_no_view_sees_stay_as_they_are(family_device):
 
 @pytest.mark.one_family
 def test_the_same_bits_every_time_and_others_from_another_seed(family_device):
-    source = visible_scene(60, 1, seed=3)
-    cameras = ring_of_cameras(8, size=40)
     results = [
-        fitted_to(family_device, source, shaken(source), cameras, dataclasses.replace(STEPS, steps=40, seed=seed))
+        fitted_to(family_device, SOURCE, shaken(SOURCE), CAMERAS, dataclasses.replace(STEPS, steps=10, seed=seed))
         for seed in (0, 0, 1)
     ]
     for name in PARAMETERS:
@@ -147,15 +125,13 @@ def test_the_same_bits_every_time_and_others_from_another_seed(family_device):
 @pytest.mark.one_family
 def test_what_does_not_help_is_not_kept(family_device):
     """A scene that is perfect in the views held out, and targets elsewhere that lead away from it."""
-    source = visible_scene(60, 1, seed=3)
-    cameras = ring_of_cameras(8, size=40)
     _, held_out = share_out(8, 0)
-    with Rasterizer(family_device, source) as rasterizer:
-        pictures = [rasterizer.render(camera)[0] for camera in cameras]
+    with Rasterizer(family_device, SOURCE) as rasterizer:
+        pictures = [rasterizer.render(camera)[0] for camera in CAMERAS]
     wrong = [picture if number in held_out else 1 - picture for number, picture in enumerate(pictures)]
-    start = shaken(source, only=("sh",))
+    start = shaken(SOURCE, only=("sh",))
     with Pictures(family_device, wrong) as targets:
-        result = fit_scene(family_device, start, cameras, targets, STEPS)
+        result = fit_scene(family_device, start, CAMERAS, targets, STEPS)
     assert result.kept == 0
     assert result.steps < STEPS.steps, "the fit should end before"
     for name in PARAMETERS:
@@ -163,14 +139,11 @@ def test_what_does_not_help_is_not_kept(family_device):
 
 
 def test_no_splat_leaves_the_range_of_sizes_and_opacities(family_device):
-    source = visible_scene(60, 1, seed=3)
-    start = shaken(source)
-    black = [np.zeros((40, 40, 3), np.float32)] * 8
-    with Pictures(family_device, black) as targets:
-        options = FitOptions(
-            steps=100, rates=dataclasses.replace(STEPS.rates, log_scales=1.0, opacity_logits=5.0), patience=10
-        )
-        result = fit_scene(family_device, start, ring_of_cameras(8, size=40), targets, options)
+    start = shaken(SOURCE)
+    with Pictures(family_device, [np.zeros((40, 40, 3), np.float32)] * 8) as targets:
+        rates = dataclasses.replace(STEPS.rates, log_scales=1.0, opacity_logits=5.0)
+        options = FitOptions(steps=40, rates=rates, patience=10)
+        result = fit_scene(family_device, start, CAMERAS, targets, options)
     assert result.kept > 0
     assert result.scene.log_scales.min() >= start.log_scales.min()
     assert result.scene.log_scales.max() <= start.log_scales.max()
@@ -179,22 +152,12 @@ def test_no_splat_leaves_the_range_of_sizes_and_opacities(family_device):
 
 
 @pytest.mark.one_family
-def test_views_of_several_sizes(family_device):
-    source = visible_scene(60, 1, seed=3)
-    cameras = [*ring_of_cameras(8, size=40)[::2], *ring_of_cameras(8, size=72)[1::2]]
-    result = fitted_to(family_device, source, shaken(source), cameras)
-    assert result.errors[-1] < 0.3 * result.errors[0]
-
-
-@pytest.mark.one_family
 def test_targets_need_not_all_be_kept(family_device):
-    source = visible_scene(60, 1, seed=3)
-    cameras = ring_of_cameras(8, size=40)
-    few = dataclasses.replace(STEPS, steps=60)
-    wanted = fitted_to(family_device, source, shaken(source), cameras, few)
-    for memory in (0, 2 * 12 * 40 * 40):
-        found = fitted_to(family_device, source, shaken(source), cameras, dataclasses.replace(few, memory=memory))
-        assert found.errors == wanted.errors
+    found = []
+    for memory in (None, 0, 2 * 12 * 40 * 40):
+        few = dataclasses.replace(STEPS, steps=20, memory=memory)
+        found.append(fitted_to(family_device, SOURCE, shaken(SOURCE), CAMERAS, few).errors)
+    assert found[0] == found[1] == found[2]
 
 
 def test_added_views_are_never_held_out():
@@ -215,30 +178,13 @@ def test_every_view_comes_as_often_as_any_other():
 
 
 def test_progress_and_what_is_told(family_device):
-    source = visible_scene(40, 1, seed=3)
     told, lines = [], []
-    fitted_to(
-        family_device,
-        source,
-        shaken(source),
-        ring_of_cameras(4, size=40),
-        FitOptions(steps=6, rounds=3),
-        progress=lambda done, steps: told.append((done, steps)),
-        tell=lines.append,
-    )
+    options = FitOptions(steps=6, rounds=3)
+    progress = {"progress": lambda done, steps: told.append((done, steps)), "tell": lines.append}
+    fitted_to(family_device, SOURCE, shaken(SOURCE), CAMERAS[:4], options, **progress)
     assert told == [(done, 6) for done in range(1, 7)]
     assert len(lines) == 3
     assert all("held-out" in line for line in lines)
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [{"steps": -1}, {"steps": 10**7}, {"batch": 0}, {"rounds": 0}, {"patience": 0}, {"last": 0}, {"last": 2}],
-    ids=str,
-)
-def test_what_is_out_of_range_is_refused(wrong):
-    with pytest.raises(UsageError, match="the fit"):
-        FitOptions(**wrong)
 
 
 # ------------------------------------------------------------------------------------------ the stage
@@ -262,15 +208,15 @@ def test_the_stage_mends_what_pruning_has_left(family_device):
     assert errors[1] < 0.6 * errors[0]
 
 
+@pytest.mark.one_family
 def test_one_view_cannot_be_held_out(family_device):
-    source = visible_scene(40, 1)
-    before = State.of(source, ring_of_cameras(1))
+    before = State.of(SOURCE, CAMERAS[:1])
     after = Fit(steps=10).run(before, bench_of(family_device))
     assert after.scene is before.scene
     assert isinstance(after.results.fitted, LeftOut)
     assert "two training views" in str(after.results.fitted)
     with pytest.raises(UsageError, match="two training views"):
-        fitted_to(family_device, source, source, ring_of_cameras(1))
+        fitted_to(family_device, SOURCE, SOURCE, CAMERAS[:1])
 
 
 @pytest.mark.one_family
@@ -284,11 +230,6 @@ def test_sparse_colours_stay_sparse(family_device):
     after = Fit(steps=30).run(before, bench_of(family_device)).scene
     assert np.array_equal(after.sh[:, 1:], start.sh[:, 1:])
     assert not np.array_equal(after.sh[:, 0], start.sh[:, 0])
-
-
-def test_it_is_off_unless_asked_for():
-    assert not Fit().asked_for
-    assert Fit(steps=5).asked_for
 
 
 # ------------------------------------------------------------------------------------------ fewer splats for the fit
@@ -306,11 +247,6 @@ def cost(device, source, scene, cameras, price):
 
 #: Of which about half of the excerpt's splats are worth it.
 PRICE = 3e-8
-
-
-@pytest.fixture
-def small_views(plush_excerpt_cameras):
-    return [resized(camera, 120, 90) for camera in plush_excerpt_cameras if camera.split == "train"]
 
 
 @pytest.mark.one_family
@@ -335,14 +271,6 @@ def priced_fit(further, **options):
     fit = Fit(**{"steps": 50, "further": at_price, "between": 0, "choosing": 0, "rounding": 0, **options})
     assert fit.limit(PRICE) == pytest.approx(further * PRICE)
     return fit
-
-
-@pytest.mark.one_family
-def test_of_a_given_number_of_splats_none_are_removed(family_device, plush_excerpt, small_views):
-    before = dataclasses.replace(State.of(plush_excerpt, small_views), scene=shaken(plush_excerpt, only=("sh",)))
-    after = Fit(steps=30).run(before, bench_of(family_device))
-    assert len(after.scene) == len(plush_excerpt)
-    assert after.results.fitted.spared == 0
 
 
 @pytest.mark.one_family
@@ -374,7 +302,7 @@ def test_the_best_of_all_cycles_is_kept(family_device, plush_excerpt, small_view
     """The last one, from too few splats, is not."""
     start, further = priced(plush_excerpt, small_views, PRICE), 12
     bench = bench_of(family_device)
-    after = priced_fit(further, cycles=3, steps=120).run(start, bench)
+    after = priced_fit(further, cycles=3, steps=60).run(start, bench)
     costs = [cost(family_device, plush_excerpt, state.scene, small_views, PRICE) for state in (start, after)]
     assert costs[1] < 0.97 * costs[0]
     low = dataclasses.replace(bench.parameters, delta_mse_max=further * PRICE)
@@ -408,19 +336,12 @@ def test_views_between_are_added_to_the_given_ones(family_device):
 @pytest.mark.one_family
 @pytest.mark.parametrize(("steps", "further", "price"), [(2, 1e6, 1e-9), (2, 1e4, 1e-7)])
 def test_what_does_not_pay_is_left_out(family_device, steps, further, price):
-    source, cameras = visible_scene(60, 1, seed=3), ring_of_cameras(8, size=40)
-    before = priced(source, cameras, price)
+    before = priced(SOURCE, CAMERAS, price)
     after = Fit(steps=steps, further=further).run(before, bench_of(family_device))
     assert isinstance(after.results.fitted, LeftOut)
     assert "did not make up" in str(after.results.fitted)
     assert after.scene is before.scene
     assert after.survivors is before.survivors
-
-
-@pytest.mark.parametrize("wrong", [{"further": -0.5}, {"cycles": 0}, {"finer": -1}, {"between": -1}], ids=str)
-def test_an_option_of_the_stage_that_is_out_of_range(wrong):
-    with pytest.raises(UsageError, match="the fit"):
-        Fit(**wrong)
 
 
 def test_steps_are_finer_the_more_splats_are_left():
@@ -439,4 +360,39 @@ def test_automatic_steps_and_what_they_are_on_each_family():
     assert Fit(steps="auto").asked_for
     assert 0 < Fit(steps="auto").steps_on("cpu") < Fit(steps="auto").steps_on("gpu")
     assert Fit(steps=7).steps_on("cpu") == 7
+    assert Fit(steps=5).asked_for
     assert not Fit().asked_for
+
+
+# ---------------------------------------------------------------------------------------- which of two files is better
+
+
+def two(nbytes: float, decibels: float) -> TwoFiles:
+    """A file of 100,000 bytes and 50 dB, and one with a fit: by how much its size and PSNR differ."""
+    return TwoFiles(File(100_000, 1e-5), File(round(100_000 * nbytes), 1e-5 * 10 ** (-decibels / 10)))
+
+
+@pytest.mark.parametrize(
+    ("nbytes", "decibels", "pays"),
+    [
+        (0.85, 0.0, True),
+        (1.0, 1.0, True),
+        (0.9, -0.5, True),  # at 15 % a decibel, half of it would take back 7 %
+        (0.9, -1.0, False),
+        (1.04, 1.2, True),
+        (1.04, 0.6, False),  # at 5 % a decibel it would be larger
+        (1.0, 0.0, False),
+        (0.995, 0.0, False),  # so little may be chance
+        (1.0, 0.1, False),
+        (1.002, -0.16, False),
+    ],
+)
+def test_it_pays_however_much_a_decibel_takes(nbytes, decibels, pays):
+    assert two(nbytes, decibels).pays is pays
+
+
+def test_what_is_told_of_both():
+    files = two(0.9, -0.5)
+    assert files.facts["without"] == {"bytes": 100_000, "psnr": pytest.approx(50)}
+    assert files.facts["with"] == {"bytes": 90_000, "psnr": pytest.approx(49.5)}
+    assert "90,000 bytes and 49.50 dB with it, 100,000 bytes and 50.00 dB without" in str(files)

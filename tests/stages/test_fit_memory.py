@@ -7,32 +7,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from potr_cl.model.camera import resized, train_views
+from potr_cl.model.camera import resized
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.forecast import fit_bytes, memory_needed
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.fit import FitOptions, fit_scene
 from potr_cl.views.targets import RenderedTargets
-from tests.devices import FAMILIES
-
-
-class CountingDevice(Device):
-    """A device that knows the most that was ever allocated on it."""
-
-    most = 0
-
-    def allocate(self, nbytes, what):
-        buffer = super().allocate(nbytes, what)
-        self.most = max(self.most, self.allocated)
-        return buffer
-
-
-@pytest.fixture(scope="module", params=FAMILIES)
-def device(request):
-    device = CountingDevice(family=request.param)
-    yield device
-    assert device.allocated == 0
+from tests.cases.memory import taken_of
 
 
 @pytest.fixture(scope="module")
@@ -44,53 +26,47 @@ def many_splats(plush_excerpt):
     return dataclasses.replace(scene, means=moved)
 
 
-@pytest.fixture(scope="module")
-def views(plush_excerpt_cameras):
-    return [resized(camera, 120, 90) for camera in train_views(plush_excerpt_cameras)]
-
-
 def peak(device, source, scene, views, memory):
     """Bytes of the device that a fit of a few steps took at its peak."""
-    device.most = 0
     options = FitOptions(steps=4, rounds=1, memory=memory)
-    with Rasterizer(device, source) as rasterizer:
+    with Rasterizer(device, source) as rasterizer, taken_of(device) as taken:
         fit_scene(device, scene, views, RenderedTargets(rasterizer, views), options)
-    return device.most
+    return max(in_all for _, in_all in taken)
 
 
 @pytest.mark.one_family
-def test_the_peak_is_what_is_said(device, many_splats, views):
+def test_the_peak_is_what_is_said(family_device, many_splats, small_views):
     scene = many_splats.subset(np.arange(20_000))
-    with Rasterizer(device, scene) as rasterizer:
-        before = device.allocated
-        with rasterizer.prepare_set(views[:1]):
-            view = device.allocated - before
-    together = 4 if device.family == "gpu" else 1
-    said = fit_bytes(20_000, 30_000, 48, together, len(views), view, 120 * 90, 1e9)
-    assert 0.85 * said < peak(device, many_splats, scene, views, 10**9) < 1.15 * said
+    with Rasterizer(family_device, scene) as rasterizer:
+        before = family_device.allocated
+        with rasterizer.prepare_set(small_views[:1]):
+            view = family_device.allocated - before
+    together = 4 if family_device.family == "gpu" else 1
+    said = fit_bytes(20_000, 30_000, 48, together, len(small_views), view, 120 * 90, 1e9)
+    assert 0.85 * said < peak(family_device, many_splats, scene, small_views, 10**9) < 1.15 * said
 
 
 @pytest.mark.slow
 @pytest.mark.one_family
-def test_a_budget_of_memory_is_kept(device, many_splats, views):
+def test_a_budget_of_memory_is_kept(family_device, many_splats, small_views):
     """What is kept of views is no more than the budget."""
-    larger, some = [resized(view, 240, 180) for view in views], many_splats.subset(np.arange(3000))
+    larger, some = [resized(view, 240, 180) for view in small_views], many_splats.subset(np.arange(3000))
     picture = 12 * 240 * 180
-    least = peak(device, some, some, larger, 0)
-    assert peak(device, some, some, larger, 4 * picture + 100) <= least + 4 * picture + 100
+    least = peak(family_device, some, some, larger, 0)
+    assert peak(family_device, some, some, larger, 4 * picture + 100) <= least + 4 * picture + 100
     # What nothing limits takes more.
-    assert peak(device, some, some, larger, 10**9) > least + 4 * picture + 100
+    assert peak(family_device, some, some, larger, 10**9) > least + 4 * picture + 100
 
 
 @pytest.mark.one_family
 @pytest.mark.parametrize("own", [False, True], ids=["the host's memory", "memory of its own"])
-def test_the_forecast_knows_of_the_fit(device, own, many_splats, views):
+def test_the_forecast_knows_of_the_fit(family_device, own, many_splats, small_views):
     """Where no view is kept; what kept views take may be more than the fit, which begins when they are gone."""
-    info = dataclasses.replace(device.info, kind="gpu" if own else "cpu", integrated=not own)
-    opened = Device(info, family=device.family)
+    info = dataclasses.replace(family_device.info, kind="gpu" if own else "cpu", integrated=not own)
+    opened = Device(info, family=family_device.family)
 
     def memory(**changes):
-        return memory_needed(many_splats, views, EncodeOptions().changed(**changes), opened)
+        return memory_needed(many_splats, small_views, EncodeOptions().changed(**changes), opened)
 
     without, with_it = memory(memory=0), memory(memory=0, fit={"steps": 1000})
     assert with_it - without > 30_000 * 59 * 4 * 3

@@ -9,7 +9,6 @@ import pytest
 
 from potr_cl.codec.geometry import Geometry
 from potr_cl.codec.quantize import HyperParameters
-from potr_cl.model.camera import resized, train_views
 from potr_cl.outputs.ply import Ply
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fit import Fit
@@ -20,22 +19,10 @@ from potr_cl.stages.held_out import share_out
 from potr_cl.stages.refit import Refit
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.views.targets import RenderedTargets
-from tests.devices import FAMILIES, open_device
+from tests.cases.judging import mean_error
 
 PARAMETERS = HyperParameters.from_quality(0.2, "best")
-OPTIONS = FitOptions(steps=120)
-
-
-@pytest.fixture(scope="module", params=FAMILIES)
-def device(request):
-    device = open_device(request.param)
-    yield device
-    assert device.allocated == 0, "memory was not given back"
-
-
-@pytest.fixture(scope="module")
-def views(plush_excerpt_cameras):
-    return [resized(camera, 120, 90) for camera in train_views(plush_excerpt_cameras)]
+OPTIONS = FitOptions(steps=60)
 
 
 def settled(device, scene, views, settling, **changes):
@@ -48,20 +35,15 @@ def settled(device, scene, views, settling, **changes):
     return before, then, errors, bench
 
 
-def error_of(device, source, scene, views):
-    with Rasterizer(device, source) as one, Rasterizer(device, scene) as other:
-        return np.mean([np.mean((one.render(c)[0] - other.render(c)[0]) ** 2) for c in views])
-
-
 @pytest.mark.one_family
-def test_what_moves_makes_up_for_what_is_rounded(device, plush_excerpt, views):
-    before, then, errors, bench = settled(device, plush_excerpt, views, Settling(0, 0.5, 1.0))
+def test_what_moves_makes_up_for_what_is_rounded(family_device, plush_excerpt, small_views):
+    before, then, errors, bench = settled(family_device, plush_excerpt, small_views, Settling(0, 0.5, 1.0))
     assert isinstance(then.geometry, Geometry)
     assert then.geometry.asked == PARAMETERS
     assert len(errors) == 2
     at_once = bench.output.geometry(plush_excerpt, bench.request(before)).decoded(plush_excerpt.sh)
     in_turns = then.geometry.decoded(then.scene.sh)
-    found = [error_of(device, plush_excerpt, scene, views) for scene in (at_once, in_turns)]
+    found = [mean_error(family_device, plush_excerpt, scene, small_views) for scene in (at_once, in_turns)]
     assert found[1] < 0.8 * found[0]
     levels = np.exp(in_turns.log_scales.astype(np.float64)) * then.geometry.parameters.sf_scale
     assert np.all(np.abs(levels - np.rint(levels))[levels > 0.5] < 1e-3), "what the file holds is rounded"
@@ -71,20 +53,20 @@ def test_what_moves_makes_up_for_what_is_rounded(device, plush_excerpt, views):
     assert np.array_equal(then.scene.sh[:, 1:], plush_excerpt.sh[:, 1:])
 
 
-def test_a_fit_can_look_at_what_a_file_will_hold(device, plush_excerpt, views):
+def test_a_fit_can_look_at_what_a_file_will_hold(family_device, plush_excerpt, small_views):
     """Its kernel rounds shapes and opacities as the codec does."""
-    bench = Workbench(PARAMETERS, device=device)
-    geometry = bench.output.geometry(plush_excerpt, bench.request(State.of(plush_excerpt, views)))
+    bench = Workbench(PARAMETERS, device=family_device)
+    geometry = bench.output.geometry(plush_excerpt, bench.request(State.of(plush_excerpt, small_views)))
     decoded = dataclasses.replace(geometry.decoded(plush_excerpt.sh), means=plush_excerpt.means)
     world = geometry.parameters
     factors = Factors(world.sf_scale, world.sf_rotation, world.sf_opacity)
     scene = in_form_of_files(plush_excerpt)
-    with Rasterizer(device, plush_excerpt) as rasterizer:
-        targets = RenderedTargets(rasterizer, views)
-        found = fit_scene(device, scene, views, targets, FitOptions(steps=0), factors=factors)
-        unrounded = fit_scene(device, scene, views, targets, FitOptions(steps=0))
-    _, held_out = share_out(len(views), 0)
-    expected = error_of(device, plush_excerpt, decoded, [views[k] for k in held_out])
+    with Rasterizer(family_device, plush_excerpt) as rasterizer:
+        targets = RenderedTargets(rasterizer, small_views)
+        found = fit_scene(family_device, scene, small_views, targets, FitOptions(steps=0), factors=factors)
+        unrounded = fit_scene(family_device, scene, small_views, targets, FitOptions(steps=0))
+    _, held_out = share_out(len(small_views), 0)
+    expected = mean_error(family_device, plush_excerpt, decoded, [small_views[k] for k in held_out])
     assert found.errors[0] == pytest.approx(expected, rel=1e-3)
     assert found.scene is not None
     assert np.array_equal(found.scene.log_scales, scene.log_scales), "what lies behind is not rounded"
@@ -93,8 +75,8 @@ def test_a_fit_can_look_at_what_a_file_will_hold(device, plush_excerpt, views):
 
 @pytest.mark.slow
 @pytest.mark.one_family
-def test_coefficients_are_chosen_and_the_rest_moves(device, plush_excerpt, views):
-    _, then, errors, _ = settled(device, plush_excerpt, views, Settling(0.5, 0, 0.1))
+def test_coefficients_are_chosen_and_the_rest_moves(family_device, plush_excerpt, small_views):
+    _, then, errors, _ = settled(family_device, plush_excerpt, small_views, Settling(0.5, 0, 0.1))
     assert then.geometry is None
     assert len(errors) == 1
     zeros = [np.mean(scene.sh[:, 1:] == 0) for scene in (plush_excerpt, then.scene)]
@@ -104,9 +86,9 @@ def test_coefficients_are_chosen_and_the_rest_moves(device, plush_excerpt, views
 
 @pytest.mark.slow
 @pytest.mark.one_family
-def test_the_refit_takes_no_coefficient_back(device, plush_excerpt, views):
+def test_the_refit_takes_no_coefficient_back(family_device, plush_excerpt, small_views):
     """Unless it is asked for other steps, which other coefficients may suit."""
-    _, then, _, bench = settled(device, plush_excerpt, views, Settling(0.5, 0.5, 0.1))
+    _, then, _, bench = settled(family_device, plush_excerpt, small_views, Settling(0.5, 0.5, 0.1))
     given_up = (then.scene.sh[:, 1:] == 0).all(axis=2)
     assert np.mean(given_up) > 0.3
     other = dataclasses.replace(bench, parameters=HyperParameters.from_quality(0.6, "best"))
@@ -118,22 +100,22 @@ def test_the_refit_takes_no_coefficient_back(device, plush_excerpt, views):
     assert back[1] > 0.01
 
 
-def test_nothing_of_it_where_nothing_is_asked_for(device, plush_excerpt, views):
-    before, then, errors, _ = settled(device, plush_excerpt, views, Settling(0, 0, 0.1))
+@pytest.mark.one_family
+def test_nothing_of_it_where_nothing_is_asked_for_and_other_kinds_of_files_round_at_once(
+    family_device, plush_excerpt, small_views
+):
+    before, then, errors, _ = settled(family_device, plush_excerpt, small_views, Settling(0, 0, 0.1))
     assert then.scene is before.scene
     assert errors == ()
-
-
-def test_other_kinds_of_files_round_at_once(device, plush_excerpt, views):
-    _, then, errors, _ = settled(device, plush_excerpt, views, Settling(0, 0.5, 0.1), output=Ply())
+    _, then, errors, _ = settled(family_device, plush_excerpt, small_views, Settling(0, 0.5, 0.1), output=Ply())
     assert then.geometry is None
     assert errors == ()
 
 
 @pytest.mark.one_family
-def test_the_stage_hands_its_geometry_on(device, plush_excerpt, views):
-    bench = Workbench(HyperParameters.from_quality(0.5, "best"), device=device)
-    start = State.of(plush_excerpt, views).with_results(price=3e-8)  # about half of the splats are worth it
+def test_the_stage_hands_its_geometry_on(family_device, plush_excerpt, small_views):
+    bench = Workbench(HyperParameters.from_quality(0.5, "best"), device=family_device)
+    start = State.of(plush_excerpt, small_views).with_results(price=3e-8)  # about half of the splats are worth it
     usual = Fit(steps=50, further=0.26, choosing=0, between=0)
     with_it, without = (dataclasses.replace(usual, rounding=part).run(start, bench) for part in (0.3, 0))
     assert isinstance(with_it.geometry, Geometry)
@@ -146,11 +128,14 @@ def test_the_stage_hands_its_geometry_on(device, plush_excerpt, views):
 
 
 @pytest.mark.one_family
-def test_where_no_splats_were_spared_nothing_is_rounded_yet(device, plush_excerpt, views):
+def test_of_a_given_number_of_splats_none_are_spared_and_nothing_is_rounded_yet(
+    family_device, plush_excerpt, small_views
+):
     """The file then has coarser steps than the fit was told."""
     smaller = plush_excerpt.subset(np.arange(0, len(plush_excerpt), 2))
-    start = dataclasses.replace(State.of(plush_excerpt, views), scene=smaller, survivors=np.arange(0, 1500, 2))
-    after = Fit(steps=60, between=0).run(start, Workbench(PARAMETERS, device=device))
+    start = dataclasses.replace(State.of(plush_excerpt, small_views), scene=smaller, survivors=np.arange(0, 1500, 2))
+    after = Fit(steps=60, between=0).run(start, Workbench(PARAMETERS, device=family_device))
+    assert len(after.scene) == len(smaller)
     assert after.results.fitted.spared == 0
     assert after.results.fitted.settled == ()
     assert after.geometry is None

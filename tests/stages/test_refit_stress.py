@@ -2,30 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 
-from potr_cl.model.camera import Camera
+from potr_cl.model.camera import resized
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from tests.reference.refit import to_ycocg
 from tests.reference.refit_cases import Case, Linearised
 from tests.reference.scenes import plain_splats, ring_of_cameras, straight_camera, visible_scene
 
 
-def of_size(camera: Camera, width: int, height: int) -> Camera:
-    factor = width / camera.width
-    return dataclasses.replace(
-        camera, width=width, height=height, fx=factor * camera.fx, fy=factor * camera.fy, cx=width / 2, cy=height / 2
-    )
-
-
 @pytest.mark.one_family
 @pytest.mark.one_runtime
-@pytest.mark.parametrize(
-    "share", [pytest.param(share, marks=[] if share == 0.6 else pytest.mark.slow) for share in (0.2, 0.4, 0.6, 0.9)]
-)
+@pytest.mark.parametrize("share", [0.2, 0.6])
 def test_the_memory_budget_is_used_and_not_exceeded(device, share):
     """What the device holds when views and targets are kept, above what it holds at most when none is."""
     cameras = ring_of_cameras(60, size=32)
@@ -60,28 +49,23 @@ def solve_and_check(case: Case, options: RefitOptions, active=None) -> np.ndarra
     return x
 
 
-def test_splats_that_no_view_sees_stay_as_they_are(device):
+@pytest.mark.parametrize("seen", [0, 10])
+def test_splats_that_no_view_sees_stay_as_they_are(device, seen):
     scene = visible_scene(30)
-    scene.means[10:] += np.float32(1000)
+    scene.means[seen:] += np.float32(1000)
+    before = to_ycocg(scene.sh)
     with Case(device, scene, visible_scene(30, 2, 7), ring_of_cameras(3, size=40)) as case:
         for prior in (0.0, 0.1):
             x = solve_and_check(case, RefitOptions(prior=prior))
-            assert np.allclose(x[10:], to_ycocg(scene.sh)[10:], atol=1e-6)
-            assert not np.allclose(x[:10], to_ycocg(scene.sh)[:10], atol=1e-3)
-
-
-def test_no_splat_is_seen(device):
-    scene = visible_scene(30)
-    scene.means[:] += np.float32(1000)
-    with Case(device, scene, visible_scene(30, 2, 7), ring_of_cameras(3, size=40)) as case:
-        for options in (RefitOptions(), RefitOptions(lam=1, prior=0), RefitOptions(prior=0)):
-            solve_and_check(case, options)
+            assert np.allclose(x[seen:], before[seen:], atol=1e-6)
+            assert seen == 0 or not np.allclose(x[:seen], before[:seen], atol=1e-3)
+        solve_and_check(case, RefitOptions(lam=1, prior=0))
 
 
 def test_one_view(device):
     with Case(device, visible_scene(40), visible_scene(60, 2, 7), ring_of_cameras(5, size=40)[1:2]) as case:
-        solve_and_check(case, RefitOptions(steps=30, gain=0))
-        solve_and_check(case, RefitOptions(steps=30, gain=0, prior=0))
+        for prior in (0.1, 0):
+            solve_and_check(case, RefitOptions(steps=30, gain=0, prior=prior))
 
 
 def test_a_black_target(device):
@@ -105,26 +89,24 @@ def test_no_regulariser_on_a_rank_deficient_system(device):
     scene = visible_scene(20).subset(np.tile(np.arange(20), 2))
     with Case(device, scene, visible_scene(60, 2, 7), ring_of_cameras(2, size=40)) as case:
         for steps in (1, 8, 100):
-            x = solve_and_check(case, RefitOptions(steps=steps, gain=0, lam=0, prior=0))
-            assert np.abs(x).max() < 1e3
+            assert np.abs(solve_and_check(case, RefitOptions(steps=steps, gain=0, prior=0))).max() < 1e3
 
 
 def test_a_strong_pull_to_zero_is_no_better_than_what_it_costs(case):
-    for lam in (1e3, 1e6, 1e12):
-        solve_and_check(case, RefitOptions(steps=20, gain=0, lam=lam))
-    solve_and_check(case, RefitOptions(steps=20, gain=0, prior=1e12))
+    for changes in ({"lam": 1e3}, {"lam": 1e12}, {"prior": 1e12}):
+        solve_and_check(case, RefitOptions(steps=20, gain=0, **changes))
 
 
 @pytest.mark.slow
 def test_absurd_coefficients(device):
-    for where in ["dc", "ac", "both"]:
-        for value in [1e4, 1e10, 1e30, 3e38]:
+    for where in ["dc", "ac"]:
+        for value in [1e4, 1e30, 3e38]:
             scene = visible_scene(40)
             rng = np.random.default_rng(0)
             for k in range(0, 40, 7):
-                if where != "ac":
+                if where == "dc":
                     scene.sh[k, 0] = value * rng.choice([-1, 1], size=3)
-                if where != "dc":
+                else:
                     scene.sh[k, 1:] = value * rng.choice([-1, 1], size=(15, 3))
             with Case(device, scene, visible_scene(60, 2, 7), ring_of_cameras(3, size=40)) as case:
                 for options in (RefitOptions(), RefitOptions(lam=1), RefitOptions(prior=0), RefitOptions(drop=1e-7)):
@@ -145,7 +127,7 @@ def test_absurd_targets(device):
 
 def test_views_of_different_sizes(device):
     cameras = ring_of_cameras(4, size=40)
-    cameras = [cameras[0], of_size(cameras[1], 61, 33), of_size(cameras[2], 16, 16), of_size(cameras[3], 7, 90)]
+    cameras = [cameras[0], resized(cameras[1], 61, 33), resized(cameras[2], 16, 16), resized(cameras[3], 7, 90)]
     with Case(device, visible_scene(30, 1), visible_scene(60, 2, 7), cameras) as case:
         options = RefitOptions(steps=200, gain=0, prior=10)
         x = solve_and_check(case, options)
@@ -156,7 +138,7 @@ def test_views_of_different_sizes(device):
 
 @pytest.mark.one_runtime
 @pytest.mark.parametrize(
-    "count", [20_000, pytest.param(400_000, marks=[pytest.mark.slow, pytest.mark.one_family])]
+    "count", [8000, pytest.param(100_000, marks=[pytest.mark.slow, pytest.mark.one_family])]
 )  # fmt: skip
 def test_overlapping_splats_on_one_pixel_column(device, count):
     rng = np.random.default_rng(0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from contextlib import contextmanager
 
 import numpy as np
@@ -10,24 +11,19 @@ import pytest
 
 from potr_cl.errors import DeviceMemoryError, UsageError
 from potr_cl.model.camera import Camera
-from potr_cl.model.scene import Scene
+from potr_cl.model.scene import LOW_PASS, MIP_SPLATTING_LOW_PASS, Scene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
+from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS, ViewWeights
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions, prune
 from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.views.budget import default_memory
-from tests.devices import KERNELS, open_device
+from tests.cases.judging import mean_error
+from tests.cases.scenes import antialiased
 from tests.reference import raster as reference
 from tests.reference.removal import BruteForce
-from tests.reference.scenes import ring_of_cameras, visible_scene
-
-
-@pytest.fixture(scope="module", params=KERNELS)
-def device(request):
-    device = open_device(request.param)
-    yield device
-    assert device.allocated == 0, "a sweep did not give all its memory back"
+from tests.reference.scenes import plain_splats, ring_of_cameras, visible_scene
 
 
 def without(scene: Scene, gone) -> Scene:
@@ -67,16 +63,34 @@ def sweep(device, scene, cameras, tolerance=0.0, background=(0.0, 0.0, 0.0)):
         yield removal
 
 
-def test_single_removals(device):
-    scene, background = visible_scene(60, 1), (1.0, 0.3, 0.0)
-    cameras = ring_of_cameras(3, size=48)
-    with sweep(device, scene, cameras, background=background) as removal:
+COLOURFUL = (1.0, 0.3, 0.0)
+CLASSIC = visible_scene(60, 1)
+VIEWS = ring_of_cameras(3, size=48)
+
+
+@functools.cache
+def true_effects(low_pass):
+    """Of every third splat, and how much of each picture the splats cover."""
+    scene = CLASSIC if low_pass is None else antialiased(CLASSIC, low_pass)
+    targets = renders(scene, VIEWS, COLOURFUL)
+    covered = [1 - reference.render(scene, camera, INRIA).transmittance.mean() for camera in VIEWS]
+    return scene, brute_force(scene, VIEWS, targets, range(0, 60, 3), background=COLOURFUL), covered
+
+
+@pytest.mark.parametrize("low_pass", [None, LOW_PASS, MIP_SPLATTING_LOW_PASS])
+def test_single_removals(device, low_pass):
+    """Of a classic scene, and of an antialiased one, whose splats are about a pixel large."""
+    scene, true, covered = true_effects(low_pass)
+    with sweep(device, scene, VIEWS, background=COLOURFUL) as removal:
         effect, importance = removal.measure()
-    targets = renders(scene, cameras, background)
-    close(effect, brute_force(scene, cameras, targets, range(60), background=background))
+        weights = ViewWeights.from_importances(len(scene), removal.view_importances())
+    close(effect[::3], true)
     assert (effect >= 0).all()  # nothing is better than the target itself
-    transmittances = [reference.render(scene, c, INRIA).transmittance for c in cameras]
-    assert importance.sum() == pytest.approx(np.mean([1 - t.mean() for t in transmittances]), rel=1e-5)
+    # The compaction's weights: the mean of T alpha over each view's pixels, which add up to what is not background.
+    assert importance.sum() == pytest.approx(np.mean(covered), rel=1e-5)
+    for number, share in enumerate(covered):
+        total = weights.weights[weights.views == number].sum(dtype=np.float64) / REFERENCE_PIXELS
+        assert total == pytest.approx(share, rel=1e-5)
 
 
 def test_single_removals_when_others_are_gone(device):
@@ -100,14 +114,11 @@ def test_single_removals_when_others_are_gone(device):
 def test_alpha_at_the_cap_behind_hundreds_of_layers(device):
     """No digits are lost where the paper's formula divides by 1 - alpha and subtracts what the layers in front add."""
     layers, opaque = 320, 300
-    logits = np.full(layers, -4.6, np.float32)  # alpha 0.01; a twentieth of the light is left at the opaque one
+    logits = np.full(layers, -4.6)  # alpha 0.01; a twentieth of the light is left at the opaque one
     logits[opaque] = 12  # alpha 0.99
-    means = np.zeros((layers, 3), np.float32)
-    means[:, 0] = np.linspace(-2, 2, layers)
-    quaternions = np.zeros((layers, 4), np.float32)
-    quaternions[:, 0] = 1
-    dc = np.random.default_rng(0).normal(size=(layers, 1, 3)).astype(np.float32)
-    scene = Scene(means, np.full((layers, 3), 0.5, np.float32), quaternions, logits, dc)
+    means = np.linspace([-2, 0, 0], [2, 0, 0], layers)
+    colours = 0.5 + 0.28 * np.random.default_rng(0).normal(size=(layers, 3))
+    scene = plain_splats(means, sigma=np.exp(0.5), logit=logits, colour=colours)
     camera_centre = np.array([-8.0, 0, 0])
     rotation = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
     cameras = [Camera("along", 16, 16, 60, 60, 8, 8, rotation, -rotation @ camera_centre)]
@@ -116,16 +127,6 @@ def test_alpha_at_the_cap_behind_hundreds_of_layers(device):
     splats = [0, 150, 299, opaque, 301, 310, 319]
     true = brute_force(scene, cameras, renders(scene, cameras), splats)
     assert np.abs(effect[splats] / true - 1).max() < 1e-3
-
-
-def test_same_bits_every_time(device, plush_excerpt, plush_excerpt_cameras):
-    results = []
-    for _ in range(3):
-        with sweep(device, plush_excerpt, plush_excerpt_cameras[:3]) as removal:
-            removal.measure()
-            removal.remove(np.arange(0, 1500, 7))
-            results.append(np.concatenate(removal.measure()).tobytes())
-    assert len(set(results)) == 1
 
 
 def test_sums_kept_over_removals_are_those_of_a_new_sweep(device, plush_excerpt, plush_excerpt_cameras):
@@ -161,27 +162,19 @@ def test_buffers_too_small_for_all_views_change_nothing(device, plush_excerpt, p
 
 
 @pytest.mark.one_runtime
-def test_views_in_turns(device, plush_excerpt, plush_excerpt_cameras):
-    with (
-        Rasterizer(device, plush_excerpt) as rasterizer,
-        RemovalSweep(rasterizer, plush_excerpt_cameras[:4], SweepOptions(-1, turns=2)) as removal,
-    ):
-        for _ in range(3):
-            removal.measure()
-        assert removal.sweeps == pytest.approx(1 + 0.5 + 0.5)
-
-
-@pytest.mark.one_runtime
-def test_tolerance_saves_sweeps(device, plush_excerpt, plush_excerpt_cameras):
+def test_tolerance_and_turns_save_sweeps(device, plush_excerpt, plush_excerpt_cameras):
     sweeps = []
-    for tolerance in (-1, 0, 0.05):
-        with sweep(device, plush_excerpt, plush_excerpt_cameras[:2], tolerance) as removal:
-            for start in range(4):
-                removal.measure()
-                removal.remove(np.arange(start, 1500, 100))
-            sweeps.append(removal.sweeps)
-    assert sweeps[0] == pytest.approx(4)
-    assert sweeps[0] > sweeps[1] > sweeps[2] >= 1
+    with Rasterizer(device, plush_excerpt) as rasterizer:
+        for tolerance, turns in ((-1, 1), (-1, 2), (0, 1), (0.05, 1)):
+            with RemovalSweep(rasterizer, plush_excerpt_cameras[:2], SweepOptions(tolerance, turns=turns)) as removal:
+                for start in range(4):
+                    removal.measure()
+                    removal.remove(np.arange(start, 1500, 100))
+                sweeps.append(removal.sweeps)
+    every, in_turns, changed, tolerant = sweeps
+    assert every == pytest.approx(4)
+    assert in_turns == pytest.approx(1 + 3 * 0.5)
+    assert every > changed > tolerant >= 1
 
 
 def test_a_removal_lets_pixels_go_on(device):
@@ -207,47 +200,16 @@ def test_a_removal_lets_pixels_go_on(device):
     assert shares[SweepOptions.transmittance_threshold] > 0.98
 
 
-@pytest.mark.parametrize(
-    "bad",
-    [
-        {"tolerance": np.nan},
-        {"tolerance": np.inf},
-        {"turns": 0},
-        {"memory": -1},
-        {"transmittance_threshold": 0.0},
-        {"transmittance_threshold": 1.0},
-        {"transmittance_threshold": np.nan},
-    ],
-)
-def test_options_out_of_range(bad):
-    with pytest.raises(UsageError):
-        SweepOptions(**bad)
-
-
-def test_a_view_that_sees_nothing_changes_only_the_mean(device):
+def test_views_count_the_same_whatever_their_size_and_what_they_see(device):
     scene = visible_scene(30, 0)
-    cameras = ring_of_cameras(1, size=48)
-    away = dataclasses.replace(cameras[0], name="away", translation=np.array([0, 0, -50.0]))
-    with sweep(device, scene, cameras) as removal:
-        one = removal.measure()
-    with sweep(device, scene, [*cameras, away]) as removal:
-        two = removal.measure()
-    for a, b in zip(one, two, strict=True):
-        assert np.allclose(a, 2 * b, rtol=1e-6, atol=1e-14)
-
-
-def test_views_of_different_sizes_count_the_same(device):
-    scene = visible_scene(30, 0)
-    large = ring_of_cameras(2, size=96)[0]
-    small = ring_of_cameras(2, size=48)[1]
-    separate = []
-    for camera in (large, small):
-        with sweep(device, scene, [camera]) as removal:
-            separate.append(removal.measure())
-    with sweep(device, scene, [large, small]) as removal:
-        together = removal.measure()
-    for i in range(2):
-        assert np.allclose(together[i], (separate[0][i] + separate[1][i]) / 2, rtol=1e-5, atol=1e-13)
+    views = [ring_of_cameras(2, size=96)[0], ring_of_cameras(2, size=48)[1]]
+    views.append(dataclasses.replace(views[0], name="away", translation=np.array([0, 0, -50.0])))
+    found = []
+    for some in ([views[0]], [views[1]], views):
+        with sweep(device, scene, some) as removal:
+            found.append(removal.measure())
+    for large, small, together in zip(*found, strict=True):
+        assert np.allclose(together, (large + small) / 3, rtol=1e-5, atol=1e-13)
 
 
 @pytest.mark.slow
@@ -270,7 +232,7 @@ def test_the_memory_budget_is_used_and_not_exceeded(device):
         nothing, _ = measured(0)
         everything, expected = measured(None)
         left = np.arange(1500) % 3 > 0
-        for share in (0.2, 0.3, 0.5, 0.7, 0.95):
+        for share in (0.2, 0.5, 0.95):
             budget = int(share * (everything - nothing))
             taken, effects = measured(budget)
             assert 0.9 * budget <= taken - nothing <= 1.001 * budget, share
@@ -278,7 +240,7 @@ def test_the_memory_budget_is_used_and_not_exceeded(device):
 
 
 @pytest.mark.one_runtime
-@pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.99])
+@pytest.mark.parametrize("share", [0.1, 0.9])
 def test_a_failure_gives_all_memory_back(device, monkeypatch, share):
     """Wherever the device's memory ends while a sweep is made."""
     cameras, keep_all = ring_of_cameras(5, size=48), SweepOptions(memory=1 << 40)
@@ -297,21 +259,11 @@ def test_a_failure_gives_all_memory_back(device, monkeypatch, share):
 
 def test_identical_splats_share_their_effect(device):
     scene = visible_scene(1, 0).subset(np.zeros(40, np.int64))
-    cameras = ring_of_cameras(2, size=48)
-    with sweep(device, scene, cameras) as removal:
+    with sweep(device, scene, ring_of_cameras(2, size=48)) as removal:
         effect, importance = removal.measure()
     assert np.isfinite(effect).all()
     # Nearer by number: the first is in front of all others.
     assert (np.diff(importance) <= 1e-12).all()
-
-
-@pytest.mark.one_runtime
-def test_pruning_to_one_splat(device):
-    scene = visible_scene(40, 0)
-    cameras = ring_of_cameras(2, size=48)
-    with sweep(device, scene, cameras) as removal:
-        pruned = prune(removal, 40, PruningOptions(np.inf, 5))
-    assert pruned.kept == 1
 
 
 @pytest.mark.one_runtime
@@ -322,11 +274,11 @@ def test_pruning_keeps_the_picture_better_than_importance(device, plush_excerpt,
         pruned = prune(removal, 1500, PruningOptions(0, 12, count=750))
     by_importance = np.sort(np.argsort(importance)[-750:])
 
-    def error(kept):
-        with Rasterizer(device, plush_excerpt) as whole, Rasterizer(device, plush_excerpt.subset(kept)) as other:
-            return sum(np.mean((other.render(c)[0] - whole.render(c)[0]) ** 2) for c in cameras)
-
-    assert error(pruned.survivors) < 0.5 * error(by_importance)
+    ours, theirs = (
+        mean_error(device, plush_excerpt, plush_excerpt.subset(kept), cameras)
+        for kept in (pruned.survivors, by_importance)
+    )
+    assert ours < 0.5 * theirs
 
 
 @pytest.mark.one_runtime
@@ -339,8 +291,7 @@ def test_no_view_is_an_error(device):
 @pytest.mark.parametrize(
     ("kind", "integrated", "share"), [("gpu", False, 0.5), ("gpu", True, 0.3), ("cpu", True, 0.3), ("cpu", False, 0.3)]
 )
-def test_views_take_less_of_memory_that_is_the_hosts(device, kind, integrated, share):
-    before = device.info
-    device.info = dataclasses.replace(before, memory=10**10, kind=kind, integrated=integrated)
+def test_views_take_less_of_memory_that_is_the_hosts(device, monkeypatch, kind, integrated, share):
+    info = dataclasses.replace(device.info, memory=10**10, kind=kind, integrated=integrated)
+    monkeypatch.setattr(device, "info", info)
     assert default_memory(device) == share * 10**10
-    device.info = before

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from potr_cl.codec.quantize import quantize_sh, to_ycocg
-from potr_cl.model.camera import Camera, camera_centres, train_views
+from potr_cl.model.camera import Camera, camera_centres, resized, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
@@ -18,15 +15,7 @@ from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, Weight
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS, ViewWeights
 from potr_cl.stages.pruning.removal import RemovalSweep
 from tests.cases.ridges import check_optimal, dense_weights, on_a_sphere
-from tests.devices import KERNELS, open_device
 from tests.reference.scenes import random_scene
-
-
-@pytest.fixture(scope="module", params=KERNELS)
-def device(request: pytest.FixtureRequest) -> Iterator[Device]:
-    device = open_device(request.param)
-    yield device
-    assert device.allocated == 0, "a compactor did not give all its memory back"
 
 
 def measured_weights(device: Device, scene: Scene, cameras: list[Camera]) -> ViewWeights:
@@ -55,20 +44,17 @@ def test_real_systems(device: Device, plush_excerpt: Scene, plush_excerpt_camera
         assert zeros(compacted.sh) > zeros(plush_excerpt.sh) + 0.15
 
 
-def scaled(camera: Camera, factor: float) -> Camera:
-    """The same view in another resolution."""
-    size = {name: round(getattr(camera, name) * factor) for name in ("width", "height")}
-    return replace(camera, **size, **{name: getattr(camera, name) * factor for name in ("fx", "fy", "cx", "cy")})
-
-
-def test_half_the_resolution_gives_the_same_sparsity(plush_excerpt: Scene, plush_excerpt_cameras: list[Camera]) -> None:
+def test_half_the_resolution_gives_the_same_sparsity(
+    usual_device: Device, plush_excerpt: Scene, plush_excerpt_cameras: list[Camera]
+) -> None:
     """From 480 x 360 to 240 x 180; the rasterizer's dilation by 0.3 pixels hardly matters yet."""
-    device = Device()
     views = train_views(plush_excerpt_cameras)
     sparsity = []
     for factor in (2, 1):
-        weights = measured_weights(device, plush_excerpt, [scaled(c, factor) for c in views])
-        sparsity.append(zeros(Compactor(device).compact(plush_excerpt, camera_centres(views), weights).sh))
+        larger = [resized(view, factor * view.width, factor * view.height) for view in views]
+        weights = measured_weights(usual_device, plush_excerpt, larger)
+        compacted = Compactor(usual_device).compact(plush_excerpt, camera_centres(views), weights)
+        sparsity.append(zeros(compacted.sh))
     assert sparsity[1] == pytest.approx(sparsity[0], abs=0.01)
 
 

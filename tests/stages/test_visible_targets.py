@@ -16,18 +16,10 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
 from potr_cl.raster.scene_buffers import uploaded
 from potr_cl.views import targets, visibility
-from potr_cl.views.pictures import SeenRasterizer
 from potr_cl.views.targets import RenderedTargets, targets_of
 from potr_cl.views.visibility import Visibility
+from tests.cases.noting import noted
 from tests.cases.streets import street
-from tests.devices import KERNELS, open_device
-
-
-@pytest.fixture(scope="module", params=[kernels for kernels in KERNELS if "gpu" in str(kernels)])
-def device(request):
-    device = open_device(request.param)
-    yield device
-    assert device.allocated == 0, "targets did not give all their memory back"
 
 
 @pytest.fixture(autouse=True)
@@ -35,7 +27,7 @@ def _small_groups(monkeypatch):
     monkeypatch.setattr(splat_groups, "LARGEST", 32)
 
 
-def test_the_same_pictures(device):
+def test_the_same_pictures(gpu):
     """Of views of two sizes, one of which looks at nothing."""
     scene, cameras = street()
     away = dataclasses.replace(cameras[0], rotation=np.diag([1.0, -1.0, -1.0]) @ cameras[0].rotation)
@@ -47,10 +39,10 @@ def test_the_same_pictures(device):
     pixels = [3 * camera.width * camera.height for camera in cameras]
     background = (0.1, 0.2, 0.3)
     with (
-        uploaded(device, scene) as whole,
-        Rasterizer(device, whole, background=background) as rasterizer,
-        targets_of(device, whole, cameras, background, visibility) as visible,
-        Memory(device) as memory,
+        uploaded(gpu, scene) as whole,
+        Rasterizer(gpu, whole, background=background) as rasterizer,
+        targets_of(gpu, whole, cameras, background, visibility) as visible,
+        Memory(gpu) as memory,
     ):
         buffers = [memory.allocate(4 * sum(pixels), "pictures") for _ in range(2)]
         orders = [list(range(len(cameras))), [3, len(cameras) - 2, 1]]
@@ -58,13 +50,13 @@ def test_the_same_pictures(device):
             size = sum(pixels[number] for number in numbers)
             RenderedTargets(rasterizer, cameras).into(numbers, buffers[0])
             visible.into(numbers, buffers[1])
-            wanted, got = (device.download(buffer, (size,), np.float32) for buffer in buffers)
+            wanted, got = (gpu.download(buffer, (size,), np.float32) for buffer in buffers)
             assert np.array_equal(wanted, got)
             assert wanted.std() > 0.05
-        device.queue.finish()
+        gpu.queue.finish()
 
 
-def test_fewer_together_where_the_device_has_no_room(device, monkeypatch):
+def test_fewer_together_where_the_device_has_no_room(gpu, monkeypatch):
     scene, cameras = street()
     visibility = Visibility.of(scene, cameras, INRIA.near)
     pixels = sum(3 * camera.width * camera.height for camera in cameras)
@@ -78,34 +70,28 @@ def test_fewer_together_where_the_device_has_no_room(device, monkeypatch):
         return prepare(self, some, *args)
 
     found = []
-    with uploaded(device, scene) as whole, Memory(device) as memory:
+    with uploaded(gpu, scene) as whole, Memory(gpu) as memory:
         buffer = memory.allocate(4 * pixels, "pictures")
         for full in (False, True):
             if full:
                 monkeypatch.setattr(Rasterizer, "prepare_set", failing)
-            with targets_of(device, whole, cameras, (0.0, 0.0, 0.0), visibility) as visible:
+            with targets_of(gpu, whole, cameras, (0.0, 0.0, 0.0), visibility) as visible:
                 visible.into(range(len(cameras)), buffer)
-            found.append(device.download(buffer, (pixels,), np.float32))
+            found.append(gpu.download(buffer, (pixels,), np.float32))
     assert max(together) > 2 == together[-1]
     assert np.array_equal(*found)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("memory", [None, 3_000_000], ids=["all memory", "little"])
-def test_a_refit_takes_them_and_the_bytes_stay(device, monkeypatch, memory):
-    scene, cameras = street(6, 400)
-    options = EncodeOptions.for_preset("best", memory=memory, cameras_anyway=True).changed(prune={"iterations": 4})
-    # With little memory other views fit than those that all splats leave room for, and so other splats go.
-    wanted = encode(scene, cameras, options, device=device) if memory is None else None
-    made = []
-
-    class Noting(SeenRasterizer):
-        def __init__(self, *args: object, **named: object) -> None:
-            made.append(self)
-            super().__init__(*args, **named)  # type: ignore[arg-type]
-
+def test_a_refit_takes_them_and_the_bytes_stay(gpu, monkeypatch):
+    scene, cameras = street(5, 300)
+    options = EncodeOptions.for_preset("best", cameras_anyway=True)
+    options = options.changed(prune={"iterations": 2}, refit={"steps": 2})
+    wanted = encode(scene, cameras, options, device=gpu)
     monkeypatch.setattr(visibility, "LEAST_SPLATS", 1)
-    monkeypatch.setattr(targets, "SeenRasterizer", Noting)
-    got = encode(scene, cameras, options, device=device)
-    assert len(made) == (2 if memory is None else 1)  # where there is room, pictures are rendered ahead besides
-    assert wanted is None or got.data == wanted.data
+    made = noted(monkeypatch, targets, "SeenRasterizer")
+    assert encode(scene, cameras, options, device=gpu).data == wanted.data
+    assert len(made) == 2  # there is room, so pictures are rendered ahead besides
+    made.clear()
+    encode(scene, cameras, options.changed(memory=3_000_000), device=gpu)
+    assert len(made) == 1

@@ -14,7 +14,7 @@ from potr_cl.views.engine import ViewEngine
 from potr_cl.views.plan import ViewPlan, in_launches
 from potr_cl.views.subsets import CopiedSplats, WholeScene
 from potr_cl.views.visibility import ViewGroup
-from tests.devices import FAMILIES, open_device
+from tests.devices import FAMILIES, shared_device
 from tests.reference.scenes import ring_of_cameras, visible_scene
 
 SCENE, CAMERAS = visible_scene(60, 1), ring_of_cameras(9, size=32)
@@ -24,7 +24,9 @@ BLACK = (0.0, 0.0, 0.0)
 
 @pytest.fixture(scope="module", params=FAMILIES)
 def device(request):
-    return open_device(request.param)
+    device = shared_device(request.param)
+    yield device
+    assert device.allocated == 0, "not all memory was given back"
 
 
 class Views:
@@ -49,7 +51,6 @@ def picture(device, rasterizer, views):
 @pytest.mark.parametrize("copied", [False, True], ids=["all splats", "copies"])
 def test_every_view_is_walked_once_and_shows_the_scene(device, memory, copied):
     most = 1 if device.family == "cpu" else 2  # of views in a launch
-    most = 1 if device.family == "cpu" else 2
     with ExitStack() as stack:
         whole = stack.enter_context(Rasterizer(device, SCENE))
         if copied:
@@ -84,6 +85,6 @@ def test_a_copy_that_rests_is_back_in_the_colours_of_now_for_a_projection(device
             source.replace_sh(other)
             source.project(subset, views)
             found = picture(device, subset.rasterizer, views)
-        whole.replace_sh(other)
+        device.free(whole.replace_sh(other))
         assert np.array_equal(found, whole.render(CAMERAS[0])[0].reshape(-1, 3))
     assert not np.array_equal(SCENE.sh, other)
