@@ -7,6 +7,7 @@ import io
 import time
 from collections.abc import Callable, Iterator
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,15 @@ WIDTH, HEIGHT = 760, 480
 #: Of the page, what neither labels nor viser's notes nor the panel cover: rows and columns.
 CLEAR = (slice(220, 460), slice(20, 420))
 HOSTILE = '<img src=x onerror="document.title=1">\u202e.ply'
+
+
+@pytest.fixture(scope="module")
+def ladder(tmp_path_factory, data) -> Path:
+    """The folder of a ladder of the excerpt: three qualities, no views, so that it takes no time."""
+    pytest.importorskip("viser", reason="the extra view is not installed")
+    folder = tmp_path_factory.mktemp("ladder")
+    potr_cl.encode_ladder(data / "plush_excerpt.ply", folder, [0, 0.5, 1], prune=False, refit=False, compact=False)
+    return folder
 
 
 @pytest.fixture(scope="module")
