@@ -25,8 +25,7 @@ from tests.reference.frames import ORDINARY, PHOTOGRAPHS, changed, moved, parts
 
 PHOTOGRAPHED = (0, 11, 23, 35)
 #: Of each kind of motion the smallest ones, which are the hardest to find.
-LEAST = ["scaled by 0.7", "scaled by 1.5", "shifted by 1 along x", "turned by 10 degrees about z"]
-LEAST += ["turned by 20 degrees about y"]
+LEAST = ("scaled by 0.7", "scaled by 1.5", "shifted by 1 along x", "turned by 10 degrees about z")
 
 
 @pytest.fixture(scope="module")

@@ -126,7 +126,7 @@ def test_recorded_figures_of_another_renderer_and_other_metrics(name, request):
     recorded = json.loads((folder / "reference" / "metrics.json").read_text())["per_view"]
     cameras = {camera.name: camera for camera in load_cameras(folder / "cameras.json")}
     rasterizer = Rasterizer(Device(), load_scene(folder / "point_cloud.ply"), GSPLAT)
-    for view in recorded[:: max(len(recorded) // 12, 1)]:
+    for view in recorded[:: max(len(recorded) // 6, 1)]:
         camera = cameras[view["img_name"]]
         image, _ = rasterizer.render(camera)
         photograph = read_ground_truth(camera.image_path)

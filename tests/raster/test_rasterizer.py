@@ -26,7 +26,7 @@ from tests.reference.scenes import random_splats, tilted_camera
 from tests.reference.scenes import straight_camera as camera
 
 #: The same for all families of kernels.
-definition = once(reference.render, 100)
+definition, projection = once(reference.render, 100), once(reference.project, 3)
 
 #: A pixel whose every alpha and transmittance stays this far, relatively, from 1/255 and 1e-4 cannot flip.
 CLEAR = 1e-4
@@ -79,7 +79,7 @@ def test_square_extent_cuts_whole_tiles(device: Device) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene_name", "view_names"),
-    [("lego", ("test_r_0", "test_r_66", "test_r_133")), ("plush", ("20240212_004037",))],
+    [("lego", ("test_r_0", "test_r_66")), ("plush", ("20240212_004037",))],
 )
 def test_against_another_renderer(
     device: Device, request: pytest.FixtureRequest, scene_name: str, view_names: tuple[str, ...]
@@ -94,7 +94,7 @@ def test_against_another_renderer(
             assert -10 * np.log10(np.mean(np.square(error))) >= 70
             error_alpha = 1 - transmittance - theirs["alpha"]
         # The largest differences must all come from a threshold or a tie in depth that single precision can flip.
-        projected = reference.project(scene, cameras[name], GSPLAT)
+        projected = projection(scene, cameras[name], GSPLAT)
         worst = np.maximum(np.abs(error).max(axis=2), np.abs(error_alpha))
         assert (worst > 5e-4).mean() < 1e-3
         for pixel in np.argsort(worst, axis=None)[-8:]:

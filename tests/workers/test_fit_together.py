@@ -61,8 +61,9 @@ def steps(monkeypatch):
     return found
 
 
-@pytest.mark.parametrize("kind", [HostPool, ElsewherePool])
-@pytest.mark.parametrize("count", [2, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("kind", "count"), [(HostPool, 2), (ElsewherePool, 2), pytest.param(ElsewherePool, 4, marks=pytest.mark.slow)]
+)
 def test_the_same_bits(family, alone, kind, count, monkeypatch, steps):
     monkeypatch.setattr(together, "_TRIED", OPTIONS.steps)
     devices = [open_device(family) for _ in range(count)]
