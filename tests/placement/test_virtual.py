@@ -229,9 +229,7 @@ def test_colours_tell_a_room_from_an_object():
 
 def scaled(scene: Scene, factor: float) -> Scene:
     return dataclasses.replace(
-        scene,
-        means=(scene.means * np.float32(factor)),
-        log_scales=scene.log_scales + np.float32(np.log(factor)),
+        scene, means=(scene.means * np.float32(factor)), log_scales=scene.log_scales + np.float32(np.log(factor))
     )
 
 

@@ -60,10 +60,7 @@ def test_some_splats_of_the_host_go_to_the_device_as_all_do(gpu, sh_count):
     scene = dataclasses.replace(scene, sh=scene.sh[:, :sh_count])
     assert scene.sh.shape[1] == sh_count
     splats = np.flatnonzero(np.arange(len(scene)) % 7 > 0)
-    with (
-        uploaded(gpu, scene.subset(splats)) as wanted,
-        SceneBuffers(gpu, len(splats), scene.sh.shape[1]) as got,
-    ):
+    with uploaded(gpu, scene.subset(splats)) as wanted, SceneBuffers(gpu, len(splats), scene.sh.shape[1]) as got:
         got.write_some(scene, splats)
         for name, buffer in wanted.parameters.items():
             size = (buffer.size // 4,)

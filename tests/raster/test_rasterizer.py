@@ -78,8 +78,7 @@ def test_square_extent_cuts_whole_tiles(device: Device) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("scene_name", "view_names"),
-    [("lego", ("test_r_0", "test_r_66")), ("plush", ("20240212_004037",))],
+    ("scene_name", "view_names"), [("lego", ("test_r_0", "test_r_66")), ("plush", ("20240212_004037",))]
 )
 def test_against_another_renderer(
     device: Device, request: pytest.FixtureRequest, scene_name: str, view_names: tuple[str, ...]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tracemalloc
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -20,17 +19,10 @@ from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.workers.host import HostPool
-from tests.devices import FAMILIES, open_device
 from tests.reference.scenes import random_splats, straight_camera
 
+pytestmark = pytest.mark.one_runtime
 OPTIONS = EncodeOptions.for_preset("best", prune={"iterations": 2}, refit={"steps": 1}, compact={"on": True})
-
-
-@pytest.fixture(scope="module", params=FAMILIES)
-def device(request: pytest.FixtureRequest) -> Iterator[Device]:
-    device = open_device(request.param)
-    yield device
-    assert device.allocated == 0
 
 
 @pytest.fixture

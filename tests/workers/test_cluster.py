@@ -166,7 +166,7 @@ def test_the_same_bytes(cluster, scene, cameras, device, expected):
 def test_workers_get_what_their_views_see(cluster, device, monkeypatch):
     """And no more of a large scene: the bytes are the same, and fewer travel."""
     monkeypatch.setattr(splat_groups, "LARGEST", 32)
-    scene, cameras = street(8, 300, across=True)
+    scene, cameras = street(5, 150, across=True)
     options = dataclasses.replace(OPTIONS, cameras_anyway=True)
     with ClusterPool(cluster.scheduler_address, device) as pool:
         every = encode(scene, cameras, options, device=device, pool=pool)
@@ -285,10 +285,7 @@ def test_workers_are_lost(scene, cameras, device, expected, caplog, stage, how, 
 )
 def test_what_is_printed_when_the_cluster_is_gone(how, expected, tmp_path, data):
     """One line that says so, and that this computer goes on; none of Dask's own."""
-    with (
-        processes_of_a_cluster(2) as (address, (scheduler, *workers)),
-        long_encode(address, data, tmp_path) as running,
-    ):
+    with processes_of_a_cluster(2) as (address, (scheduler, *workers)), long_encode(address, data, tmp_path) as running:
         lines = iter(running.stderr.readline, "")
         assert any("prune …" in line for line in lines), "it has ended before pruning"
         time.sleep(1)

@@ -31,15 +31,10 @@ from potr_cl.workers.host import HostPool
 from tests.cases.cameras import small
 from tests.cases.elsewhere import ElsewherePool
 from tests.cases.streets import street
-from tests.devices import FAMILIES, open_device
+from tests.devices import open_device
 
 OPTIONS = EncodeOptions.for_preset("best", q=0.3, prune={"iterations": 2}, refit={"steps": 1}, between=False)
 BACKGROUND = (0.1, 0.2, 0.3)
-
-
-@pytest.fixture(scope="module", params=FAMILIES)
-def family(request):
-    return request.param
 
 
 @pytest.fixture(scope="module")
@@ -59,10 +54,7 @@ def coded(plush_excerpt):
 
 
 def judged(device, scene, coded, views, pool=None):
-    with (
-        Evaluator(device, scene, views, BACKGROUND, pool, remember=False) as evaluator,
-        coded.on(device) as candidate,
-    ):
+    with Evaluator(device, scene, views, BACKGROUND, pool, remember=False) as evaluator, coded.on(device) as candidate:
         told = []
         comparison, beside = evaluator.judge(candidate, lambda _, done: told.append(done), coded)
     assert told == sorted(told)
