@@ -97,9 +97,7 @@ def test_names_and_splits(around_ball):
     assert not is_virtual([])
     assert not is_virtual([dataclasses.replace(around_ball[0], name="photo")])
     assert describe(around_ball).startswith("128 virtual views and 16 to judge by, ")
-    few, again = place_cameras(BALL, 5, 64), place_cameras(BALL, 5, 64)
-    assert np.array_equal(camera_centres(few), camera_centres(again)), "the same every time"
-    assert all(np.array_equal(a.rotation, b.rotation) for a, b in zip(few, again, strict=True))
+    few = place_cameras(FEW, 5, 64)
     assert [c.split for c in few] == ["train"] * 5
     assert few[0].width == 64
     assert "judge" not in describe(few)
@@ -281,12 +279,13 @@ def test_the_basis_is_that_of_the_rasterizer():
 
 @pytest.mark.slow
 def test_encode_places_them_itself(monkeypatch):
+    """The same ones every time."""
     monkeypatch.setattr(
         "potr_cl.pipeline.encode.place_cameras", lambda scene, count, device: place_cameras(scene, 6, 64)
     )
     scene, options = random_scene(150, 2), EncodeOptions.for_preset("paper", prune={"iterations": 2})
     given = encode(scene, place_cameras(scene, 6, 64), options)
-    assert b"".join(encode(scene, None, options).pieces) == b"".join(given.pieces)
+    assert encode(scene, None, options).data == given.data
     assert given.pruned is not None
 
 

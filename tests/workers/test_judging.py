@@ -128,11 +128,11 @@ def test_a_candidate_of_the_host_is_judged_too(plush_excerpt, cameras, coded, fa
 @pytest.mark.one_family
 def test_views_of_the_same_name(plush_excerpt, cameras, coded, family):
     """As cameras made in Python may have it."""
-    alike = [dataclasses.replace(camera, name="view", split="test") for camera in cameras[:4]]
+    alike = [dataclasses.replace(camera, name="view", split="test") for camera in cameras[:3]]
     device, another = open_device(family), open_device(family)
     settings = {"background": BACKGROUND}
     expected = [potr_cl.compare(plush_excerpt, coded.data, [c], device=device, **settings).psnr for c in alike]
-    assert len(set(expected)) == 4
+    assert len(set(expected)) == 3
     for devices in (device, [device, another]):
         found = potr_cl.compare(plush_excerpt, coded.data, alike, device=devices, **settings)
         assert [view.figures["b_against_a"].psnr for view in found.figures.views] == expected
