@@ -7,9 +7,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from potr_cl.formats.images import to_8_bits, write_png
 from potr_cl.model.camera import Camera
+from potr_cl.model.lens import Lens
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
@@ -37,3 +39,12 @@ def photographs(
             with (folder / f"{camera.name}.png").open("wb") as file:
                 write_png(file, to_8_bits(picture))
     return folder
+
+
+def bent(picture: FloatArray, view: Camera, lens: Lens) -> NDArray[np.uint8]:
+    """The photograph that a lens makes of what a view shows, of the nearest pixels."""
+    columns, rows = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
+    x, y = lens.undistorted(((columns - lens.cx) / lens.fx).ravel(), ((rows - lens.cy) / lens.fy).ravel())[0]
+    columns = (x * view.fx + view.cx).astype(int).clip(0, view.width - 1)
+    rows = (y * view.fy + view.cy).astype(int).clip(0, view.height - 1)
+    return to_8_bits(picture[rows, columns].reshape(lens.height, lens.width, 3))

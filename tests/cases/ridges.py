@@ -15,12 +15,7 @@ from potr_cl.opencl.discovery import DeviceInfo
 from potr_cl.stages.compaction.ridge import CompactionOptions
 from potr_cl.stages.compaction.view_weights import ViewWeights
 from tests.devices import KERNELS, shared_device
-from tests.reference.ridge import (
-    YCOCG,
-    objective,
-    ridge,
-    weighted_basis,
-)
+from tests.reference.ridge import YCOCG, objective, ridge, weighted_basis
 
 #: Those of :data:`tests.devices.KERNELS`, and GPUs' where several work-items share a splat.
 COMPACTING = [*KERNELS, "gpu, a splat shared"]

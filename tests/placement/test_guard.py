@@ -32,28 +32,29 @@ _EACH = 4000
 
 def two_rooms() -> Scene:
     """One beside the other, 20 apart, with colours of degree 1."""
-    rng = np.random.default_rng(0)
-    rooms = box(_EACH, (3, 4, 1.5), 0.2), box(_EACH, (3, 4, 1.5), 0.2, seed=1)
-    rooms = rooms[0], dataclasses.replace(rooms[1], means=rooms[1].means + np.array([20, 0, 0], np.float32))
-    scene = together(*rooms)
-    return dataclasses.replace(scene, sh=rng.normal(0, 0.3, (len(scene), 4, 3)).astype(np.float32))
+    first, second = box(_EACH, (3, 4, 1.5), 0.2), box(_EACH, (3, 4, 1.5), 0.2, seed=1)
+    scene = together(first, dataclasses.replace(second, means=second.means + np.array([20, 0, 0], np.float32)))
+    sh = np.random.default_rng(0).normal(0, 0.3, (len(scene), 4, 3))
+    return dataclasses.replace(scene, sh=sh.astype(np.float32))
+
+
+SCENE = two_rooms()
 
 
 def in_the_first() -> list[Camera]:
     """Views of all the first room from its middle, in pairs."""
     sides = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
     corners = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
-    return [
-        resized(
-            looking(
-                np.array([0.0, 0.0, 0.05 * turn]), np.array(side, float), (0.1, 0.2, 1), f"{turn}{number}", wide=1.2
-            ),
-            90,
-            60,
-        )
-        for turn in range(2)
-        for number, side in enumerate((*sides, *corners))
-    ]
+    views = []
+    for turn in range(2):
+        for number, side in enumerate((*sides, *corners)):
+            centre = np.array([0.0, 0.0, 0.05 * turn])
+            view = looking(centre, np.array(side, float), (0.1, 0.2, 1), f"{turn}{number}", wide=1.2)
+            views.append(resized(view, 90, 60))
+    return views
+
+
+VIEWS = in_the_first()
 
 
 @pytest.fixture(scope="module")
@@ -62,45 +63,39 @@ def device():
     return Device()
 
 
-def test_the_room_that_nobody_looked_into_is_unresolved(device):
-    scene = two_rooms()
-    found = unresolved(device, scene, in_the_first())
+@pytest.fixture(scope="module")
+def found(device):
+    """What no view has resolved."""
+    return unresolved(device, SCENE, VIEWS)
+
+
+def test_the_room_that_nobody_looked_into_is_unresolved(found):
     assert found[_EACH:].all()
     assert np.mean(found[:_EACH]) < 0.3, "but what is between the pictures"
 
 
-def options(unseen: str, prune_count: int | None = None) -> EncodeOptions:
-    prune = {"iterations": 4, "unseen": unseen, "count": prune_count}
-    return EncodeOptions.for_preset("best", prune=prune, between={"views": 0})
-
-
-def kept(device: Device, unseen: str, **changes) -> State:
-    chosen = options(unseen, **changes)
-    names = [type(stage) for stage in chosen.stages if not isinstance(stage, Code)]
-    run = Run(dataclasses.replace(chosen, q=0.1), Stopwatch(), device)
-    return run.stages(State.of(two_rooms(), in_the_first()), names)
+def kept(device: Device, preset: str = "best", **prune) -> State:
+    options = EncodeOptions.for_preset(preset, prune={"iterations": 4} | prune, between={"views": 0})
+    names = [type(stage) for stage in options.stages if not isinstance(stage, Code)]
+    return Run(dataclasses.replace(options, q=0.1), Stopwatch(), device).stages(State.of(SCENE, VIEWS), names)
 
 
 @pytest.mark.parametrize("preset", ["best", pytest.param("paper", marks=pytest.mark.slow)])
-def test_no_stage_touches_what_no_view_resolved(device, preset):
-    scene = two_rooms()
-    found = unresolved(device, scene, in_the_first())
-    chosen = EncodeOptions.for_preset(preset, prune={"iterations": 4, "unseen": "protect", "delta_mse_max": 1e-5})
-    names = [type(stage) for stage in chosen.stages if not isinstance(stage, Code)]
-    state = Run(dataclasses.replace(chosen, q=0.1), Stopwatch(), device).stages(State.of(scene, in_the_first()), names)
+def test_no_stage_touches_what_no_view_resolved(device, found, preset):
+    state = kept(device, preset, unseen="protect", delta_mse_max=1e-5)
     assert np.isin(np.flatnonzero(found), state.survivors).all()
     rows = np.flatnonzero(found[state.survivors])
     for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
-        assert np.array_equal(getattr(state.scene, name)[rows], getattr(scene, name)[found]), name
-    assert len(state.survivors) < len(scene), "others go"
+        assert np.array_equal(getattr(state.scene, name)[rows], getattr(SCENE, name)[found]), name
+    assert len(state.survivors) < len(SCENE), "others go"
     assert state.results.unresolved.splats == state.results.unseen.splats == np.count_nonzero(found)
 
 
 @pytest.mark.slow
 def test_without_the_guard_they_are_lost(device):
-    dropped = kept(device, "drop")
+    dropped = kept(device, unseen="drop")
     assert np.count_nonzero(dropped.survivors >= _EACH) < 50
-    plain = kept(device, "keep")
+    plain = kept(device, unseen="keep")
     assert plain.results.unresolved is None, "given cameras say where people look"
     assert np.count_nonzero(plain.survivors >= _EACH) < _EACH / 2
 
@@ -116,26 +111,25 @@ def test_small_units_do_not_keep_everything(device):
 
 def test_fewer_splats_than_must_stay_are_refused(device):
     with pytest.raises(UsageError, match="that no view shows from near enough: keep more"):
-        kept(device, "protect", prune_count=100)
+        kept(device, unseen="protect", count=100)
 
 
 @pytest.mark.slow
 def test_a_file_holds_what_was_kept(device):
-    encoded = encode(two_rooms(), in_the_first(), dataclasses.replace(options("protect"), q=0.5), device=device)
-    assert np.count_nonzero(encoded.order >= _EACH) == _EACH
-    back = encoded.scene
-    found, wanted = back.sh[encoded.order >= _EACH], two_rooms().sh[encoded.order[encoded.order >= _EACH]]
-    assert np.sqrt(np.mean((found - wanted) ** 2)) < 0.1
+    options = EncodeOptions.for_preset("best", q=0.5, prune={"iterations": 4, "unseen": "protect"}, between=False)
+    encoded = encode(SCENE, VIEWS, options, device=device)
+    second = encoded.order >= _EACH
+    assert np.count_nonzero(second) == _EACH
+    assert np.sqrt(np.mean((encoded.scene.sh[second] - SCENE.sh[encoded.order[second]]) ** 2)) < 0.1
     assert "from near enough to judge them: kept as they are" in str(encoded.unseen)
 
 
 @pytest.mark.parametrize("count", [None, _EACH + 500])
 def test_spared_splats_stay_whoever_decides(device, count):
-    scene = two_rooms()
-    spared = np.arange(len(scene)) % 3 == 0
-    with Rasterizer(device, scene) as rasterizer, RemovalSweep(rasterizer, in_the_first()) as removal:
-        schedule = PruningOptions(1e-3, 4, count=count)
-        left = prune_scene(removal, schedule, spared=spared).survivors
+    spared = np.arange(len(SCENE)) % 3 == 0
+    with Rasterizer(device, SCENE) as rasterizer, RemovalSweep(rasterizer, VIEWS) as removal:
+        left = prune_scene(removal, PruningOptions(1e-3, 4, count=count), spared=spared).survivors
     assert np.isin(np.flatnonzero(spared), left).all()
-    assert len(left) == (np.count_nonzero(spared) if count is None else count) or count is None
-    assert len(left) < len(scene)
+    assert len(left) < len(SCENE)
+    if count is not None:
+        assert len(left) == count

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.spherical_harmonics import energy, unit_coefficients
+from potr_cl.opencl.device import Device
 from potr_cl.placement.candidates import ViewMemory
 from potr_cl.placement.rays import resolved_by, shown_from
 from potr_cl.placement.space import Space, _distances
@@ -41,13 +42,17 @@ def walked(space: Space, start: np.ndarray, direction: np.ndarray, length: float
     return float(ways[met[0]]) if len(met) else length
 
 
+def inside_the_room() -> np.ndarray:
+    """Places where nothing is."""
+    inside = np.random.default_rng(0).uniform(-1, 1, (2000, 3)) * (2.5, 3.5, 1.0)
+    return inside[np.linalg.norm(inside, axis=1) > 1]
+
+
 def test_walls_are_matter_and_rooms_are_free(space):
     rng = np.random.default_rng(0)
     walls = ROOM.means[rng.integers(0, 9000, 2000)]
     assert np.mean(space.free(walls) == 0) > 0.95
-    inside = rng.uniform(-1, 1, (2000, 3)) * (2.5, 3.5, 1.0)
-    inside = inside[np.linalg.norm(inside, axis=1) > 1]
-    assert np.mean(space.free(inside) > 0) == 1
+    assert (space.free(inside_the_room()) > 0).all()
     assert (space.free(np.array([[100.0, 0, 0], [0, 0, -50]])) > 4).all()
 
 
@@ -84,10 +89,7 @@ def test_sizes_are_those_of_splats_nearby(space):
 def test_haze_and_backdrops_are_no_matter():
     haze = dataclasses.replace(sphere(3000, 2.5, 0.05, 3), opacity_logits=np.full(3000, -2.0, np.float32))
     backdrop = flat_splats([[0, 0, 0.9]], [[0.0, 0, 1]], 40, -1.0)
-    space = Space.of(together(ROOM, haze, backdrop))
-    rng = np.random.default_rng(0)
-    inside = rng.uniform(-1, 1, (2000, 3)) * (2.5, 3.5, 1.0)
-    assert np.mean(space.free(inside[np.linalg.norm(inside, axis=1) > 1]) > 0) > 0.97
+    assert np.mean(Space.of(together(ROOM, haze, backdrop)).free(inside_the_room()) > 0) > 0.97
 
 
 def terrain(splats: int, height: float, overlap: float):
@@ -99,7 +101,7 @@ def terrain(splats: int, height: float, overlap: float):
     return flat_splats(points, np.tile([0.0, 0, 1], (splats, 1)), size)
 
 
-@pytest.mark.parametrize(("splats", "height", "overlap"), [(100_000, 5, 5), (50_000, 5, 8), (20_000, 1, 5)])
+@pytest.mark.parametrize(("splats", "height", "overlap"), [(50_000, 5, 8), (20_000, 1, 5)])
 def test_wide_ground_is_matter(splats, height, overlap):
     ground = terrain(splats, height, overlap)
     space = Space.of(ground)
@@ -190,7 +192,7 @@ def test_energies_are_those_of_numpy(device, degree):
     assert np.allclose(memory.of_places(places, shown), means / np.quantile(means, 0.95), rtol=2e-3)
 
 
-@pytest.mark.parametrize("degree", [0, 1])
-def test_smooth_colours_remember_nothing(device, degree):
-    scene = random_scene(150, degree)
-    assert ViewMemory.of(device, Space.of(scene), scene.means.astype(np.float64), scene.sh, np.ones((3, 3))) is None
+def test_smooth_colours_remember_nothing(space):
+    for degree in (0, 1):
+        scene, places = random_scene(150, degree), np.ones((3, 3))
+        assert ViewMemory.of(Device(), space, scene.means.astype(np.float64), scene.sh, places) is None

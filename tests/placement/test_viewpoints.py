@@ -35,9 +35,9 @@ def rotated(scene: Scene, rotation: np.ndarray) -> Scene:
     )
 
 
-def house(seed: int = 0) -> Scene:
+def house() -> Scene:
     """A floor in the plane z = 0 and a small cube on it; of SH degree 0."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     floor = np.column_stack([rng.uniform(-3, 3, (4000, 2)), np.zeros(4000)])
     ground = flat_splats(floor, np.tile([0.0, 0.0, 1.0], (4000, 1)), 0.05)
     sides = []
@@ -51,6 +51,9 @@ def house(seed: int = 0) -> Scene:
     return together(ground, *sides)
 
 
+HOUSE = house()
+
+
 def tilt(degrees: float) -> np.ndarray:
     turn = math.radians(degrees)
     return np.array([[1, 0, 0], [0, math.cos(turn), -math.sin(turn)], [0, math.sin(turn), math.cos(turn)]])
@@ -61,26 +64,24 @@ def angle(a, b) -> float:
 
 
 def test_ground_tells_which_way_is_up():
-    scene = house()
-    assert np.array_equal(guess_up(scene, place_cameras(scene, 16)), (0, 0, 1))
+    assert np.array_equal(guess_up(HOUSE, place_cameras(HOUSE, 16)), (0, 0, 1))
 
 
 @pytest.mark.slow
 def test_a_scene_that_stands_askew_is_held_level():
     """As those of COLMAP do: no axis is up."""
     rotation = tilt(20)
-    scene = rotated(house(), rotation)
+    scene = rotated(HOUSE, rotation)
     up = guess_up(scene, place_cameras(scene, 16))
     assert angle(up, rotation @ (0, 0, 1)) < 3
     # The nearest axis would be wrong by the 20 degrees.
     assert angle(up, (0, 0, 1)) > 15
 
 
-@pytest.mark.parametrize("views", [look_around, turntable])
-@pytest.mark.parametrize("up", [AXES["-y"], (1.0, 2.0, -0.5)])
+@pytest.mark.parametrize(("views", "up"), [(look_around, (1.0, 2.0, -0.5)), (turntable, AXES["-y"])])
 def test_views_are_level(views, up):
     direction = np.array(up) / np.linalg.norm(up)
-    for camera in views(house(), 5, 64, up):
+    for camera in views(HOUSE, 5, 64, up):
         assert abs(camera.rotation[0] @ direction) < 1e-9 or abs(camera.rotation[2] @ direction) > 0.999
         assert -camera.rotation[1] @ direction > 0, "upside down"
         assert np.allclose(camera.rotation @ camera.rotation.T, np.eye(3))
@@ -89,14 +90,14 @@ def test_views_are_level(views, up):
 
 @pytest.mark.slow
 def test_a_view_has_one_name_and_one_way_up_whoever_places_it():
-    scene = rotated(house(), tilt(90))
-    judging, placed = judging_views(scene), place_cameras(scene, 160)
+    scene = rotated(HOUSE, tilt(90))
+    judging, placed = judging_views(scene), place_cameras(scene, 40)
     for cameras in (look_around(scene, 8, judging[0].width), judging, test_views(placed)):
         assert [c.name for c in cameras] == [f"virtual_test_{k:03d}" for k in range(len(cameras))]
         for camera, other in zip(cameras, judging, strict=False):
             assert np.array_equal(camera.rotation, other.rotation)
             assert np.array_equal(camera.translation, other.translation)
-    assert [c.name for c in train_views(placed)] == [f"virtual_{k:03d}" for k in range(160)]
+    assert [c.name for c in train_views(placed)] == [f"virtual_{k:03d}" for k in range(40)]
     assert {c.split for c in judging} == {"test"}
     for camera in placed:
         assert -camera.rotation[1] @ tilt(90) @ (0, 0, 1) > 0, "upside down"
@@ -104,8 +105,7 @@ def test_a_view_has_one_name_and_one_way_up_whoever_places_it():
 
 @pytest.mark.slow
 def test_another_way_up_moves_no_camera():
-    scene = house()
-    level, askew = (look_around(scene, 8, 64, up) for up in (None, (1, 0, 0)))
+    level, askew = (look_around(HOUSE, 8, 64, up) for up in (None, (1, 0, 0)))
     assert np.allclose(camera_centres(level), camera_centres(askew))
     assert np.allclose([c.rotation[2] for c in level], [c.rotation[2] for c in askew])
 
@@ -119,7 +119,7 @@ def seen(scene: Scene, camera) -> float:
 
 @pytest.mark.slow
 def test_a_turntable_turns_evenly_around_the_scene():
-    scene, scale = house(), 1000.0
+    scene, scale = HOUSE, 1000.0
     larger = dataclasses.replace(
         scene,
         means=scene.means * np.float32(scale) + np.array([5, -7, 3], np.float32) * np.float32(scale),
@@ -148,11 +148,11 @@ def test_one_splat_can_be_looked_at():
 def test_what_is_no_direction(up):
     for make in (lambda s: look_around(s, 1, 32, up), lambda s: turntable(s, 1, 32, up)):
         with pytest.raises(UsageError, match="the direction that is up"):
-            make(house())
+            make(HOUSE)
 
 
 @pytest.mark.parametrize(("count", "size"), [(0, 32), (10**6, 32), (1, 0), (1, 10**6)])
 def test_how_many_and_how_large(count, size):
     for make in (look_around, turntable):
         with pytest.raises(UsageError, match="must lie between"):
-            make(house(), count, size)
+            make(HOUSE, count, size)

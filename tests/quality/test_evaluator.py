@@ -33,35 +33,20 @@ def evaluator():
 
 
 def test_test_views_judge_where_there_are_any():
+    """And a few training views stand beside them."""
     views = EvaluationViews.of(CAMERAS)
     assert (views.kind, [view.name for view in views.views]) == ("test", ["view_0", "view_4"])
     assert str(views) == "2 held-out test views"
-
-
-def test_a_few_training_views_stand_beside_test_views():
-    assert [view.name for view in EvaluationViews.of(CAMERAS).beside] == ["view_1", "view_3", "view_5", "view_7"]
+    assert [view.name for view in views.beside] == ["view_1", "view_3", "view_5", "view_7"]
     assert len(EvaluationViews.of(ring_of_cameras(400)).beside) == 12
-    assert len(EvaluationViews.of(ring_of_cameras(4000)).beside) == 16
-    assert EvaluationViews.of(only_training(5)).beside == ()
-
-
-def test_views_may_all_be_held_out():
+    assert len(EvaluationViews.of(ring_of_cameras(1000)).beside) == 16
     held_out = [dataclasses.replace(camera, split="test") for camera in CAMERAS]
     assert (EvaluationViews.of(held_out).views, EvaluationViews.of(held_out).beside) == (held_out, ())
 
 
-def test_views_beside_are_judged_by_themselves(evaluator):
-    expected = [
-        psnr(render(WORSE, camera, background=(0.2, 0, 0))[0], render(SCENE, camera, background=(0.2, 0, 0))[0])
-        for camera in evaluator.views.beside
-    ]
-    assert evaluator.judge(WORSE, lambda _stage, part: None)[1] == pytest.approx(np.mean(expected), abs=1e-3)
-    assert evaluator.judge(SCENE, lambda _stage, part: None)[1] == math.inf
-
-
 def test_training_views_stand_in_and_that_is_said():
     views = EvaluationViews.of(only_training(5))
-    assert (views.kind, len(views.views)) == ("train", 5)
+    assert (views.kind, len(views.views), views.beside) == ("train", 5, ())
     assert str(views) == "all 5 training views, for the cameras name no test views"
     views = EvaluationViews.of(only_training(100))
     assert (views.kind, len(views.views), views.available) == ("train", 32, 100)
@@ -76,17 +61,22 @@ def test_no_view_at_all():
 
 
 def test_figures_are_those_of_the_pictures(evaluator):
-    expected = [
-        psnr(render(WORSE, camera, background=(0.2, 0, 0))[0], render(SCENE, camera, background=(0.2, 0, 0))[0])
-        for camera in (CAMERAS[0], CAMERAS[4])
-    ]
-    assert evaluator.psnr(WORSE) == pytest.approx(np.mean(expected), abs=2e-6)
-    assert evaluator.psnr(WORSE, most=1) == pytest.approx(expected[0], abs=2e-6)
+    """Of test views, and of views beside, which are judged by themselves."""
+
+    def expected(cameras):
+        shown = ([render(scene, c, background=(0.2, 0, 0))[0] for scene in (WORSE, SCENE)] for c in cameras)
+        return [psnr(*pair) for pair in shown]
+
+    tests = expected([CAMERAS[0], CAMERAS[4]])
+    assert evaluator.psnr(WORSE) == pytest.approx(np.mean(tests), abs=2e-6)
+    assert evaluator.psnr(WORSE, most=1) == pytest.approx(tests[0], abs=2e-6)
     assert evaluator.psnr(SCENE) == math.inf
     done = []
-    comparison, _ = evaluator.judge(WORSE, lambda _stage, part: done.append(part))
-    assert [view.figures["b_against_a"].psnr for view in comparison.views] == pytest.approx(expected, abs=2e-6)
+    comparison, beside = evaluator.judge(WORSE, lambda _stage, part: done.append(part))
+    assert [view.figures["b_against_a"].psnr for view in comparison.views] == pytest.approx(tests, abs=2e-6)
+    assert beside == pytest.approx(np.mean(expected(evaluator.views.beside)), abs=1e-3)
     assert done[-1] == 1
+    assert evaluator.judge(SCENE, lambda _stage, part: None)[1] == math.inf
 
 
 def test_pictures_that_are_not_kept_are_the_same(evaluator, monkeypatch):

@@ -19,15 +19,13 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import check_frame
 from potr_cl.quality.evidence import by_photographs, by_points, evidence_of
 from potr_cl.raster.rasterizer import Rasterizer
+from tests.cases.photographs import bent
 from tests.reference.captures import CAPTURES
 from tests.reference.frames import ORDINARY, PHOTOGRAPHS, changed, moved, parts
 
 PHOTOGRAPHED = (0, 11, 23, 35)
 #: Of each kind of motion the smallest ones, which are the hardest to find.
-LEAST = [
-    *("scaled by 0.7", "scaled by 1.5", "shifted by 1 along x", "turned by 10 degrees about z"),
-    "turned by 20 degrees about y",
-]
+LEAST = ("scaled by 0.7", "scaled by 1.5", "shifted by 1 along x", "turned by 10 degrees about z")
 
 
 @pytest.fixture(scope="module")
@@ -75,22 +73,14 @@ def test_photographs_that_cannot_be_read_or_have_another_shape_say_nothing(build
 
 def test_photographs_are_straightened_before_they_are_compared(building, tmp_path):
     scene, views = building
-    bent = Lens(160, 120, views[0].fx, views[0].fy, 80, 60, radial=(-0.25,))
-    covering, _ = bent.covering()
-    x, y = bent.undistorted(
-        (np.arange(160) + 0.5 - 80) / bent.fx * np.ones((120, 1)),
-        ((np.arange(120) + 0.5 - 60) / bent.fy)[:, None] * np.ones(160),
-    )[0]
+    lens = Lens(160, 120, views[0].fx, views[0].fy, 80, 60, radial=(-0.25,))
     cameras = []
     with Rasterizer(Device(), scene) as rasterizer:
         for view in views:
-            wide = dataclasses.replace(view, **covering._asdict(), image_path=None)
-            image = rasterizer.render(wide)[0]
-            columns = np.clip((x * wide.fx + wide.cx).astype(int), 0, wide.width - 1)
-            rows = np.clip((y * wide.fy + wide.cy).astype(int), 0, wide.height - 1)
+            wide = dataclasses.replace(view, **lens.covering()[0]._asdict(), image_path=None)
             path = tmp_path / f"{view.name}.png"
-            Image.fromarray(to_8_bits(image[rows, columns])).save(path)
-            cameras.append(dataclasses.replace(wide, lens=bent, image_path=path))
+            Image.fromarray(bent(rasterizer.render(wide)[0], wide, lens)).save(path)
+            cameras.append(dataclasses.replace(wide, lens=lens, image_path=path))
     assert evidence_of(scene, cameras).agrees is True
 
 

@@ -28,19 +28,15 @@ def ssim_by_definition(a, b):
     window = np.exp(-(offsets[:, None] ** 2 + offsets[None, :] ** 2) / (2 * 1.5**2))
     window /= window.sum()
     c1, c2 = 0.01**2, 0.03**2
-    values = []
-    for channel in range(3):
-        x, y = a[..., channel].astype(np.float64), b[..., channel].astype(np.float64)
-        mean_x, mean_y, xx, yy, xy = (
-            correlate(v, window, mode="constant", cval=0) for v in (x, y, x * x, y * y, x * y)
-        )
-        variance_x, variance_y, covariance = xx - mean_x**2, yy - mean_y**2, xy - mean_x * mean_y
-        values.append(
-            (2 * mean_x * mean_y + c1)
-            * (2 * covariance + c2)
-            / ((mean_x**2 + mean_y**2 + c1) * (variance_x + variance_y + c2))
-        )
-    return np.mean(values)
+
+    def mean(values):
+        return np.stack([correlate(values[..., c], window, mode="constant", cval=0) for c in range(3)], axis=-1)
+
+    x, y = a.astype(np.float64), b.astype(np.float64)
+    mean_x, mean_y = mean(x), mean(y)
+    variance_x, variance_y, covariance = mean(x * x) - mean_x**2, mean(y * y) - mean_y**2, mean(x * y) - mean_x * mean_y
+    above = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
+    return np.mean(above / ((mean_x**2 + mean_y**2 + c1) * (variance_x + variance_y + c2)))
 
 
 def pictures(height, width, seed, noise=0.1):
@@ -49,17 +45,11 @@ def pictures(height, width, seed, noise=0.1):
     return a, np.clip(a + noise * rng.normal(size=a.shape), 0, 1)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(st.integers(1, 80), st.integers(1, 40), st.integers(0, 2**32 - 1), st.floats(0, 1))
 def test_ssim_is_its_definition(height, width, seed, noise):
     a, b = pictures(height, width, seed, noise)
     assert ssim(a, b) == pytest.approx(ssim_by_definition(a, b), abs=1e-10)
-
-
-def test_ssim_of_flat_pictures():
-    black, white = np.zeros((20, 20, 3)), np.ones((20, 20, 3))
-    assert ssim(black, black) == 1
-    assert ssim(black, white) == pytest.approx(ssim_by_definition(black, white), abs=1e-10)
 
 
 def test_psnr_is_its_definition():
@@ -69,10 +59,12 @@ def test_psnr_is_its_definition():
     assert psnr(half, half + 0.1) == pytest.approx(20, abs=1e-9)
 
 
-def test_identical_pictures():
+def test_identical_and_opposite_pictures():
     a, _ = pictures(12, 12, 1)
+    black, white = np.zeros((20, 20, 3)), np.ones((20, 20, 3))
     assert psnr(a, a) == math.inf
-    assert ssim(a, a) == 1
+    assert ssim(a, a) == ssim(black, black) == 1
+    assert ssim(black, white) == pytest.approx(ssim_by_definition(black, white), abs=1e-10)
 
 
 def test_colours_are_clamped_but_not_rounded():
@@ -134,7 +126,7 @@ def test_recorded_figures_of_another_renderer_and_other_metrics(name, request):
     recorded = json.loads((folder / "reference" / "metrics.json").read_text())["per_view"]
     cameras = {camera.name: camera for camera in load_cameras(folder / "cameras.json")}
     rasterizer = Rasterizer(Device(), load_scene(folder / "point_cloud.ply"), GSPLAT)
-    for view in recorded[:: max(len(recorded) // 12, 1)]:
+    for view in recorded[:: max(len(recorded) // 6, 1)]:
         camera = cameras[view["img_name"]]
         image, _ = rasterizer.render(camera)
         photograph = read_ground_truth(camera.image_path)

@@ -16,3 +16,11 @@ def device(request: pytest.FixtureRequest) -> Iterator[Device]:
     device = open_device(request.param)
     yield device
     assert device.allocated == 0, "a rasterizer did not give all its memory back"
+
+
+@pytest.fixture(scope="module", params=[kernels for kernels in KERNELS if "gpu" in str(kernels)])
+def gpu(request: pytest.FixtureRequest) -> Iterator[Device]:
+    """The same with GPUs' kernels alone, which take several views at a time."""
+    device = open_device(request.param)
+    yield device
+    assert device.allocated == 0, "a rasterizer did not give all its memory back"

@@ -8,38 +8,21 @@ import numpy as np
 import pytest
 
 from potr_cl.errors import DataError
-from potr_cl.model.camera import Camera
-from potr_cl.model.scene import LOW_PASS, MIP_SPLATTING_LOW_PASS, Scene
+from potr_cl.model.scene import LOW_PASS, MIP_SPLATTING_LOW_PASS
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer, render
 from potr_cl.raster.rules import GSPLAT, INRIA, LEAST_COMPENSATION, RasterRules
 from tests.cases.scenes import antialiased
-from tests.reference import raster as reference
+from tests.raster.test_rasterizer import check, definition
 from tests.reference.scenes import plain_splats, random_splats, tilted_camera
 from tests.reference.scenes import straight_camera as camera
 
-#: A pixel whose every alpha and transmittance stays this far, relatively, from 1/255 and 1e-4 cannot flip.
-CLEAR = 1e-4
 
-
-def check(device: Device, scene: Scene, view: Camera, rules: RasterRules) -> reference.Composite:
-    """Render and compare with the definition wherever no threshold is near."""
-    image, transmittance = render(scene, view, device, rules)
-    wanted = reference.render(scene, view, rules)
-    error = np.maximum(np.abs(image - wanted.image).max(axis=2), np.abs(transmittance - wanted.transmittance))
-    clear = wanted.margin > CLEAR
-    assert clear.mean() > 0.9
-    assert error[clear].max() <= 2e-5
-    assert (error > 2e-5).mean() < 0.005
-    return wanted
-
-
-@pytest.mark.parametrize("rules", [INRIA, GSPLAT], ids=["inria", "gsplat"])
-@pytest.mark.parametrize("low_pass", [LOW_PASS, MIP_SPLATTING_LOW_PASS])
+@pytest.mark.parametrize(("rules", "low_pass"), [(INRIA, MIP_SPLATTING_LOW_PASS), (GSPLAT, LOW_PASS)])
 def test_against_definition(device: Device, rules: RasterRules, low_pass: float) -> None:
     scene, view = antialiased(random_splats(400, 2, seed=2), low_pass), tilted_camera(2, 83, 61)
     wanted = check(device, scene, view, rules)
-    classic = reference.render(scene.rendered(False), view, rules)
+    classic = definition(scene.rendered(False), view, rules)
     assert np.abs(wanted.image - classic.image).max() > 0.2  # to render it as a classic one is no small mistake
 
 

@@ -9,29 +9,21 @@ import pytest
 
 from potr_cl.raster import launcher, preparing_memory
 from potr_cl.raster.rasterizer import Rasterizer
-from tests.devices import KERNELS, open_device
 from tests.reference.scenes import ring_of_cameras, visible_scene
 
 
-@pytest.fixture(scope="module", params=[kernels for kernels in KERNELS if "gpu" in str(kernels)])
-def device(request):
-    device = open_device(request.param)
-    yield device
-    assert device.allocated == 0
-
-
-def lists_of(device, scene, cameras):
-    with Rasterizer(device, scene) as rasterizer, rasterizer.prepare_set(cameras) as views:
-        return device.download(views.intersections, (views.capacity,), np.uint32), views.found_offsets
+def lists_of(gpu, scene, cameras):
+    with Rasterizer(gpu, scene) as rasterizer, rasterizer.prepare_set(cameras) as views:
+        return gpu.download(views.intersections, (views.capacity,), np.uint32), views.found_offsets
 
 
 @pytest.mark.parametrize(("count", "longest"), [(2500, 16), (2500, 700), (9000, 700), (9000, 2048)])
-def test_the_same_order(device, monkeypatch, count, longest):
+def test_the_same_order(gpu, monkeypatch, count, longest):
     """Of lists of any length: shorter than a piece, some pieces, and some that stay as they were."""
     scene = visible_scene(count, 0)
     scene = dataclasses.replace(scene, log_scales=scene.log_scales - 1)
     cameras = ring_of_cameras(3, size=40)
-    wanted, offsets = lists_of(device, scene, cameras)
+    wanted, offsets = lists_of(gpu, scene, cameras)
     lengths = np.concatenate([np.diff(each.astype(np.int64)) for each in offsets])
     assert lengths.max() > longest
     sorted_apart = []
@@ -44,23 +36,23 @@ def test_the_same_order(device, monkeypatch, count, longest):
     monkeypatch.setattr("potr_cl.raster.preparing_memory.LongLists", Noting)
     monkeypatch.setattr(preparing_memory, "LONGEST", longest)
     monkeypatch.setattr(launcher, "LONGEST", longest)
-    got, _ = lists_of(device, scene, cameras)
+    got, _ = lists_of(gpu, scene, cameras)
     assert sorted_apart
     assert np.array_equal(got, wanted)
     monkeypatch.setattr(preparing_memory, "PIECE", 64)
-    got, _ = lists_of(device, scene, cameras)
+    got, _ = lists_of(gpu, scene, cameras)
     assert np.array_equal(got, wanted)
 
 
-def test_without_room_the_same_order(device, monkeypatch):
+def test_without_room_the_same_order(gpu, monkeypatch):
     """Long lists are sorted as others are then: a view that the device has room for is prepared."""
     scene, cameras = visible_scene(2500, 0), ring_of_cameras(3, size=40)
-    wanted, _ = lists_of(device, scene, cameras)
+    wanted, _ = lists_of(gpu, scene, cameras)
 
     class WithoutRoom(preparing_memory.LongLists):
         def find(self, views: object) -> bool:
             with monkeypatch.context() as full:
-                full.setattr(device, "info", dataclasses.replace(device.info, memory=device.allocated))
+                full.setattr(gpu, "info", dataclasses.replace(gpu.info, memory=gpu.allocated))
                 found = super().find(views)  # type: ignore[arg-type]
             asked.append(found)
             return found
@@ -69,12 +61,12 @@ def test_without_room_the_same_order(device, monkeypatch):
     monkeypatch.setattr("potr_cl.raster.preparing_memory.LongLists", WithoutRoom)
     monkeypatch.setattr(preparing_memory, "LONGEST", 16)
     monkeypatch.setattr(launcher, "LONGEST", 16)
-    got, _ = lists_of(device, scene, cameras)
+    got, _ = lists_of(gpu, scene, cameras)
     assert asked == [False]
     assert np.array_equal(got, wanted)
 
 
-def test_lists_as_others(device, monkeypatch):
+def test_lists_as_others(gpu, monkeypatch):
     """None is long: nothing is sorted apart."""
     monkeypatch.setattr(preparing_memory.LongLists, "enqueue", lambda *args: pytest.fail("there is no long list"))
-    lists_of(device, visible_scene(500, 0), ring_of_cameras(2, size=40))
+    lists_of(gpu, visible_scene(500, 0), ring_of_cameras(2, size=40))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tracemalloc
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -13,24 +12,25 @@ from potr_cl.codec.quantize import HyperParameters
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.raster import resident, scene_buffers
+from potr_cl.raster import resident
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.resident import ResidentScene, ResidentSubset, scene_on
 from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.workers.host import HostPool
-from tests.devices import FAMILIES, open_device
 from tests.reference.scenes import random_splats, straight_camera
 
-OPTIONS = EncodeOptions.for_preset("best", prune={"iterations": 8}, compact={"on": True})
+pytestmark = pytest.mark.one_runtime
+OPTIONS = EncodeOptions.for_preset("best", prune={"iterations": 2}, refit={"steps": 1}, compact={"on": True})
 
 
-@pytest.fixture(scope="module", params=FAMILIES)
-def device(request: pytest.FixtureRequest) -> Iterator[Device]:
-    device = open_device(request.param)
-    yield device
-    assert device.allocated == 0
+@pytest.fixture
+def uploads(monkeypatch):
+    """The colours that have gone to a device."""
+    found, write_sh = [], SceneBuffers.write_sh
+    monkeypatch.setattr(SceneBuffers, "write_sh", lambda self, to, sh: found.append(sh) or write_sh(self, to, sh))
+    return found
 
 
 def test_only_the_scene_itself_is_on_its_device(device):
@@ -80,28 +80,6 @@ def test_other_colours_leave_the_kept_ones_alone(device):
             assert np.array_equal(rasterizer.render(camera)[0], before)
 
 
-@pytest.mark.slow
-@pytest.mark.one_family
-def test_an_encode_uploads_its_scene_once_and_makes_the_same_bytes(
-    device, plush_excerpt, plush_excerpt_cameras, monkeypatch
-):
-    scenes = []
-    real = scene_buffers.SceneBuffers.write_sh
-
-    def counted(self, parameter, sh):
-        scenes.append(sh is plush_excerpt.sh)
-        real(self, parameter, sh)
-
-    monkeypatch.setattr(scene_buffers.SceneBuffers, "write_sh", counted)
-    once = encode(plush_excerpt, plush_excerpt_cameras, OPTIONS, device=device).data
-    assert sum(scenes) == 1
-    monkeypatch.setattr(resident, "_PART", 1 << 40)
-    scenes.clear()
-    assert encode(plush_excerpt, plush_excerpt_cameras, OPTIONS, device=device).data == once
-    assert sum(scenes) > 1
-    assert device.allocated == 0
-
-
 def test_other_devices_keep_it_too(device):
     scene, camera = random_splats(300, seed=5), straight_camera()
     other = Device(device.info, family=device.family)
@@ -122,20 +100,15 @@ def test_other_devices_keep_it_too(device):
 
 
 @pytest.mark.one_family
-def test_several_devices_are_given_it_once_each(device, plush_excerpt, plush_excerpt_cameras, monkeypatch):
-    scenes = []
-    real = scene_buffers.SceneBuffers.write_sh
-
-    def counted(self, parameter, sh):
-        scenes.append(sh is plush_excerpt.sh)
-        real(self, parameter, sh)
-
-    monkeypatch.setattr(scene_buffers.SceneBuffers, "write_sh", counted)
-    devices = [device, Device(device.info, family=device.family)]
+@pytest.mark.parametrize("count", [1, 2])
+def test_an_encode_uploads_its_scene_once(device, plush_excerpt, plush_excerpt_cameras, uploads, count):
+    """A second device has it from the first."""
+    devices = [device, Device(device.info, family=device.family)][:count]
     with HostPool(devices) as pool:
+        pool = pool if count > 1 else None
         encode(plush_excerpt, plush_excerpt_cameras[:6], OPTIONS, device=device, pool=pool)
-    assert sum(scenes) == 1  # the second device has it from the first
-    assert devices[1].allocated == 0
+    assert sum(sh is plush_excerpt.sh for sh in uploads) == 1
+    assert [each.allocated for each in devices] == [0] * count
 
 
 def test_a_part_of_what_is_kept_is_taken_on_the_device(device):
@@ -153,32 +126,25 @@ def test_a_part_of_what_is_kept_is_taken_on_the_device(device):
 
 
 def test_without_what_no_view_sees_the_scene_is_still_uploaded_once(
-    device, plush_excerpt, plush_excerpt_cameras, monkeypatch
+    device, plush_excerpt, plush_excerpt_cameras, monkeypatch, uploads
 ):
     """Splats behind all cameras are set aside, and the others taken from what is kept."""
     means = plush_excerpt.means.copy()
     means[::10] += 1e4
     scene, cameras = replace(plush_excerpt, means=means), plush_excerpt_cameras[:6]
     options = OPTIONS.changed(refit=False, compact=False)
-    splats = []
-    real = scene_buffers.SceneBuffers.write_sh
-
-    def counted(self, parameter, sh):
-        splats.append(len(sh))
-        real(self, parameter, sh)
-
-    monkeypatch.setattr(scene_buffers.SceneBuffers, "write_sh", counted)
     found = encode(scene, cameras, options, device=device)
     assert found.unseen is not None
     assert found.unseen.splats > 0
-    assert splats == [len(scene)]
+    assert [len(sh) for sh in uploads] == [len(scene)]
     monkeypatch.setattr(resident, "_PART", 1 << 40)
     assert encode(scene, cameras, options, device=device).data == found.data
+    assert [len(sh) for sh in uploads[1:]] == [len(scene) - found.unseen.splats]
 
 
 def test_pruning_copies_no_more_of_a_scene_than_is_left(device):
     """Splats that no view sees stay where they are, and those that are seen are gathered on the device."""
-    scene = random_splats(60_000, degree=3, seed=9)
+    scene = random_splats(30_000, degree=3, seed=9)
     scene.means[:] = scene.means * np.float32(0.1) + np.float32((0, 0, 4))
     scene.log_scales[:] -= 4
     scene.means[::20, 2] = -50  # behind the camera
@@ -193,10 +159,10 @@ def test_pruning_copies_no_more_of_a_scene_than_is_left(device):
             _, most = tracemalloc.get_traced_memory()
         finally:
             tracemalloc.stop()
-    assert left.results.unseen.splats == 3000
-    assert not left.scene.sh[np.isin(left.survivors, np.arange(0, 60_000, 20)), 1:].any()
+    assert left.results.unseen.splats == 1500
+    assert not left.scene.sh[np.isin(left.survivors, np.arange(0, 30_000, 20)), 1:].any()
     assert np.array_equal(left.scene.means, scene.means[left.survivors])
-    assert len(left.scene) < 20_000
+    assert len(left.scene) < 10_000
     assert most < 0.8 * scene.nbytes
 
 

@@ -30,8 +30,7 @@ def moved(scene, cameras, by):
 
 
 @pytest.mark.parametrize(
-    ("by", "found", "not_found"),
-    [((0, 0, 0), 0.99, 0.99), ((300, -200, 100), 0.7, 0.6), ((1e5, 0, 1e5), 0.0, 0.0)],
+    ("by", "found", "not_found"), [((0, 0, 0), 0.99, 0.99), ((300, -200, 100), 0.7, 0.6), ((1e5, 0, 1e5), 0.0, 0.0)]
 )
 def test_it_agrees_with_double_precision(device, plush_excerpt, narrow, by, found, not_found):
     scene, views = moved(plush_excerpt, narrow, by)

@@ -7,14 +7,8 @@ import pytest
 from potr_cl.errors import DeviceMemoryError
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.views.budget import ViewCache
-from tests.devices import FAMILIES, open_device
 
-
-@pytest.fixture(scope="module", params=FAMILIES)
-def device(request):
-    device = open_device(request.param)
-    yield device
-    assert device.allocated == 0
+pytestmark = pytest.mark.one_runtime
 
 
 @pytest.mark.parametrize(

@@ -40,11 +40,7 @@ class Gradient:
 
 
 def gradient(
-    scene: Scene,
-    camera: Camera,
-    rules: RasterRules,
-    values: Array,
-    background: tuple[float, float, float] = (0, 0, 0),
+    scene: Scene, camera: Camera, rules: RasterRules, values: Array, background: tuple[float, float, float] = (0, 0, 0)
 ) -> Gradient:
     """Jᵀ v of one view.
 

@@ -113,10 +113,7 @@ def project(scene: Scene, camera: Camera, rules: RasterRules) -> Projected:
     sharp = m @ np.swapaxes(m, 1, 2)
     covariance = sharp + scene.low_pass * np.eye(2)
 
-    centre = np.stack(
-        [camera.fx * t[:, 0] / t[:, 2] + camera.cx, camera.fy * t[:, 1] / t[:, 2] + camera.cy],
-        axis=1,
-    )
+    centre = np.stack([camera.fx * t[:, 0] / t[:, 2] + camera.cx, camera.fy * t[:, 1] / t[:, 2] + camera.cy], axis=1)
     direction = means[index] - camera.centre
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     basis = sh_basis(direction, scene.sh_degree)
@@ -165,10 +162,7 @@ class Composite:
 
 
 def composite(
-    projected: Projected,
-    shape: tuple[int, int],
-    rules: RasterRules,
-    background: tuple[float, ...] = (0, 0, 0),
+    projected: Projected, shape: tuple[int, int], rules: RasterRules, background: tuple[float, ...] = (0, 0, 0)
 ) -> Composite:
     """Composite front to back, every splat over every pixel; colours may have any number of channels."""
     height, width = shape
@@ -243,10 +237,7 @@ def composite_pixel(projected: Projected, column: int, row: int, rules: RasterRu
 
 
 def render(
-    scene: Scene,
-    camera: Camera,
-    rules: RasterRules,
-    background: tuple[float, float, float] = (0, 0, 0),
+    scene: Scene, camera: Camera, rules: RasterRules, background: tuple[float, float, float] = (0, 0, 0)
 ) -> Composite:
     """Project and composite."""
     return composite(project(scene, camera, rules), (camera.height, camera.width), rules, background)

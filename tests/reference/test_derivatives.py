@@ -34,7 +34,6 @@ class Precise(SimpleNamespace):
         return other
 
 
-@pytest.mark.parametrize("parameter", PARAMETERS)
 @pytest.mark.parametrize(
     ("rules", "antialiased", "camera"),
     [
@@ -43,8 +42,8 @@ class Precise(SimpleNamespace):
         pytest.param(GSPLAT, False, tilted_camera(3, 40, 30), id="gsplat-tilted"),
     ],
 )
-def test_gradient_is_that_of_finite_differences(parameter, rules, antialiased, camera):
-    """Of a random combination of the pixels along some random directions in one kind of parameters."""
+def test_gradient_is_that_of_finite_differences(rules, antialiased, camera):
+    """Of a random combination of the pixels along some random directions in each kind of parameters."""
     scene = visible_scene(25, 3, seed=1)
     scene.opacity_logits[:5] = 6  # capped
     scene.sh[:4, 0] -= 3  # cut at 0
@@ -52,16 +51,16 @@ def test_gradient_is_that_of_finite_differences(parameter, rules, antialiased, c
     rng = np.random.default_rng(5)
     values = rng.normal(size=(camera.height, camera.width, 3))
     background = (0.3, 0.6, 0.1)
-    found = getattr(gradient(precise, camera, rules, values, background), parameter)
-    assert np.abs(found).max() > 0
+    gradients = gradient(precise, camera, rules, values, background)
     step = 1e-7
-    for _ in range(3):
-        direction = {name: np.zeros_like(getattr(precise, name)) for name in PARAMETERS}
-        direction[parameter] = rng.normal(size=direction[parameter].shape)
+    for parameter in [name for name in PARAMETERS for _ in range(2)]:
+        found, direction = getattr(gradients, parameter), {name: np.zeros(1) for name in PARAMETERS}
+        assert np.abs(found).max() > 0
+        direction[parameter] = rng.normal(size=found.shape)
         ahead, back = (render(precise.moved(direction, s), camera, rules, background).image for s in (step, -step))
         wanted = float(((ahead - back) / (2 * step) * values).sum())
         size = np.linalg.norm(found) * np.linalg.norm(direction[parameter])
-        assert abs((found * direction[parameter]).sum() - wanted) < 1e-6 * size
+        assert abs((found * direction[parameter]).sum() - wanted) < 1e-6 * size, parameter
 
 
 def test_a_splat_that_is_not_drawn_has_no_gradient():

@@ -1,18 +1,18 @@
-"""A ladder to look at."""
+"""A viewer to look at."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import potr_cl
 
 
-@pytest.fixture(scope="session")
-def ladder(tmp_path_factory: pytest.TempPathFactory, data: Path) -> Path:
-    """The folder of a ladder of the excerpt: three qualities, no views, so that it takes no time."""
+@pytest.fixture(scope="module")
+def viewer(data: Path) -> Iterator[Any]:
     pytest.importorskip("viser", reason="the extra view is not installed")
-    folder = tmp_path_factory.mktemp("ladder")
-    potr_cl.encode_ladder(data / "plush_excerpt.ply", folder, [0, 0.5, 1], prune=False, refit=False, compact=False)
-    return folder
+    with potr_cl.view(data / "plush_excerpt.ply", cameras=data / "plush_excerpt_cameras.json") as viewer:
+        yield viewer

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import http.client
 import socket
-from collections.abc import Iterator
+import sys
 from typing import Any
 
 import pytest
@@ -45,13 +45,6 @@ pytestmark = pytest.mark.one_runtime
 def test_who_is_let_in(listens, host, origin, lets_in):
     refusal = Door(listens, {}, "", {}).refusal(host, origin)
     assert (refusal is None) == lets_in, refusal
-
-
-@pytest.fixture(scope="module")
-def viewer(data) -> Iterator[Any]:
-    pytest.importorskip("viser", reason="the extra view is not installed")
-    with potr_cl.view(data / "plush_excerpt.ply", cameras=data / "plush_excerpt_cameras.json") as viewer:
-        yield viewer
 
 
 def port_of(viewer: Any) -> int:
@@ -103,12 +96,9 @@ def test_no_file_beside_the_page_is_served(viewer):
 
 def test_it_listens_on_this_machine_alone(viewer):
     """No other address of the machine answers under the port."""
-    address = next(
-        (a[4][0] for a in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET) if a[4][0][:4] != "127."), None
-    )
-    if address is None:
-        # 127.0.0.2 is this machine too, on Linux, and not what the server listens on.
-        address = "127.0.0.2"
+    found = socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)
+    # 127.0.0.2 is this machine too, on Linux, and not what the server listens on.
+    address = next((each[4][0] for each in found if each[4][0][:4] != "127."), "127.0.0.2")
     with pytest.raises(OSError, match=r".+"):
         socket.create_connection((address, port_of(viewer)), timeout=2).close()
 
@@ -139,8 +129,6 @@ def test_a_server_that_starts_otherwise_is_not_trusted():
 
 
 def test_without_viser_the_command_that_installs_it_is_told(monkeypatch, data):
-    import sys
-
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(potr_cl.UsageError, match=r"needs viser: pip install .*vi"):
         potr_cl.view(data / "plush_excerpt.ply")

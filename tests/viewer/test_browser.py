@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import base64
+import contextlib
 import dataclasses
 import io
 import time
 from collections.abc import Callable, Iterator
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +18,7 @@ from PIL import Image
 
 import potr_cl
 from potr_cl.quality.metrics import psnr
+from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.viewer.comparison import MODES
 from potr_cl.viewer.pose import camera_of
 
@@ -27,6 +31,15 @@ HOSTILE = '<img src=x onerror="document.title=1">\u202e.ply'
 
 
 @pytest.fixture(scope="module")
+def ladder(tmp_path_factory, data) -> Path:
+    """The folder of a ladder of the excerpt: three qualities, no views, so that it takes no time."""
+    pytest.importorskip("viser", reason="the extra view is not installed")
+    folder = tmp_path_factory.mktemp("ladder")
+    potr_cl.encode_ladder(data / "plush_excerpt.ply", folder, [0, 0.5, 1], prune=False, refit=False, compact=False)
+    return folder
+
+
+@pytest.fixture(scope="module")
 def viewer(ladder, data) -> Iterator[Any]:
     cameras = potr_cl.read_cameras(data / "plush_excerpt_cameras.json")
     cameras[3] = dataclasses.replace(cameras[3], name=HOSTILE)
@@ -35,10 +48,35 @@ def viewer(ladder, data) -> Iterator[Any]:
         yield viewer
 
 
+@contextlib.contextmanager
+def opened(browser: Any, viewer: Any, prepare: Callable[[Any], Any] | None = None, **choices: Any) -> Iterator[Any]:
+    """A tab that shows the viewer; an error on its console fails the test.
+
+    Args:
+        prepare: given the context of the browser before it opens a tab.
+        choices: of the context.
+    """
+    context = browser.new_context(**{"viewport": {"width": WIDTH, "height": HEIGHT}, **choices})
+    before, errors = len(viewer.painter.visitors), []
+    if prepare is not None:
+        prepare(context)
+    tab = context.new_page()
+    tab.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    tab.on("pageerror", lambda error: errors.append(str(error)))
+    try:
+        tab.goto(viewer.url)
+        until(lambda: tab.locator(".potr-figures b").count() > 0)
+        yield tab
+    finally:
+        context.close()
+        until(lambda: len(viewer.painter.visitors) <= before)
+    assert errors == []
+
+
 @pytest.fixture(scope="module")
 def tab(viewer, browser) -> Iterator[Any]:
-    """A tab that shows the viewer; an error on its console fails the last test."""
-    yield from opened(browser, viewer)
+    with opened(browser, viewer) as tab:
+        yield tab
 
 
 @pytest.fixture
@@ -53,21 +91,6 @@ def page(viewer, tab) -> Any:
     tab.locator("[data-view='0']").click()
     until(lambda: viewer.painter.visitors[0].view == 0)
     return tab
-
-
-def opened(browser: Any, viewer: Any) -> Iterator[Any]:
-    context = browser.new_context(viewport={"width": WIDTH, "height": HEIGHT})
-    tab = context.new_page()
-    errors: list[str] = []
-    tab.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-    tab.on("pageerror", lambda error: errors.append(str(error)))
-    tab.goto(viewer.url)
-    until(lambda: tab.locator(".potr-figures b").count() > 0)
-    before = len(viewer.painter.visitors)
-    yield tab
-    context.close()
-    until(lambda: len(viewer.painter.visitors) < before)
-    assert errors == []
 
 
 def until(condition: Callable[[], bool], seconds: float = 120) -> None:
@@ -286,11 +309,7 @@ HIDE = """document.head.append(Object.assign(document.createElement("style"),
 
 def test_the_browser_draws_what_render_does(viewer, browser):
     """Where WebGL is computed on the CPU only if it is asked to."""
-    context = browser.new_context(viewport={"width": WIDTH, "height": HEIGHT})
-    tab = context.new_page()
-    try:
-        tab.goto(viewer.url)
-        until(lambda: tab.locator(".potr-figures b").count() > 0)
+    with opened(browser, viewer) as tab:
         tab.locator("[data-potr=drawn] [aria-pressed=true]", has_text="exact").wait_for()
         assert tab.evaluate("globalThis.potr") is None, "what is not needed is loaded"
         visitor = viewer.painter.visitors[-1]
@@ -354,9 +373,6 @@ def test_the_browser_draws_what_render_does(viewer, browser):
         # What it cannot draw.
         press(viewer, tab, "6")
         until(lambda: tab.evaluate("document.body.dataset.drawn") == "")
-    finally:
-        context.close()
-        until(lambda: len(viewer.painter.visitors) < 2)
 
 
 def test_a_scene_that_is_too_large_is_pictured(viewer, page, monkeypatch):
@@ -369,13 +385,10 @@ def test_a_scene_that_is_too_large_is_pictured(viewer, page, monkeypatch):
 
 def test_a_second_tab_and_the_end_of_the_work(viewer, browser, page):
     first = still(viewer, page)
-    second = opened(browser, viewer)
-    other = next(second)
-    assert len(viewer.painter.visitors) == 2
-    other.keyboard.press("4")
-    until(lambda: [visitor.mode for visitor in viewer.painter.visitors] == ["divider", "B"])
-    for _ in second:  # closes it
-        pass
+    with opened(browser, viewer) as other:
+        assert len(viewer.painter.visitors) == 2
+        other.keyboard.press("4")
+        until(lambda: [visitor.mode for visitor in viewer.painter.visitors] == ["divider", "B"])
     assert viewer.painter.visitors == [first]
 
 
@@ -402,12 +415,7 @@ Worker.prototype.postMessage = function (data, ...rest) {
 
 
 def test_the_camera_is_told_as_often_as_screens_show_pictures(viewer, browser):
-    context = browser.new_context(viewport={"width": WIDTH, "height": HEIGHT})
-    tab = context.new_page()
-    tab.add_init_script(SPY)
-    try:
-        tab.goto(viewer.url)
-        until(lambda: tab.locator(".potr-figures b").count() > 0)
+    with opened(browser, viewer, lambda context: context.add_init_script(SPY)) as tab:
         tab.mouse.move(200, 330)
         tab.mouse.down()
         gaps: list[float] = []
@@ -418,10 +426,7 @@ def test_the_camera_is_told_as_often_as_screens_show_pictures(viewer, browser):
             told = tab.evaluate("window.told")
             gaps = [later - before for before, later in pairwise(told)]
         tab.mouse.up()
-        assert min(gaps) < 1000 / 60, "viser's page tells no sooner than after 20 ms"
-    finally:
-        context.close()
-        until(lambda: len(viewer.painter.visitors) < 2)
+    assert min(gaps) < 1000 / 60, "viser's page tells no sooner than after 20 ms"
 
 
 def test_arrow_keys_move_the_slider_from_file_to_file(viewer, page):
@@ -441,7 +446,6 @@ def test_arrow_keys_move_the_slider_from_file_to_file(viewer, page):
 
 def test_an_old_answer_does_not_undo_a_key(viewer, page, browser):
     """On a slow line what the server told before a key may come after it."""
-    context = browser.new_context(viewport={"width": WIDTH, "height": HEIGHT})
     held: list[Any] = []
     is_slow = False
 
@@ -449,17 +453,16 @@ def test_an_old_answer_does_not_undo_a_key(viewer, page, browser):
         server = socket.connect_to_server()
         server.on_message(lambda message: held.append((socket, message)) if is_slow else socket.send(message))
 
-    context.route_web_socket(lambda url: "potr_cl/channel" in url, route)
-    slow = context.new_page()
+    def prepare(context: Any) -> None:
+        context.route_web_socket(lambda url: "potr_cl/channel" in url, route)
 
-    def behind(name: str) -> bool:
-        """Is this file shown behind the page? What a routed page says goes by this process, while it waits for it."""
-        slow.wait_for_timeout(50)
-        return name in viewer.session.exhibit("B").name
+    with opened(browser, viewer, prepare) as slow:
 
-    try:
-        slow.goto(viewer.url)
-        until(lambda: slow.locator(".potr-figures b").count() > 0)
+        def behind(name: str) -> bool:
+            """Is this file shown behind the page? What a routed page says goes by this process, while it waits."""
+            slow.wait_for_timeout(50)
+            return name in viewer.session.exhibit("B").name
+
         until(lambda: slow.title().startswith("plush_excerpt.ply – plush_excerpt_q0.5.potr – "))
         is_slow = True
         slow.locator("[role=slider]:not(.potr-grip)").first.focus()
@@ -472,19 +475,11 @@ def test_an_old_answer_does_not_undo_a_key(viewer, page, browser):
         until(lambda: slow.title().startswith("plush_excerpt.ply – plush_excerpt_q0.potr – "))
         slow.keyboard.press("ArrowRight")
         until(lambda: behind("_q1."))
-    finally:
-        context.close()
-        until(lambda: len(viewer.painter.visitors) < 2)
 
 
 def test_on_a_phone(viewer, browser):
-    context = browser.new_context(
-        viewport={"width": 390, "height": 844}, is_mobile=True, has_touch=True, device_scale_factor=2
-    )
-    phone = context.new_page()
-    try:
-        phone.goto(viewer.url)
-        until(lambda: phone.locator(".potr-figures b").count() > 0)
+    choices = {"viewport": {"width": 390, "height": 844}, "is_mobile": True, "has_touch": True}
+    with opened(browser, viewer, **choices, device_scale_factor=2) as phone:
         visitor = still(viewer, phone)
         assert (visitor.width, visitor.height) == (780, 1688), "pictures have the pixels of the screen"
         phone.locator("[data-potr=figures]", has_text="780 × 1688").wait_for()
@@ -497,9 +492,6 @@ def test_on_a_phone(viewer, browser):
         note = phone.locator(".mantine-Notification-root").first  # that WebGL is computed on the CPU
         label = phone.locator(".potr-label.left").bounding_box()
         assert note.bounding_box()["y"] >= label["y"] + label["height"], "notes leave the labels free"
-    finally:
-        context.close()
-        until(lambda: len(viewer.painter.visitors) < 2)
 
 
 def test_a_bad_file_is_told(viewer, page):
@@ -521,13 +513,11 @@ def drop(page: Any, name: str, content: bytes, which: str) -> None:
             document.body.dispatchEvent(event("dragenter"));
             document.querySelector(`[data-as=${which}]`).dispatchEvent(event("drop"));
         }""",
-        [name, __import__("base64").b64encode(content).decode(), which],
+        [name, base64.b64encode(content).decode(), which],
     )
 
 
 def test_an_error_of_the_device_is_shown_and_the_server_lives_on(viewer, page, monkeypatch):
-    from potr_cl.raster.rasterizer import Rasterizer
-
     visitor = still(viewer, page)
 
     def failing(*_: Any) -> None:

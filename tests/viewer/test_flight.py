@@ -56,61 +56,59 @@ class Camera:
 def patient(monkeypatch):
     """A camera that arrives is waited for, however busy the machine is."""
     monkeypatch.setattr("potr_cl.viewer.flight.LANDING", 300.0)
+    monkeypatch.setattr("potr_cl.viewer.flight.FLIGHT", 0.2)
 
 
 @pytest.fixture
-def gazes(plush_excerpt_cameras) -> list[Gaze]:
-    return [gaze_on(camera, 1.5) for camera in plush_excerpt_cameras]
+def goal(plush_excerpt_cameras) -> Gaze:
+    return gaze_on(plush_excerpt_cameras[5], 1.5)
 
 
-def test_a_camera_that_looks_past_its_goal_is_set_once_more(gazes):
-    camera = Camera(gazes[0])
-    fly(camera, gazes[5], lambda: True)
-    camera.turned_by = 0.01
+@pytest.fixture
+def camera(plush_excerpt_cameras, goal) -> Camera:
+    """One that has just flown to the goal."""
+    camera = Camera(gaze_on(plush_excerpt_cameras[0], 1.5))
+    fly(camera, goal, lambda: True)
+    assert camera.puts > 2
+    return camera
+
+
+@pytest.mark.parametrize("turned_by", [0.0, 0.01])
+def test_a_camera_that_looks_past_its_goal_is_set_once_more(camera, goal, turned_by):
+    """One that has arrived is left alone."""
+    camera.turned_by = turned_by
     camera.wxyz = camera.wxyz
-    assert not camera.told[0].is_near(gazes[5])
+    assert camera.told[0].is_near(goal) == (turned_by == 0)
     before = camera.puts
-    assert land(camera, gazes[5], lambda: camera.told, lambda: True)
-    assert camera.told[0].is_near(gazes[5])
-    assert camera.puts == before + 1
+    assert land(camera, goal, lambda: camera.told, lambda: True)
+    assert camera.told[0].is_near(goal)
+    assert camera.puts == before + (turned_by > 0)
 
 
-def test_a_camera_that_has_arrived_is_left_alone(gazes):
-    camera = Camera(gazes[0])
-    fly(camera, gazes[5], lambda: True)
-    before = camera.puts
-    assert land(camera, gazes[5], lambda: camera.told, lambda: True)
-    assert camera.puts == before
-
-
-def test_what_was_told_of_an_earlier_step_is_not_taken_for_an_arrival_missed(gazes):
+def test_what_was_told_of_an_earlier_step_is_not_taken_for_an_arrival_missed(camera, goal, plush_excerpt_cameras):
     """Words of the last step and of the one before come in the wrong order; it rests where the browser says last."""
-    camera = Camera(gazes[0])
-    fly(camera, gazes[5], lambda: True)
     arrived = camera.told[0]
-    camera.told = gazes[4], time.monotonic()
+    camera.told = gaze_on(plush_excerpt_cameras[4], 1.5), time.monotonic()
 
     def tells() -> None:
         camera.told = arrived, time.monotonic()
 
     timer = threading.Timer(0.1, tells)
     timer.start()
-    assert land(camera, gazes[5], lambda: camera.told, lambda: True)
+    assert land(camera, goal, lambda: camera.told, lambda: True)
     timer.join()
 
 
-def test_whoever_moves_the_camera_away_keeps_it(gazes, monkeypatch):
+def test_whoever_moves_the_camera_away_keeps_it(camera, goal, monkeypatch):
     monkeypatch.setattr("potr_cl.viewer.flight.LANDING", 0.6)
-    camera = Camera(gazes[0])
-    fly(camera, gazes[5], lambda: True)
-    camera.told = Gaze(gazes[5].position + 0.5, gazes[5].rotation, gazes[5].fov), time.monotonic()
+    camera.told = Gaze(goal.position + 0.5, goal.rotation, goal.fov), time.monotonic()
     before = camera.puts
-    assert not land(camera, gazes[5], lambda: camera.told, lambda: True)
+    assert not land(camera, goal, lambda: camera.told, lambda: True)
     assert camera.puts == before
 
 
-def test_another_flight_ends_this_one(gazes):
-    camera = Camera(gazes[0])
-    assert not land(camera, gazes[5], lambda: None, lambda: False)
-    fly(camera, gazes[5], lambda: False)
-    assert camera.puts == 0
+def test_another_flight_ends_this_one(camera, goal):
+    before = camera.puts
+    assert not land(camera, goal, lambda: None, lambda: False)
+    fly(camera, goal, lambda: False)
+    assert camera.puts == before

@@ -17,7 +17,7 @@ from potr_cl.views.shares import HelpFrom
 from potr_cl.views.targets import RenderedTargets
 from potr_cl.workers.host import HostPool
 from tests.cases.elsewhere import ElsewherePool
-from tests.devices import FAMILIES, open_device
+from tests.devices import open_device
 from tests.reference.scenes import ring_of_cameras, visible_scene
 
 SOURCE = visible_scene(60, 2, seed=3)
@@ -25,11 +25,6 @@ START = dataclasses.replace(SOURCE, sh=0.8 * SOURCE.sh, opacity_logits=SOURCE.op
 #: Of two sizes: a launch has one fixed point for all of its views.
 VIEWS = [*ring_of_cameras(6, size=40), *ring_of_cameras(5, size=57)]
 OPTIONS = FitOptions(steps=9, rounds=2, batch=4)
-
-
-@pytest.fixture(scope="module", params=FAMILIES)
-def family(request):
-    return request.param
 
 
 def fitted(device, pool=None, options=OPTIONS):
@@ -61,8 +56,9 @@ def steps(monkeypatch):
     return found
 
 
-@pytest.mark.parametrize("kind", [HostPool, ElsewherePool])
-@pytest.mark.parametrize("count", [2, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("kind", "count"), [(HostPool, 2), (ElsewherePool, 2), pytest.param(ElsewherePool, 4, marks=pytest.mark.slow)]
+)
 def test_the_same_bits(family, alone, kind, count, monkeypatch, steps):
     monkeypatch.setattr(together, "_TRIED", OPTIONS.steps)
     devices = [open_device(family) for _ in range(count)]

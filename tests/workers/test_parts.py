@@ -14,7 +14,7 @@ from potr_cl.workers.parts import Each, Parts
 from potr_cl.workers.pool import Held, Part, Pool, Shared, Traffic, Worker, WorkerLost
 
 #: Seconds that a worker may be silent: they are waited in vain here, and enough for those that are only kept busy.
-PATIENCE = 2.0
+PATIENCE = 1.0
 
 
 class Sum(Part):

@@ -26,12 +26,13 @@ from potr_cl.views.visibility import Visibility
 from tests.cases.cameras import small
 from tests.cases.elsewhere import ElsewherePool
 from tests.cases.streets import street
-from tests.devices import FAMILIES, open_device
+from tests.devices import open_device
+from tests.reference.surfaces import together
 
 #: Splats go, colours are made sparse and re-fitted on the way, coefficients are given up, and AC is rounded.
 OPTIONS = dataclasses.replace(
     EncodeOptions.for_preset(
-        "best", q=0.3, prune={"keep": 0.4, "iterations": 6}, refit={"at": (0.4,), "steps": 2, "drop": 1e-7},
+        "best", q=0.3, prune={"keep": 0.4, "iterations": 4}, refit={"at": (0.4,), "steps": 2, "drop": 1e-7},
         compact=True, between=False,
     ),
     cameras_anyway=True,
@@ -44,23 +45,18 @@ def _small_groups(monkeypatch):
     monkeypatch.setattr(visibility, "LEAST_SPLATS", 1)
 
 
-@pytest.fixture(scope="module", params=FAMILIES)
-def family(request):
-    return request.param
+@functools.cache
+def street_with_a_house_that_nobody_sees():
+    scene, cameras = street(5, 150, across=True)
+    behind = scene.subset(np.arange(150))
+    behind = dataclasses.replace(behind, means=behind.means - np.float32([500, 0, 0]))
+    return together(scene, behind), cameras
 
 
 @functools.cache
-def street_with_a_house_that_nobody_sees():
-    scene, cameras = street(5, 250, across=True)
-    behind = scene.subset(np.arange(150))
-    behind = dataclasses.replace(behind, means=behind.means - np.float32([500, 0, 0]))
-    together = (np.concatenate([getattr(each, f.name) for each in (scene, behind)]) for f in array_fields(scene))
-    named = dict(zip([f.name for f in array_fields(scene)], together, strict=True))
-    return dataclasses.replace(scene, **named), cameras
-
-
-def array_fields(scene):
-    return [f for f in dataclasses.fields(scene) if isinstance(getattr(scene, f.name), np.ndarray)]
+def visible_of_a_street():
+    scene, cameras = street(across=True)
+    return scene, cameras, Visibility.of(scene, cameras, INRIA.near)
 
 
 #: A GPU decides itself, and what nobody sees stays; no re-fits on the way.
@@ -68,20 +64,19 @@ IN_THE_END = OPTIONS.changed(prune={"keep": None}, refit={"at": ()})
 
 
 @functools.cache
-def in_the_end_alone(family):
+def in_the_end_alone():
     """What one device makes of that street."""
-    return encode(*street_with_a_house_that_nobody_sees(), IN_THE_END, device=open_device(family))
+    return encode(*street_with_a_house_that_nobody_sees(), IN_THE_END, device=open_device("cpu"))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "options",
+    ("family", "options"),
     [
-        # The host decides, as it does on a CPU whatever the options.
-        pytest.param(OPTIONS, marks=pytest.mark.one_family),
+        ("cpu", OPTIONS),  # the host decides, as it does on a CPU whatever the options
         # Nothing is kept of any view; tests/workers/test_host.py has that without slow ones.
-        pytest.param(OPTIONS.changed(memory=0, prune={"tolerance": 0.0}), marks=pytest.mark.one_family),
-        OPTIONS.changed(prune={"keep": None}),  # a GPU decides itself, and what nobody sees stays
+        ("cpu", OPTIONS.changed(memory=0, prune={"tolerance": 0.0})),
+        ("gpu", OPTIONS.changed(prune={"keep": None})),  # a GPU decides itself, and what nobody sees stays
     ],
     ids=["by number", "little memory", "by threshold"],
 )
@@ -115,18 +110,17 @@ def test_the_same_bytes(family, options, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.one_family
-def test_a_re_fit_sends_what_views_draw(family, monkeypatch):
+def test_a_re_fit_sends_what_views_draw(monkeypatch):
     """Of a direction, each worker gets the coefficients of these splats alone; what it finds is the same."""
     scene, cameras = street_with_a_house_that_nobody_sees()
     found, sent = [], []
     for left_out in (False, True):
-        with monkeypatch.context() as patched, ElsewherePool([open_device(family) for _ in range(4)]) as pool:
+        with monkeypatch.context() as patched, ElsewherePool([open_device("cpu") for _ in range(4)]) as pool:
             if not left_out:
                 patched.setattr(DrawnRows, "are_worth_it", lambda drawn: False)
             found.append(encode(scene, cameras, IN_THE_END, device=pool.first, pool=pool).data)
             sent.append(pool.traffic.of["normal"].sent)
-    assert found[0] == found[1] == in_the_end_alone(family).data
+    assert found[0] == found[1] == in_the_end_alone().data
     assert 0 < sent[1] < 0.8 * sent[0]
 
 
@@ -162,7 +156,7 @@ def test_a_re_fit_without_room_for_that_sends_all(monkeypatch):
     """The bytes are the same, and nothing stays taken."""
     scene, cameras = street_with_a_house_that_nobody_sees()
     devices = [open_device("cpu") for _ in range(4)]
-    expected = in_the_end_alone("cpu").data
+    expected = in_the_end_alone().data
     refused = []
 
     class WithoutRoom(DrawnRows):
@@ -178,13 +172,12 @@ def test_a_re_fit_without_room_for_that_sends_all(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.one_family
-def test_the_uncompressed_scene_travels_once(family, monkeypatch):
+def test_the_uncompressed_scene_travels_once(monkeypatch):
     """Where workers get all of it: of what is pruned, once unseen splats are set aside, they get the numbers."""
     monkeypatch.setattr(visibility, "LEAST_SPLATS", 1 << 40)
     scene, cameras = street_with_a_house_that_nobody_sees()
-    devices = [open_device(family) for _ in range(3)]
-    expected = in_the_end_alone(family)
+    devices = [open_device("cpu") for _ in range(3)]
+    expected = in_the_end_alone()
     assert expected.unseen.splats > 100
     with ElsewherePool(devices) as pool:
         assert encode(scene, cameras, IN_THE_END, device=devices[0], pool=pool).data == expected.data
@@ -193,14 +186,12 @@ def test_the_uncompressed_scene_travels_once(family, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("keep", [0.4, None])
-def test_workers_with_gpus_look_at_each_view_with_what_it_may_draw(keep, monkeypatch):
+def test_workers_with_gpus_look_at_each_view_with_what_it_may_draw(monkeypatch):
     """As a GPU with memory of its own does: a CPU that runs its kernels has none."""
-    family = next(each for each in FAMILIES if "gpu" in str(each))
-    family = getattr(family, "values", [family])[0]
     scene, cameras = street_with_a_house_that_nobody_sees()
-    options = OPTIONS.changed(prune={"keep": keep})
-    expected = encode(scene, cameras, options, device=open_device(family)).data
+    options = OPTIONS.changed(prune={"keep": None})
+    devices = [open_device("gpu") for _ in range(3)]
+    expected = encode(scene, cameras, options, device=devices[0]).data
     monkeypatch.setattr("potr_cl.raster.resident.fits_whole", lambda device, scene: True)
     made = []
     for where, name in (("stages.pruning.removal", "NamedSplats"), ("views.targets", "SeenRasterizer")):
@@ -212,7 +203,6 @@ def test_workers_with_gpus_look_at_each_view_with_what_it_may_draw(keep, monkeyp
             kind.__init__(self, *args, **named)
 
         monkeypatch.setattr(f"{where}.{name}", type(name, (kind,), {"__init__": noting}))
-    devices = [open_device(family) for _ in range(3)]
     with ElsewherePool(devices) as pool:
         assert encode(scene, cameras, options, device=devices[0], pool=pool).data == expected
     assert made.count("NamedSplats") == 2
@@ -221,8 +211,7 @@ def test_workers_with_gpus_look_at_each_view_with_what_it_may_draw(keep, monkeyp
 
 
 def test_neighbours_go_to_the_same():
-    scene, cameras = street(across=True)
-    visibility = Visibility.of(scene, cameras, INRIA.near)
+    scene, cameras, visibility = visible_of_a_street()
     dealt = ViewShares.of(cameras, visibility, [1.0, 1.0], scene, np.arange(len(scene)))
     numbers = [share.numbers for share in dealt.shares]
     assert sorted(chain(*numbers)) == list(range(len(cameras)))
@@ -241,8 +230,7 @@ def test_twice_as_fast_gets_twice_as_much():
 
 
 def test_a_share_names_its_splats_by_their_places():
-    scene, cameras = street(across=True)
-    visibility = Visibility.of(scene, cameras, INRIA.near)
+    _, _, visibility = visible_of_a_street()
     splats, own = visibility.of_views([3, 4])
     assert np.array_equal(splats, visibility.groups.splats(visibility.seen[3] | visibility.seen[4]))
     assert own.totals[3] == visibility.totals[3]
@@ -251,7 +239,7 @@ def test_a_share_names_its_splats_by_their_places():
 
 
 def test_views_that_see_nothing_have_a_share_too():
-    scene, cameras = street(across=True)
+    scene, cameras, _ = visible_of_a_street()
     away = dataclasses.replace(cameras[0], translation=cameras[0].translation + np.array([0, 0, -500.0]))
     visibility = Visibility.of(scene, [*cameras, away, away], INRIA.near)
     assert visibility.totals[-1] == 0
@@ -261,7 +249,7 @@ def test_views_that_see_nothing_have_a_share_too():
 
 
 def test_an_excerpt_arrives_as_a_scene():
-    scene, _ = street(across=True)
+    scene, *_ = visible_of_a_street()
     sent = SceneSubset(scene, np.array([3, 5, 900]))
     there = pickle.loads(pickle.dumps(sent))
     assert type(there) is type(scene)
