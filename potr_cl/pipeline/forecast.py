@@ -21,6 +21,7 @@ from potr_cl.raster.resident import ResidentScene
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.stages.fit import Fit
 from potr_cl.stages.fitting.fit import FitOptions
+from potr_cl.stages.refitting.coefficients import fits_in_one_piece, in_one_piece
 from potr_cl.stages.views_between import Between, most_needed
 from potr_cl.views.budget import default_memory
 from potr_cl.views.visibility import LEAST_SPLATS
@@ -32,6 +33,9 @@ _LONG = 2_000_000
 #: Bytes of the process with its libraries; a splat, on the host and on the device; and what is kept of views and
 #: besides, as a multiple of what a view's own buffers take.
 _PROCESS, _HOST_SPLAT, _DEVICE_SPLAT, _VIEWS = 180e6, 1550, 154, 1.02
+#: Of a large scene, bytes of a splat in pruning besides the scene (sums, states, scores); the part of its splats that
+#: is left, at qualities that people ask for; and of what the re-fit's vectors leave, what its views take.
+_PRUNED_SPLAT, _LEFT, _OF_REST = 62, 0.3, 0.4
 #: Bytes of a pixel of the picture that a view is to have; and of what is measured of an intersection, on CPUs.
 _PIXEL, _SUM = 12, 8
 
@@ -88,6 +92,8 @@ def memory_needed(
         lists = _lists(scene if kept is None else kept.drawable(device, scene), camera, device, options)
         of_views = min(views * (lists + _PIXEL * pixels) * _VIEWS, budget)
     memory = len(scene) * _DEVICE_SPLAT + of_views
+    if len(scene) >= LEAST_SPLATS and not device.info.shares_host_memory:
+        memory = _of_large(scene, of_views, options.memory, device)
     fit = next((stage for stage in options.stages if isinstance(stage, Fit) and stage.asked_for), None)
     if fit is not None and lists and fit.looks_at(scene):
         together = FitOptions.batch if device.family == "gpu" else 1
@@ -100,6 +106,18 @@ def memory_needed(
             # Views of large scenes leave room for the host's arrays, and the largest of these lie in files.
             memory = min(memory, options.memory + _PROCESS)
     return memory
+
+
+def _of_large(scene: Scene, of_views: float, memory: int | None, device: Device) -> float:
+    """The same of a large scene on a GPU: what pruning takes, or the re-fit of what it leaves."""
+    pruning = scene.nbytes + _PRUNED_SPLAT * len(scene) + of_views
+    free = device.info.memory - scene.nbytes
+    vectors: float = in_one_piece(int(_LEFT * len(scene)), scene.sh.shape[1])
+    if not fits_in_one_piece(vectors, free, memory):
+        # In slices, with the views, they take what is given, or what is free.
+        return max(pruning, scene.nbytes + min(free if memory is None else memory, free))
+    views = _OF_REST * (free - vectors) if memory is None else memory - vectors
+    return max(pruning, scene.nbytes + vectors + views)
 
 
 def _views(cameras: Sequence[Camera], options: EncodeOptions, device: Device) -> float:

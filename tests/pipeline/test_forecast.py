@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from potr_cl.model.camera import train_views
@@ -46,6 +48,36 @@ def test_memory_of_a_large_scene_is_what_is_allowed(memory, device, plush_excerp
     large = memory(views, memory=1 << 20)
     assert large < small - 1e6, "what the host has of the scene lies in files"
     assert large < memory(views)
+
+
+@dataclasses.dataclass
+class City:
+    """What is asked of a scene of SH degree 3."""
+
+    splats: int
+    sh = np.empty((1, 16, 3))
+
+    def __len__(self):
+        return self.splats
+
+    @property
+    def nbytes(self):
+        return 236 * self.splats
+
+
+@pytest.mark.parametrize(
+    ("splats", "gigabytes", "given", "measured"),
+    [
+        (10e6, 150.1, None, 68.8), (50e6, 150.1, None, 96.4), (50e6, 85.0, None, 71.5), (50e6, 150.1, 25.8, 43.0),
+    ],
+)  # fmt: skip
+def test_memory_of_cities_is_about_what_was_measured(splats, gigabytes, given, measured):
+    """On one H200 or H100, whose views filled what they may take."""
+    scene = City(int(splats))
+    device = SimpleNamespace(info=SimpleNamespace(memory=int(gigabytes * 1e9)))
+    memory = None if given is None else int(given * 1e9)
+    said = forecast._of_large(scene, memory or gigabytes * 0.5e9, memory, device)
+    assert 0.85 * measured < said / 1e9 < 1.2 * measured
 
 
 @pytest.mark.slow

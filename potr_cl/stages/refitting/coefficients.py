@@ -273,6 +273,21 @@ class Residency:
     resident: int = 0
 
 
+def in_one_piece(splats: int, sh_count: int) -> int:
+    """Bytes of a re-fit's vectors, sums and blocks where all of them lie on the device."""
+    vector, triangle = 12 * sh_count, sh_count * (sh_count + 1) // 2
+    return splats * (_VECTORS * vector + 2 * vector + 12 * triangle)
+
+
+def fits_in_one_piece(nbytes: float, free: float, memory: int | None) -> bool:
+    """Whether so many bytes are to lie on a device of which so many are free.
+
+    Args:
+        memory: bytes of it that the user would have taken; None: as much as there is.
+    """
+    return nbytes <= max(_OF_FREE * free if memory is None else min(_OF_GIVEN * memory, _OF_FREE * free), _ANYWAY)
+
+
 def residency_of(
     device: Device,
     splats: int,
@@ -300,10 +315,8 @@ def residency_of(
         shared: whether other devices do some of the views: packed coefficients and sums of theirs take three vectors.
     """
     vector, triangle = 12 * sh_count, sh_count * (sh_count + 1) // 2
-    one_piece = splats * (_VECTORS * vector + 2 * vector + 12 * triangle)
-    free = max(device.info.memory - device.allocated, 0)
-    fits = one_piece <= max(_OF_FREE * free if memory is None else min(_OF_GIVEN * memory, _OF_FREE * free), _ANYWAY)
-    if slices is None and fits:
+    one_piece, free = in_one_piece(splats, sh_count), max(device.info.memory - device.allocated, 0)
+    if slices is None and fits_in_one_piece(one_piece, free, memory):
         return Residency(memory if memory is None or one_piece <= _ANYWAY else max(memory - one_piece, 0))
     total = free if memory is None else min(memory, free)
     of_slice = 2 * vector + 4 * triangle + 8
