@@ -3,10 +3,10 @@
     python -m tools.bench.encode [SCENE …] [--device NAME] [--quick] [--stage NAME …] [--json FILE]
 
 For each stage the variants that exist: kernel family, compiler flags, precision, steps, entropy coder; each with its
-time and its error against float64 or against the full computation. (tools.study.rate_distortion compares whole encodes
-of any options.) A variant is on the Pareto front if no other of its stage is at least as good in time, error and bytes
-and better in one by more than 5 %, the noise. Scenes: lego and plush by default; --quick takes the bundled excerpt at
-half size and the best device.
+time on a scene and its error: of kernels what tools.stress.run measures, in a few of its cases. (Whole encodes of any
+options: tools.study.rate_distortion.) A variant is on the Pareto front if no other of its stage is at least as good in
+time, error and bytes and better in one by more than 5 %, the noise. Scenes: lego and plush by default; --quick takes
+the bundled excerpt at half size and the best device.
 
 Every device runs in a process of its own. Times of the rasterizer's kernels and of the ridge are the device's own, the
 others the clock's. Each is the best of some.
@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import decode
@@ -34,23 +33,21 @@ from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import DeviceInfo, Family, choose_device, list_devices
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.rules import GSPLAT, INRIA
+from potr_cl.raster.rules import GSPLAT
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, Precision
 from potr_cl.stages.compaction.view_weights import ViewWeights
 from potr_cl.stages.pruning.removal import RemovalSweep
-from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.views.targets import RenderedTargets
-from tests.reference import raster as reference
-from tests.reference.removal import BruteForce
+from tests.reference.scenes import random_splats, tilted_camera
 from tools.bench.rasterizer import stage_times
 from tools.results import Results
+from tools.stress.cases import Case, layered
+from tools.stress.platforms import families
 from tools.stress.solvers import ridge_errors
-from tools.stress.views import rasterized
+from tools.stress.views import check_rasterizer
 from tools.workloads import SCENES, best_of, excerpt, in_process, log, read, scaled, scene_parser
-
-F64 = NDArray[np.float64]
 
 #: Part by which a time or an error must be lower to be lower.
 NOISE = 0.05
@@ -63,10 +60,8 @@ FLAGS: Mapping[str, tuple[str, ...]] = {
     "unsafe": ("-cl-unsafe-math-optimizations",),
     "fast relaxed": ("-cl-fast-relaxed-math",),
 }
-#: Pixels of a view, and splats, that are computed in float64.
-PIXELS, SPLATS = 300, 150
-#: As in the tests: pixels that come no nearer, relatively, to a threshold cannot flip, nor splats in another order.
-CLEAR, TIE = 1e-4, 1e-6
+#: What errors of kernels are measured in: many splats, and many layers over each other.
+CASES = (Case("400 splats", random_splats(400, 3, seed=1), tilted_camera(1, 83, 61), GSPLAT), layered(100))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,11 +119,6 @@ class Workload:
     def repeats(self) -> int:
         return 3 if self.quick else 7
 
-    @property
-    def families(self) -> tuple[Family, ...]:
-        """The device's own kernel family first."""
-        return ("cpu", "gpu") if self.info.family == "cpu" else ("gpu",)
-
     def profiled(self, family: Family, flags: Sequence[str] = ()) -> Device:
         """A device whose kernels are timed, with compiler flags."""
         return Device(self.info, profiling=True, family=family, build_options=flags)
@@ -140,100 +130,33 @@ class Workload:
                 yield f"{family}, {name}", family == self.info.family and not flags, self.profiled(family, flags)
 
 
-# ------------------------------------------------------------------------------------------------ rasterizer
+# ----------------------------------------------------------------------------------------------------- kernels
 
-
-#: The kernels of each stage.
+#: The kernels of each stage, and the measure of its error.
 KERNELS = {
-    "project": ("project",),
-    "tile lists": ("count_tiles", "scan_tiles", "fill_tiles"),
-    "sort": ("sort_tiles",),
-    "composite": ("composite", "composite_frame"),
+    "project": (("project",), "project: alpha"),
+    "tile lists": (("count_tiles", "scan_tiles", "fill_tiles"), "tile lists"),
+    "sort": (("sort_tiles",), "sort"),
+    "composite": (("composite", "composite_frame"), "composite"),
 }
 
 
-def rasterizer_rows(load: Workload) -> Iterator[Row]:
-    """All kernels of the rasterizer: family and flags."""
-    truth, first = RasterizerTruth(load), None
-
-    for name, default, device in (each for family in load.families for each in load.flagged(family)):
+def view_rows(load: Workload) -> Iterator[Row]:
+    """What a view needs, and a sweep of removal over it: family and flags."""
+    for name, default, device in (each for family in families(load.info) for each in load.flagged(family)):
+        found = [check_rasterizer(device, case)[0] for case in CASES]
+        errors = {measure: max(each[measure][0] for each in found) for measure in found[0]}
         runs = [stage_times(device, load.scene, load.some) for _ in range(load.repeats)]
-        times = {kernel: min(run[kernel] for run in runs) for kernel in runs[0]}
-        centre, wrong, pixel, pairs = truth.errors(device, load.scene)
-        first = pairs if first is None else first
-        errors = {"project": centre, "tile lists": len(first ^ pairs), "sort": wrong, "composite": pixel}
-        for stage, kernels in KERNELS.items():
-            yield Row(stage, name, sum(times.get(kernel, 0) for kernel in kernels), errors[stage], default)
-
-
-class RasterizerTruth:
-    """One view in float64: splats on screen, and some pixels."""
-
-    def __init__(self, load: Workload) -> None:
-        self.camera = load.some[0]
-        self.projected = reference.project(load.scene, self.camera, GSPLAT)
-        rng = np.random.default_rng(0)
-        self.pixels: list[tuple[int, int, F64]] = []
-        for _ in range(4 * PIXELS):
-            column, row = int(rng.integers(self.camera.width)), int(rng.integers(self.camera.height))
-            pixel = reference.composite_pixel(self.projected, column, row, GSPLAT)
-            if pixel.margin > CLEAR and pixel.gap > TIE and len(self.pixels) < PIXELS:
-                self.pixels.append((column, row, np.append(pixel.colour, pixel.transmittance)))
-
-    def errors(self, device: Device, scene: Scene) -> tuple[float, float, float, set[bytes]]:
-        """Of centres, of order, of pixels; and the tile lists as a set."""
-        with Rasterizer(device, scene, GSPLAT) as rasterizer:
-            lists = rasterized(rasterizer, self.camera)
-        listed = np.isin(self.projected.index, lists.intersections)
-        centres = np.abs(lists.shapes[self.projected.index[listed], :2] - self.projected.centre[listed])
-        inside = (self.projected.centre[listed] >= 0).all(axis=1)
-        inside &= (self.projected.centre[listed] < (self.camera.width, self.camera.height)).all(axis=1)
-        tiles = np.repeat(np.arange(len(lists.offsets) - 1), np.diff(lists.offsets).astype(np.int64))
-        order = np.lexsort((lists.intersections, lists.shapes[lists.intersections, 6], tiles))
-        wrong = int(np.count_nonzero(lists.intersections[order] != lists.intersections))
-        ours = np.concatenate([lists.image, lists.transmittance[:, None]], axis=1)
-        at = (np.abs(ours[row * self.camera.width + column] - true).max() for column, row, true in self.pixels)
-        pixel = float(max(at, default=0.0))
-        pairs = {pair.tobytes() for pair in np.stack([tiles, lists.intersections], axis=1)}
-        return float(centres[inside].max(initial=0)), wrong, pixel, pairs
-
-
-# -------------------------------------------------------------------------------------------- pruning, colours
-
-
-def removal_rows(load: Workload) -> Iterator[Row]:
-    """Family, flags, and where pixels end; what each sweep is compared with ends its pixels in the same place."""
-    camera, default, usual = load.some[0], SweepOptions(), INRIA.transmittance_threshold
-    variants = [(*flagged, default) for family in load.families for flagged in load.flagged(family)]
-    if default.transmittance_threshold not in (None, usual):
-        ends = dataclasses.replace(default, transmittance_threshold=usual)
-        variants += [(f"{f}, pixels end at {usual:.0e}", False, load.profiled(f), ends) for f in load.families]
-    with Rasterizer(variants[0][2], load.scene) as rasterizer, RemovalSweep(rasterizer, [camera]) as removal:
-        chosen = choose_splats(removal.measure()[1], SPLATS // 3 if load.quick else SPLATS)
-    thresholds = sorted({usual, default.transmittance_threshold or usual}, reverse=True)
-    brute = BruteForce(reference.project(load.scene, camera, INRIA), camera, INRIA)
-    truths = dict(zip(thresholds, brute.effects(chosen, thresholds)[0], strict=True))
-    for label, is_default, device, options in variants:
-        with Rasterizer(device, load.scene) as rasterizer, RemovalSweep(rasterizer, [camera], options) as removal:
-            effect = removal.measure()[0][chosen]
+        for stage, (kernels, measure) in KERNELS.items():
+            seconds = sum(min(run.get(kernel, 0.0) for run in runs) for kernel in kernels)
+            yield Row(stage, name, seconds, errors[measure], default)
+        with Rasterizer(device, load.scene) as rasterizer, RemovalSweep(rasterizer, load.some[:1]) as removal:
 
             def sweep(removal: RemovalSweep = removal) -> None:
                 removal.sweep_everything()
                 removal.measure()
 
-            best = best_of(load.repeats, sweep)
-        true = truths[options.transmittance_threshold or usual] / (3 * camera.width * camera.height)
-        seen = true > 0
-        yield Row("removal", label, best, float(np.median(np.abs(effect[seen] / true[seen] - 1))), is_default)
-
-
-def choose_splats(importance: F64, count: int) -> NDArray[np.int64]:
-    """About ``count`` splats that the views see, evenly over the logarithm of importance."""
-    seen = np.flatnonzero(importance > 0)
-    by_importance = seen[np.argsort(importance[seen], kind="stable")]
-    low, high = np.log(importance[by_importance[[len(seen) // 100, -1]]])
-    at = np.searchsorted(np.log(importance[by_importance]), np.linspace(low, high, count))
-    return np.unique(by_importance[at.clip(0, len(seen) - 1)])
+            yield Row("removal", name, best_of(load.repeats, sweep), errors["removal: effect"], default)
 
 
 def ridge_rows(load: Workload) -> Iterator[Row]:
@@ -244,7 +167,7 @@ def ridge_rows(load: Workload) -> Iterator[Row]:
     with Rasterizer(Device(load.info), scene) as rasterizer, RemovalSweep(rasterizer, views) as sweep:
         sweep.measure()
         weights = ViewWeights.from_importances(len(scene), sweep.view_importances())
-    for family in load.families:
+    for family in families(load.info):
         device = load.profiled(family)
         for precision in get_args(Precision):
             # λ 0.01 and no column dropped: as hard as it gets.
@@ -267,7 +190,7 @@ def refit_rows(load: Workload) -> Iterator[Row]:
         importance = removal.measure()[1]
     kept = load.scene.subset(np.sort(np.argsort(importance)[len(importance) // 2 :]))
     default = EncodeOptions.for_preset("best").refit.steps
-    for family in load.families[: 1 if load.quick else 2]:
+    for family in families(load.info)[: 1 if load.quick else 2]:
         device = Device(load.info, family=family)
         with Rasterizer(device, load.scene) as rasterizer:
             targets = RenderedTargets(rasterizer, views)
@@ -303,11 +226,11 @@ def code_rows(load: Workload) -> Iterator[Row]:
 
 #: By stage: what the time is of, what the error is, and what measures it.
 STAGES: dict[str, tuple[str, str, Callable[[Workload], Iterator[Row]]]] = {
-    "project": ("a view's projection", "largest error of a centre, pixels", rasterizer_rows),
-    "tile lists": ("a view's tile lists", "intersections that another variant has not", rasterizer_rows),
-    "sort": ("a view's depth sort", "intersections out of order", rasterizer_rows),
-    "composite": ("a view's compositing", "largest error of a pixel", rasterizer_rows),
-    "removal": ("a sweep over all tiles of a view", "median relative error of ΔMSE", removal_rows),
+    "project": ("a view's projection", "largest error of a splat's alpha", view_rows),
+    "tile lists": ("a view's tile lists", "255 alpha - 1 of what a list lacks", view_rows),
+    "sort": ("a view's depth sort", "intersections out of order", view_rows),
+    "composite": ("a view's compositing", "largest error of a pixel", view_rows),
+    "removal": ("a sweep over all tiles of a view", "largest relative error of ΔMSE", view_rows),
     "ridge": ("the kernel, a million splats", "colour error above the optimum, 99.99th percentile", ridge_rows),
     "re-fit": ("the solver", "RMS error on training views", refit_rows),
     "code": ("coding without looking at views", "bytes", code_rows),

@@ -8,18 +8,397 @@ if one is not.
 
 from __future__ import annotations
 
+import dataclasses
+import gzip
+import json
+import struct
 import sys
 import tempfile
+import zipfile
+import zlib
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from random import Random
+from typing import Any
 
+import numpy as np
+import zstandard
+
+from potr_cl.codec.encoder import code_scene
+from potr_cl.codec.quantize import HyperParameters
+from potr_cl.codec.sections import ORDER
+from tests.reference.file_parts import STREAMS, File, Section
+from tests.reference.scenes import random_scene
 from tools.results import Results
-from tools.stress.hostile.bomb_files import BOMBS
+from tools.stress.hostile import (
+    camera_files,
+    gltf_files,
+    picture_files,
+    ply_files,
+    potr_files,
+    sog_files,
+    splat_files,
+)
+from tools.stress.hostile.changes import Files, saved
 from tools.stress.hostile.judge import Verdict
 from tools.stress.hostile.supervisor import read_again
 from tools.stress.hostile.worker import Job, keep
 from tools.workloads import plain_parser
 
 _MIB = 1 << 20
+_LONG = 1 << 26
+_ORDER = [prop.value for prop in ORDER]
+Bomb = Callable[[], Files]
+
+
+def _is(name: str, data: bytes) -> Bomb:
+    return lambda: {name: data}
+
+
+def _nested(name: str, opening: bytes) -> dict[str, Bomb]:
+    return {"100,000 nested objects": _is(name, opening * 100_000)}
+
+
+# .potr ---------------------------------------------------------------------------------------------------------------
+
+
+def _potr(splats: int, depth: int, sections: list[Section], degree: int = 0, blocks: int = 1) -> Files:
+    """A file of equal blocks of the plain coder."""
+    file = File.of(potr_files.originals()[3])
+    block = dataclasses.replace(file.blocks[0], splats=splats, depth=depth, side=0.0)
+    block.reals = [*(-9.0,) * 3, *(9.0,) * 3, 0.0, 0.0, 0.0, 0.0]
+    if not any(section.name == b"OPAC" for section in sections):
+        sections = [*sections, Section(b"OPAC", b"\0", 1)]
+    block.sections = sorted(sections, key=lambda section: _ORDER.index(section.name.decode()))
+    return {"a.potr": dataclasses.replace(file, degree=degree, blocks=[block] * blocks).bytes()}
+
+
+def _run(name: bytes, value: int, size: int, before: bytes = b"") -> Section:
+    """A section that holds one byte over and over."""
+    raw = before + bytes([value]) * size
+    return Section(name, zstandard.ZstdCompressor(level=3).compress(raw), len(raw))
+
+
+def _one_leaf(splats: int, depth: int = 0) -> list[Section]:
+    crowded = np.packbits(np.ones(depth, bool), bitorder="little").tobytes()
+    tree = [Section(b"OCCU", b"\1" * depth, depth), Section(b"SEVE", crowded, len(crowded))]
+    return [*(tree if depth else []), Section(b"MULT", splats.to_bytes(4, "little"), 4)]
+
+
+def _equal_splats() -> Files:
+    alike = random_scene(1, 0).subset(np.zeros(400_000, np.int64))
+    return {"a.potr": b"".join(code_scene(alike, HyperParameters.from_quality(0.5, "best")).pieces)}
+
+
+def _long_description() -> Files:
+    """A description, whose stored size opens the section."""
+    file = File.of(potr_files.originals()[8])
+    section = next(section for section in file.blocks[0].sections if section.name == b"OPAC")
+    (described,) = struct.unpack_from("<I", section.stored)
+    packed = zstandard.ZstdCompressor(level=3).compress(bytes(_LONG))
+    section.stored = struct.pack("<I", len(packed)) + packed + section.stored[4 + described :]
+    section.raw = len(section.stored)
+    return {"a.potr": file.bytes()}
+
+
+def _long_metadata() -> Files:
+    file = File.of(potr_files.originals()[3])
+    file.sections = [_run(b"meta", 32, _LONG)]
+    return {"a.potr": file.bytes()}
+
+
+def _blocks_of_one_splat(number: int) -> Files:
+    """Each costs time of its own."""
+    file = File.of(potr_files.originals()[4])
+    file.blocks = file.blocks * number
+    return {"a.potr": file.bytes()}
+
+
+def _all_cells() -> Files:
+    """A full tree and a long chain of cells above each of its splats."""
+    levels, splats = 5, 8**5
+    occupancy = b"\377" * sum(8**level for level in range(levels)) + b"\1" * splats * 40
+    cells = sum(8**level for level in range(1, levels + 1)) + splats * 40
+    several = np.packbits(np.arange(cells) < cells - splats, bitorder="little").tobytes()
+    packer = zstandard.ZstdCompressor(level=3)
+    sections = [Section(n, packer.compress(raw), len(raw)) for n, raw in ((b"OCCU", occupancy), (b"SEVE", several))]
+    return _potr(splats, levels + 40, [*sections, _run(b"LEAF", 0, splats)])
+
+
+def _as_much_as_is_let_through(planes: int) -> Files:
+    """The most splats that a file may claim, with every attribute as long as can be."""
+    splats = 64_000 + 8 * 8_000
+    sections = _one_leaf(splats, 52)
+    for name in (b"SCAL", b"ROTA", b"SHC0", b"SHC1", b"SHC2", b"SHC3"):
+        sections.append(_run(name, 255, planes * splats * STREAMS[name], bytes([planes] * STREAMS[name])))
+    file = File.of(_potr(splats, 52, sections, degree=3)["a.potr"])
+    noise = np.random.default_rng(0).integers(0, 256, 8_000, np.uint8).tobytes()
+    file.blocks[0].sections.append(Section(b"junk", noise, len(noise)))
+    return {"a.potr": file.bytes()}
+
+
+# Scenes of other tools ------------------------------------------------------------------------------------------------
+
+_PROPERTIES = [f"property float {name}" for name in ply_files.names_of(0)]
+_BINARY, _ONE = "binary_little_endian", ["element vertex 1", *_PROPERTIES]
+
+
+def _ply(layout: str, lines: list[str], body: bytes) -> Bomb:
+    return lambda: {"a.ply": "\n".join(["ply", f"format {layout} 1.0", *lines, "end_header", ""]).encode() + body}
+
+
+def _compressed_count(count: int) -> Files:
+    data = saved("a.compressed.ply", 1, 3)["a.compressed.ply"]
+    for name, number in (("vertex", count), ("sh", count), ("chunk", -(-count // 256))):
+        data = data.replace(f"element {name} 1\n".encode(), f"element {name} {number}\n".encode())
+    return {"a.compressed.ply": data}
+
+
+def _spz_gzip(splats: int, more: int = 0, flags: int = 0) -> Files:
+    content = bytes(splats * (9 + 1 + 3 + 3 + 4 + 45) + more)
+    return {"a.spz": gzip.compress(splat_files.spz_content(3, splats, 3, content, flags), 9, mtime=0)}
+
+
+def _spz_members() -> Files:
+    start = gzip.compress(splat_files.spz_content(3, 1000, 0, bytes(20_000)), 9, mtime=0)
+    return {"a.spz": start + gzip.compress(bytes(1 << 24), 9, mtime=0) * 8}
+
+
+def _spz_streams(splats: int, said: int | None = None) -> Files:
+    sizes = [size * splats for size in (9, 1, 3, 3, 4, 45)]
+    streams = [zstandard.ZstdCompressor(level=3).compress(bytes(size)) for size in sizes]
+    return {"a.spz": splat_files.spz_of_streams(said or splats, 3, streams, sizes)}
+
+
+def _sog(side: int = 0, changes: Bomb = dict, **meta: Any) -> Bomb:
+    """A folder of four splats, see :func:`sog_files.parts`, some of its files changed, as an archive."""
+    return lambda: {"a.sog": sog_files.archive(sog_files.parts(4, 0, side, **meta) | changes(), zipfile.ZIP_DEFLATED)}
+
+
+def _sog_overlapping() -> Files:
+    """Thousands of names for the same packed bytes."""
+    crc, packed = zlib.crc32(bytes(1 << 24)), zlib.compress(bytes(1 << 24), 9)[2:-4]
+    sizes = (8, 0, 0, crc, len(packed), 1 << 24, 6, 0)
+    local = struct.pack("<4sHHHHHIIIHH", b"PK\3\4", 20, 0, *sizes) + b"a.webp" + packed
+    entry = struct.pack("<4sHHHHHHIIIHHHHHII", b"PK\1\2", 20, 20, 0, *sizes, 0, 0, 0, 0, 0)
+    entries = b"".join(entry + b"%06d" % i for i in range(3000))
+    end = struct.pack("<4sHHHHIIH", b"PK\5\6", 0, 0, 3000, 3000, len(entries), len(local), 0)
+    return {"a.sog": local + entries + end}
+
+
+def _levels(folders: int) -> Files:
+    small = sog_files.parts(4, 0, count=65_536, scales={}, sh0={})["meta.json"]
+    leaves = [{"lods": {"0": {"file": k, "offset": 0, "count": 65_536}}} for k in range(folders)]
+    names = [f"{k}.json" for k in range(folders)]
+    tree = {"lodLevels": 1, "filenames": names, "tree": {"children": leaves}}
+    return {"lod-meta.json": json.dumps(tree).encode()} | dict.fromkeys(names, small)
+
+
+def _leaves(number: int, count: int) -> Files:
+    leaves = [{"lods": {"0": {"file": 0, "offset": 0, "count": count}}}] * number
+    meta = {"lodLevels": 1, "filenames": ["0/meta.json"], "tree": {"children": leaves}}
+    return sog_files.streamed(meta, {"0": (5, 0)})
+
+
+def _gltf(name: str, splats: int = 5, **changes: Any) -> Files:
+    """An asset with parts of its description replaced; a function is applied to each of a list's entries."""
+    description, content = gltf_files.asset(splats, 0)
+    for key, value in changes.items():
+        description[key] = [each | value for each in description[key]] if isinstance(value, dict) else value
+    text = gltf_files.glb(json.dumps(description).encode(), content)
+    return {name: text if name.endswith("glb") else gltf_files.gltf(description, content, None)}
+
+
+def _nodes(name: str, number: int, node: dict[str, int], splats: int = 5) -> Bomb:
+    return partial(_gltf, name, splats, nodes=[node] * number, scenes=[{"nodes": list(range(number))}])
+
+
+def _ksplat(at: int, size: int, value: int) -> Files:
+    data = bytearray(splat_files.ksplat(Random(7), level=1)["a.ksplat"])
+    data[at : at + size] = value.to_bytes(size, "little")
+    return {"a.ksplat": bytes(data)}
+
+
+def _gzipped_zeros() -> Files:
+    splats = (1 << 24) // (4 * len(_PROPERTIES))
+    plain = _ply(_BINARY, [f"element vertex {splats}", *_PROPERTIES], bytes(4 * len(_PROPERTIES) * splats))
+    return {"a.ply.gz": gzip.compress(plain()["a.ply"], 9, mtime=0)}
+
+
+# Cameras and pictures -------------------------------------------------------------------------------------------------
+
+
+def _views(**changes: Any) -> Files:
+    views = json.loads(camera_files.cameras(Random(0))["cameras.json"])
+    return {"cameras.json": json.dumps([views[0] | changes, *views[1:]]).encode()}
+
+
+def _frames(count: int) -> Files:
+    content = json.loads(next(iter(camera_files.transforms(Random(0)).values())))
+    return {"transforms.json": json.dumps(content | {"frames": content["frames"] * (count // 3)}).encode()}
+
+
+def _colmap(cameras: int = 2, images: int = 3, points: int = 0, name: bytes = b"view_0.png\0") -> Files:
+    files = camera_files.colmap_binary(Random(0))
+    poses = struct.pack("<Q", images) + files["images.bin"][8:].replace(b"view_0.png\0", name)
+    end = poses.index(name) + len(name)
+    lenses = struct.pack("<Q", cameras) + files["cameras.bin"][8:]
+    return {"images.bin": poses[:end] + struct.pack("<Q", points) + poses[end + 8 :], "cameras.bin": lenses}
+
+
+def _colmap_text(line: bytes) -> Bomb:
+    files = camera_files.colmap_text(Random(0))
+    return lambda: files | {"images.txt": files["images.txt"] + line}
+
+
+def _png(width: int, height: int, kind: bytes = b"", start: bytes = b"", rows: int = 0) -> Bomb:
+    """Of no rows, or of so many bytes of them; with a chunk of 64 MB behind its start if a kind is given."""
+    others = [picture_files.chunk(kind, start + zlib.compress(bytes(_LONG), 9))] if kind else []
+    return lambda: {"a.png": picture_files.png_of(width, height, bytes(rows), *others)}
+
+
+def _jpeg(side: int) -> Files:
+    data = bytearray(picture_files.saved_as("RGB", "JPEG"))
+    frame = data.find(b"\xff\xc0")
+    data[frame + 5 : frame + 9] = struct.pack(">HH", side, side)
+    return {"a.jpg": bytes(data)}
+
+
+def _page(files: Files) -> Files:
+    return {"a.html": potr_files.page_of(files["a.potr"])}
+
+
+_WEBP = struct.pack("<4sI8sIBI5x", b"RIFF", 22, b"WEBPVP8L", 10, 0x2F, 16382 | 16382 << 14)
+_BIG, _EQUAL = "pictures of 4,000², all splats claimed", "a million equal splats"
+
+#: By format and name.
+BOMBS: dict[str, dict[str, Bomb]] = {
+    "potr": {
+        **{
+            f"one splat, long {name.decode()}": partial(_potr, 1, 52, [_run(name, name == b"OCCU", _LONG)])
+            for name in (b"OCCU", b"SEVE", b"MULT", b"LEAF", b"TAIL")
+        },
+        "one splat, long metadata": _long_metadata,
+        "a leaf of 4 million splats": lambda: _potr(1 << 22, 0, _one_leaf(1 << 22)),
+        "400,000 equal splats": _equal_splats,
+        "a long description": _long_description,
+        "1.3 million cells above 32,768 splats": _all_cells,
+        "the most splats that are let through": partial(_as_much_as_is_let_through, 1),
+        "the most splats, 7 planes each": partial(_as_much_as_is_let_through, 7),
+        "1,000 blocks of 65,536 splats": lambda: _potr(65_536, 0, _one_leaf(65_536), blocks=1000),
+        "2,000 blocks of a splat": partial(_blocks_of_one_splat, 2000),
+    },
+    "html": {
+        "a leaf of 4 million splats": lambda: _page(_potr(1 << 22, 0, _one_leaf(1 << 22))),
+        "the most splats that are let through": lambda: _page(_as_much_as_is_let_through(1)),
+    },
+    "ply": {
+        "2³¹ splats claimed": _ply(_BINARY, [f"element vertex {1 << 31}", *_PROPERTIES], bytes(1000)),
+        "10¹⁸ splats claimed": _ply("ascii", [f"element vertex {10**18}", *_PROPERTIES], b"0 " * 1000),
+        "10¹² empty rows": _ply("ascii", [f"element nothing {10**12}", *_ONE], b"0 " * len(_PROPERTIES) + b"\n"),
+        "30,000 properties": _ply(_BINARY, [*_ONE, *(f"property double p{i}" for i in range(30_000))], bytes(300_000)),
+        "50,000 elements": _ply("ascii", [*(f"element e{i} 0" for i in range(50_000)), *_ONE], b"0 " * 20),
+        "a row of 500,000 numbers": _ply("ascii", _ONE, b"0 " * 500_000),
+        "a number of a million digits": _ply("ascii", _ONE, b"9" * 1_000_000 + b" 0" * (len(_PROPERTIES) - 1) + b"\n"),
+        "100,000 comments": _ply("ascii", ["comment"] * 100_000, b""),
+    },
+    "compressed.ply": {"2³⁰ splats claimed": partial(_compressed_count, 1 << 30)},
+    "spz": {
+        f"{_EQUAL}, gzip": partial(_spz_gzip, 1_000_000),
+        "64 MB behind one splat, gzip": partial(_spz_gzip, 1, _LONG),
+        "64 MB as an extension, gzip": partial(_spz_gzip, 1, _LONG, 2),
+        "128 MB in further members, gzip": _spz_members,
+        f"{_EQUAL}, Zstandard": partial(_spz_streams, 1_000_000),
+        "streams of a million, one splat claimed": partial(_spz_streams, 1_000_000, 1),
+    },
+    "sog": {
+        _BIG: _sog(4000, count=16_000_000),
+        "pictures of 4,000², one splat claimed": _sog(4000, count=1),
+        "64 MB of blanks as description": _sog(changes=lambda: {"meta.json": b" " * _LONG + b"{}"}),
+        "64 MB of brackets as description": _sog(changes=lambda: {"meta.json": b"[" * _LONG}),
+        "64 MB as a picture": _sog(changes=lambda: {"means_l.webp": bytes(_LONG)}),
+        "48 GB by 3,000 names for one member": _sog_overlapping,
+        "a codebook of a million": _sog(sh0={"codebook": [0] * 1_000_000, "files": ["sh0.webp"]}),
+    },
+    "sog-folder": {
+        _BIG: lambda: sog_files.parts(4, 0, 4000, count=16_000_000),
+        "a device as a picture": lambda: sog_files.parts(4, 0, sh0={"codebook": [0] * 256, "files": ["/dev/zero"]}),
+    },
+    "sog-levels": {
+        "1,000 folders of 65,536 splats claimed": partial(_levels, 1000),
+        "one splat in 100,000 leaves": partial(_leaves, 100_000, 1),
+        "2⁶⁰ splats claimed in a leaf": partial(_leaves, 1, 1 << 60),
+        **_nested("lod-meta.json", b'{"tree":{"children":['),
+    },
+    "glb": {
+        "65,536 nodes with one mesh": _nodes("a.glb", 65_536, {"mesh": 0}, 100),
+        "65,536 nodes with one splat": _nodes("a.glb", 65_536, {"mesh": 0}, 1),
+        "2³¹ splats claimed": partial(_gltf, "a.glb", accessors={"count": (1 << 31) - 1}),
+        "16 million splats claimed in nothing": partial(
+            _gltf, "a.glb", accessors={"count": 1 << 24, "bufferView": None}
+        ),
+        "a stride of nothing": partial(_gltf, "a.glb", accessors={"count": 1 << 24}, bufferViews={"byteStride": 0}),
+        "4 GB claimed in the header": _is("a.glb", b"glTF\2\0\0\0" + b"\xff" * 4 + b"\xf0\xff\xff\xffJSON{}"),
+        "100,000 nested objects": lambda: {"a.glb": gltf_files.glb(b'{"asset":' * 100_000, b"")},
+    },
+    "gltf": {
+        "500,000 empty nodes": _nodes("a.gltf", 500_000, {}),
+        "a chain of 20,000 nodes": partial(
+            _gltf, "a.gltf", nodes=[*({"children": [k + 1], "scale": [2] * 3} for k in range(20_000)), {"mesh": 0}]
+        ),
+        "16 MB in base64 that is none": lambda: {
+            "a.gltf": gltf_files.gltf(gltf_files.asset(5, 0)[0], b"", "data:;base64," + "!" * (1 << 24))
+        },
+    },
+    "splat": {"empty": _is("a.splat", b"")},
+    "ksplat": {
+        "2³² sections claimed": partial(_ksplat, 4, 4, 0xFFFFFFFF),
+        "2³² splats claimed": partial(_ksplat, 4100, 4, 0xFFFFFFFF),
+        "2³² buckets of 2³² claimed": partial(_ksplat, 4104, 4, 0xFFFFFFFF),
+        "a bucket of 2³² splats": partial(_ksplat, 5120, 4, 0xFFFFFFFF),
+    },
+    "ply.gz": {
+        "64 MB of blanks": lambda: {"a.ply.gz": gzip.compress(b" " * _LONG, 9, mtime=0)},
+        "16 MB of splats in zeros": _gzipped_zeros,
+        "members without content": lambda: {"a.ply.gz": gzip.compress(b"", mtime=0) * 100_000},
+    },
+    "cameras.json": {
+        "100,000 brackets": _is("cameras.json", b"[" * 100_000),
+        "a number of a million digits": _is("cameras.json", b"[" + b"9" * 1_000_000 + b"]"),
+        "500,000 empty views": _is("cameras.json", b"[" + b"{}," * 500_000 + b"{}]"),
+        "a name of a million folders": partial(_views, img_name="a/" * 500_000 + "a.png"),
+        "a matrix of a million": partial(_views, rotation=[[0] * 1000] * 1000),
+        **_nested("cameras.json", b'{"a":'),
+    },
+    "transforms.json": {
+        "30,000 frames of one name": partial(_frames, 30_000),
+        **_nested("transforms.json", b'{"frames":'),
+    },
+    "colmap-binary": {
+        "2⁶³ cameras claimed": partial(_colmap, 1 << 63),
+        "2⁶³ images claimed": partial(_colmap, images=1 << 63),
+        "points that wrap round": partial(_colmap, points=(1 << 64) // 24 + 1),
+        "a name of a million letters": partial(_colmap, name=b"a" * 1_000_000 + b"\0"),
+    },
+    "colmap-text": {
+        "a line of a million words": _colmap_text(b"1 " * 1_000_000),
+        "a number of a million digits": _colmap_text(b"9" * 1_000_000 + b" 1 0 0 0 0 0 2 1 a.png\n\n"),
+        "500,000 empty lines": _colmap_text(b"\n" * 500_000),
+    },
+    "png": {
+        "65,535² pixels, no rows": _png(65_535, 65_535),
+        "64 MB behind a pixel": _png(1, 1, rows=_LONG),
+        "64 MB as a text": _png(8, 8, b"zTXt", b"a\0\0", 25 * 8),
+        "64 MB as an international text": _png(8, 8, b"iTXt", b"a\0\1\0\0\0", 25 * 8),
+        "64 MB as a colour profile": _png(8, 8, b"iCCP", b"a\0\0", 25 * 8),
+    },
+    "jpeg": {"65,500² pixels": partial(_jpeg, 65_500)},
+    "webp": {
+        "16,383² pixels claimed": _is("a.webp", _WEBP),
+        "2,000² equal pixels": lambda: {"a.webp": sog_files.one_colour(2000)},
+    },
+}
 
 
 def main() -> None:

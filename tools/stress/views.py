@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections.abc import Iterator
 from functools import partial
 from typing import cast
 
@@ -19,7 +20,7 @@ from tests.reference import raster as reference
 from tools.stress.cases import Case
 from tools.stress.derivatives import check_derivatives, tellable
 from tools.stress.fits import check_fits
-from tools.stress.measures import Measures
+from tools.stress.measures import Measure, Measures
 from tools.stress.precise import (
     F64,
     ULP,
@@ -45,6 +46,19 @@ REMOVED, BRIGHTEST = 64, 4.0
 
 def check(device: Device, case: Case) -> Measures:
     """Every measure of a view."""
+    found, clear = check_rasterizer(device, case)
+    if clear is None and not np.isfinite(found["composite"][0]):
+        return found
+    true = projected(case)
+    shown = (alphas_of_covariances(true, Pixels.of(case.view)) >= 1 / 255).any(axis=1)
+    sound = tellable(true.covariance[shown], true.colour[shown])
+    draw = partial(stand_in, case)
+    found |= check_fits(device, case)
+    return found | check_derivatives(device, case.scene, case.view, case.rules, clear, sound, draw, DRAWS)
+
+
+def check_rasterizer(device: Device, case: Case) -> tuple[Measures, Mask | None]:
+    """The measures of the rasterizer and of removal; and which pixels are clear of all thresholds by the definition."""
     # By the cap that the kernels get: the float32 nearest to 0.999 lets 1.3e-5 less light through.
     cap = float(np.float32(case.rules.alpha_cap))
     case = dataclasses.replace(case, rules=dataclasses.replace(case.rules, alpha_cap=cap))
@@ -53,24 +67,46 @@ def check(device: Device, case: Case) -> Measures:
         finite = np.isfinite(lists.image).all() and np.isfinite(lists.transmittance).all()
         finite &= bool(np.isfinite(lists.colours[np.unique(lists.intersections)]).all())
         if not finite or lists.transmittance.min() < 0 or lists.transmittance.max() > 1:
-            return {"composite": (np.inf, ULP)}
-        pixels = Pixels.of(case.view)
+            return {"composite": (np.inf, ULP)}, None
+        pixels, true = Pixels.of(case.view), projected(case)
+        drawn = list(_drawn(case, true, pixels))
         order = lists.order()
         member = lists.membership(order, len(lists.offsets) - 1)
         inside = member[:, pixels.tile]
         raw = np.where(inside, alphas_of_shapes(lists.shapes[order], pixels), 0)
-        found = check_projection(case, lists, pixels)
-        found |= check_lists(case, lists, pixels, raw, member)
-        composited, clear = check_composite(case, lists, pixels, raw, inside)
-        render, tellable_pixels = check_render(case, lists, pixels)
-        found |= composited | render
+        found = check_projection(case, lists, pixels, true, drawn)
+        found |= check_lists(case, lists, pixels, member)
+        found["composite"], clear = check_composite(case, lists, pixels, raw, inside)
         found |= check_removal(case, rasterizer, lists, pixels, raw, inside, clear)
-    true = projected(case)
-    shown = np.isin(true.index, lists.intersections)
-    sound = tellable(true.covariance[shown], true.colour[shown])
-    draw = partial(stand_in, case)
-    found |= check_fits(device, case)
-    return found | check_derivatives(device, case.scene, case.view, case.rules, tellable_pixels, sound, draw, DRAWS)
+        if case.rules.square_extent:
+            return found, None
+        found["render"], clear = check_render(case, lists, pixels, true, drawn)
+        return found, clear
+
+
+@dataclasses.dataclass
+class Drawn:
+    """What rounding may make of the splats of a projection; of those that it hides ``there`` is False, and alpha 0."""
+
+    there: Mask
+    alpha: F64
+    colour: F64
+    depth: F64
+
+
+def _drawn(case: Case, true: reference.Projected, pixels: Pixels) -> Iterator[Drawn]:
+    rng = np.random.default_rng(SEED)
+    place = {int(k): i for i, k in enumerate(true.index)}
+    for _ in range(DRAWS):
+        moved = projected(case, rng)
+        at = np.array([place.get(int(k), -1) for k in moved.index], int)
+        kept = at >= 0
+        alpha = np.zeros((len(true.index), len(pixels.x)))
+        drawn = Drawn(np.zeros(len(alpha), bool), alpha, true.colour.copy(), true.depth.copy())
+        drawn.there[at[kept]] = True
+        drawn.alpha[at[kept]] = alphas_of_covariances(moved, pixels)[kept]
+        drawn.colour[at[kept]], drawn.depth[at[kept]] = moved.colour[kept], moved.depth[kept]
+        yield drawn
 
 
 @dataclasses.dataclass
@@ -116,10 +152,10 @@ def rasterized(rasterizer: Rasterizer, view: Camera) -> Lists:
         )
 
 
-def check_projection(case: Case, lists: Lists, pixels: Pixels) -> Measures:
+def check_projection(
+    case: Case, lists: Lists, pixels: Pixels, true: reference.Projected, drawn: list[Drawn]
+) -> Measures:
     """Ellipses, colours and depths of the splats in front of the near plane."""
-    rng = np.random.default_rng(SEED)
-    true = projected(case)
     ours = lists.shapes[true.index]
     cap = case.rules.alpha_cap
     alpha = np.minimum(alphas_of_covariances(true, pixels), cap)
@@ -136,21 +172,13 @@ def check_projection(case: Case, lists: Lists, pixels: Pixels) -> Measures:
     colour = np.abs(lists.colours[true.index] - np.clip(true.colour, 0, 1e30)) / scale
     depth = np.abs(ours[:, 6] - true.depth) / distance
     expected = np.full(3, ULP)
-    for _ in range(DRAWS):
-        moved = projected(case, rng)
-        place = {int(k): i for i, k in enumerate(moved.index)}
-        at = np.array([place.get(int(k), -1) for k in true.index], int)
-        there = at >= 0
-        if not there.any():
-            continue
-        moved_alpha = np.minimum(alphas_of_covariances(moved, pixels)[at[there]], cap)
-        moved_colour = np.abs(np.maximum(moved.colour[at[there]], 0) - true.colour[there]) / scale[there]
+    for each in drawn:
         changes = (
-            np.abs(moved_alpha - alpha[there]).max(initial=0),
-            moved_colour.max(initial=0),
-            (np.abs(moved.depth[at[there]] - true.depth[there]) / distance[there]).max(initial=0),
+            np.abs(np.minimum(each.alpha, cap) - alpha)[each.there],
+            (np.abs(np.maximum(each.colour, 0) - true.colour) / scale)[each.there],
+            np.abs(each.depth - true.depth) / distance,
         )
-        expected = np.maximum(expected, changes)
+        expected = np.maximum(expected, [change.max(initial=0) for change in changes])
     return {
         "project: alpha": (float(error.max(initial=0)), expected[0]),
         "project: colour": (float(colour[listed].max(initial=0)), expected[1]),
@@ -158,7 +186,7 @@ def check_projection(case: Case, lists: Lists, pixels: Pixels) -> Measures:
     }
 
 
-def check_lists(case: Case, lists: Lists, pixels: Pixels, raw: F64, member: Mask) -> Measures:
+def check_lists(case: Case, lists: Lists, pixels: Pixels, member: Mask) -> Measures:
     """That lists hold all that reaches 1/255, by the device's own ellipses, and hold it in order."""
     found: Measures = {}
     if not case.rules.square_extent:  # which cuts lists short on purpose
@@ -179,49 +207,21 @@ def check_lists(case: Case, lists: Lists, pixels: Pixels, raw: F64, member: Mask
     return found
 
 
-def moved_raw(lists: Lists, order: NDArray[np.int64], pixels: Pixels, inside: Mask, rng: np.random.Generator) -> F64:
-    """Alphas of ellipses that rounding has changed."""
-    return np.where(inside, alphas_of_shapes(rounded(lists.shapes[order], rng), pixels), 0)
-
-
-def check_composite(case: Case, lists: Lists, pixels: Pixels, raw: F64, inside: Mask) -> tuple[Measures, Mask]:
+def check_composite(case: Case, lists: Lists, pixels: Pixels, raw: F64, inside: Mask) -> tuple[Measure, Mask]:
     """The picture, by the device's own ellipses and lists; and which pixels are clear of all thresholds."""
     rng = np.random.default_rng(SEED)
     order = lists.order()
     colours = lists.colours[order]
-    true = composite(raw, colours, case.rules)
-    brightest = max(1.0, float(colours.max(initial=0)))
-    wobble = np.full(len(pixels.x), 16 * ULP)
-    changes = []
-    for _ in range(DRAWS):
-        moved = moved_raw(lists, order, pixels, inside, rng)
-        wobble += (np.abs(moved - raw) / np.maximum(raw, 1 / 255)).sum(axis=0)
-        other = composite(moved, rounded(colours, rng), case.rules)
-        changes.append(difference(other.image, other.transmittance, true, brightest))
-    clear = true.margin > 1e-4 + 8 * wobble
-    error = difference(lists.image, lists.transmittance, true, brightest)
-    expected = ULP + max(float(change[clear].max(initial=0)) for change in changes)
-    return {"composite": (float(error[clear].max(initial=0)), expected)}, clear
+    moved = [(moved_raw(lists, order, pixels, inside, rng), rounded(colours, rng)) for _ in range(DRAWS)]
+    return _compared(case, lists, raw, colours, moved, np.ones(len(pixels.x), bool))
 
 
-def difference(image: F64, transmittance: F64, true: Composited, brightest: float) -> F64:
-    """(P,) of a picture to another."""
-    error: F64 = np.abs(image - true.image).max(axis=1) / brightest
-    return np.maximum(error, np.abs(transmittance - true.transmittance))
-
-
-def check_render(case: Case, lists: Lists, pixels: Pixels) -> tuple[Measures, Mask | None]:
+def check_render(
+    case: Case, lists: Lists, pixels: Pixels, true: reference.Projected, drawn: list[Drawn]
+) -> tuple[Measure, Mask]:
     """The picture by the definition alone, where no threshold and no tie in depth is near; and where that is."""
-    if case.rules.square_extent:
-        return {}, None
-    rng = np.random.default_rng(SEED)
-    true = projected(case)
     raw = alphas_of_covariances(true, pixels)
     visible = raw.max(axis=1, initial=0) >= 0.5 / 255
-    place = {int(k): i for i, k in enumerate(true.index)}
-    colours = np.clip(true.colour, 0, 1e30)
-    picture = composite(raw[visible], colours[visible], case.rules)
-    brightest = max(1.0, float(colours[visible].max(initial=0)))
     depth = true.depth[visible]
     # Orders that a float32 depth may have either way, and pairs of splats that share a pixel there.
     shown = raw[visible] >= 0.5 / 255
@@ -231,27 +231,40 @@ def check_render(case: Case, lists: Lists, pixels: Pixels) -> tuple[Measures, Ma
     for run in np.split(np.arange(len(depth)), np.flatnonzero(~tied) + 1):
         if len(run) > 1:
             clear &= shown[run].sum(axis=0) < 2
-    wobble = np.full(len(pixels.x), 16 * ULP)
-    changes = []
-    for _ in range(DRAWS):
-        moved = projected(case, rng)
-        at = np.array([place.get(int(k), -1) for k in moved.index], int)
-        kept = at >= 0
-        moved_alpha = np.zeros_like(raw)
-        moved_alpha[at[kept]] = alphas_of_covariances(moved, pixels)[kept]
-        moved_colours = colours.copy()
-        moved_colours[at[kept]] = np.clip(moved.colour[kept], 0, 1e30)
-        moved_alpha, moved_colours = moved_alpha[visible], moved_colours[visible]
-        wobble += (np.abs(moved_alpha - raw[visible]) / np.maximum(raw[visible], 1 / 255)).sum(axis=0)
-        other = composite(moved_alpha, moved_colours, case.rules)
-        changes.append(difference(other.image, other.transmittance, picture, brightest))
-    clear &= picture.margin > 1e-4 + 8 * wobble
     near = np.abs(true.depth - case.rules.near) < 1e-6 * case.rules.near
-    if near.any():
-        clear &= ~(raw[near] >= 0.5 / 255).any(axis=0)
-    error = difference(lists.image, lists.transmittance, picture, brightest)
-    expected = ULP + max(float(change[clear].max(initial=0)) for change in changes)
-    return {"render": (float(error[clear].max(initial=0)), expected)}, clear
+    clear &= ~(raw[near] >= 0.5 / 255).any(axis=0)
+    moved = [(each.alpha[visible], np.clip(each.colour[visible], 0, 1e30)) for each in drawn]
+    return _compared(case, lists, raw[visible], np.clip(true.colour[visible], 0, 1e30), moved, clear)
+
+
+def _compared(
+    case: Case, lists: Lists, raw: F64, colours: F64, moved: list[tuple[F64, F64]], clear: Mask
+) -> tuple[Measure, Mask]:
+    """The device's picture against that of some alphas and colours, where it is clear of thresholds; and where that is.
+
+    Args:
+        moved: what rounding may make of alphas and colours.
+        clear: pixels that may be.
+    """
+    true = composite(raw, colours, case.rules)
+    brightest = max(1.0, float(colours.max(initial=0)))
+    wobble = np.full(len(clear), 16 * ULP)
+    for other, _ in moved:
+        wobble += (np.abs(other - raw) / np.maximum(raw, 1 / 255)).sum(axis=0)
+    clear = clear & (true.margin > 1e-4 + 8 * wobble)
+
+    def off(image: F64, transmittance: F64) -> float:
+        error = np.abs(image - true.image).max(axis=1) / brightest
+        return float(np.maximum(error, np.abs(transmittance - true.transmittance))[clear].max(initial=0))
+
+    others = [composite(*pair, case.rules) for pair in moved]
+    expected = ULP + max(off(other.image, other.transmittance) for other in others)
+    return (off(lists.image, lists.transmittance), expected), clear
+
+
+def moved_raw(lists: Lists, order: NDArray[np.int64], pixels: Pixels, inside: Mask, rng: np.random.Generator) -> F64:
+    """Alphas of ellipses that rounding has changed."""
+    return np.where(inside, alphas_of_shapes(rounded(lists.shapes[order], rng), pixels), 0)
 
 
 def check_removal(

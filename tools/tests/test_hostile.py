@@ -14,7 +14,7 @@ import pytest
 from potr_cl.codec.sections import Coder
 from potr_cl.formats.registry import SCENE_FORMATS
 from tests.reference.file_parts import File, sealed
-from tools.stress.hostile.bomb_files import BOMBS
+from tools.stress.bombs import BOMBS
 from tools.stress.hostile.formats import FORMATS
 from tools.stress.hostile.judge import Verdict
 from tools.stress.hostile.potr_files import originals
