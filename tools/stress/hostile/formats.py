@@ -138,7 +138,8 @@ def parts_of(result: Any) -> list[bytes]:
     return [repr(result).encode()]
 
 
-Make, Change = Callable[[Random], Files], Callable[[Files, Random], Files]
+Make = Callable[[Random], Files]
+Change = Callable[[Files, Random], Files]
 
 
 def _scene(make: Make, change: Change, constant: int, a_byte: int, read: Callable[[Path], Any] = read_scene) -> Format:
