@@ -155,13 +155,11 @@ def test_tables_of_curves_and_formats(monkeypatch, folder, tmp_path, capsys):
     }
     (tmp_path / "known.json").write_text(json.dumps({"sizes": sizes}))
     monkeypatch.setattr(formats, "KNOWN", tmp_path / "known.json")
-    files = tmp_path / "formats.json"
-    words = ("--json", files, "--q", 0.3, 0.5, "--formats", ".spz:2", "--transform", "/nowhere")
-    call(monkeypatch, formats, "measure", folder, *words)
     for point in (point for series in measured["scenes"]["excerpt"]["series"].values() for point in series["encodes"]):
         point["psnr_loss"] = 50 - point["psnr"]
     out.write_text(json.dumps(measured))
-    call(monkeypatch, formats, "report", files, "--json", kept, "--curves", out)
+    words = (folder, "--formats", ".spz:2", "--transform", "/nowhere", "--json", kept, "--curves", out)
+    call(monkeypatch, formats, *words, "--q", 0.3, 0.5)
     tables = json.loads(kept.read_text())
     assert [row[:3] for row in tables["outputs_excerpt"]["rows"]] == [
         ["encode", ".spz:2", 0.3],
@@ -173,11 +171,11 @@ def test_tables_of_curves_and_formats(monkeypatch, folder, tmp_path, capsys):
     assert spz[3:5] == pytest.approx([points[0]["bytes"] / 1e6, 5e4 / points[0]["bytes"]])
     assert other[0] == "Other"
     assert other[3].startswith("below")
-    call(monkeypatch, formats, "report", files, "--json", kept, "--curves", out, "--series", "fast")
+    call(monkeypatch, formats, *words, "--q", 0.3, "--series", "fast")
     heads = [column["name"] for column in json.loads(kept.read_text())["excerpt"]["columns"]]
     assert "fast at that PSNR" in heads
     with pytest.raises(UsageError, match="there is no series 'smallest'"):
-        call(monkeypatch, formats, "report", files, "--curves", out, "--series", "smallest")
+        call(monkeypatch, formats, *words, "--series", "smallest")
 
 
 def test_rgb_streams_keep_r_g_and_b():
@@ -190,19 +188,15 @@ def test_rgb_streams_keep_r_g_and_b():
 
 
 @pytest.mark.slow
-def test_ablation(monkeypatch, folder, tmp_path, capsys):
+def test_ablation(monkeypatch, folder, tmp_path):
     out = tmp_path / "out.json"
-    call(monkeypatch, ablation, "measure", folder, "--json", out)
-    steps = json.loads(out.read_text())["scenes"]["excerpt"]["steps"]
-    sizes = [step["bytes"] for step in steps]
-    assert len(steps) == 7
+    call(monkeypatch, ablation, folder, "--json", out)
+    tables = {name: table["rows"] for name, table in json.loads(out.read_text()).items()}
+    (_, *steps), (ply, *parts) = tables["excerpt"], tables["bytes_excerpt"]
+    sizes = [size for _, _, size, *_ in steps]
+    assert len(steps) == len(parts) == 7
     assert sizes[:6] == sorted(sizes[:6], reverse=True), "a part of the codec adds bytes"
-    assert steps[0]["psnr"] == steps[1]["psnr"]
-    for step in steps[1:]:
-        listed = sum(step["bytes_a_splat"].values()) * step["splats"]
-        assert 0 < step["bytes"] - listed < 3000, "more than the header is missing"
-    call(monkeypatch, ablation, "report", out, "--json", tmp_path / "results.json")
-    assert "| as PLY | 12.00 |" in capsys.readouterr().out
-    results = json.loads((tmp_path / "results.json").read_text())
-    assert [len(results[name]["rows"]) for name in ("excerpt", "bytes_excerpt")] == [8, 8]
-    assert results["excerpt"]["machine"] == json.loads(out.read_text())["machine"]
+    assert steps[0][3] == steps[1][3]
+    assert ply[:2] == ["as PLY", 12.0]
+    for (_, splats, size, *_), (*_, a_splat) in list(zip(steps, parts, strict=True))[1:]:
+        assert 0 < 1e6 * size - a_splat * splats < 3000, "more than the header is missing"
