@@ -4,7 +4,7 @@
 
 Each stage is judged on what it was given, so that an error belongs to one kernel: projection on the scene, tile lists,
 order and compositing on the ellipses that projection left, removal effects on the same, derivatives of pictures on the
-scene (tools.stress.derivatives), the ridge on its own systems, the re-fit on small scenes. Inputs (tools.stress.cases):
+scene (tools.stress.fits), the ridge on its own systems, the re-fit on small scenes. Inputs (tools.stress.cases):
 cases made by hand, and some that hypothesis makes worse and worse.
 
 Beside each error stands what the kernel cannot help: how much the float64 result moves when the numbers that the kernel
