@@ -2,11 +2,11 @@
 
     python -m tools.bench.encode [SCENE …] [--device NAME] [--quick] [--stage NAME …] [--json FILE]
 
-For each stage the variants that exist: kernel family, compiler flags, precision, steps, entropy coder; each with its
-time on a scene and its error: of kernels what tools.stress.run measures, in a few of its cases. (Whole encodes of any
-options: tools.study.rate_distortion.) A variant is on the Pareto front if no other of its stage is at least as good in
-time, error and bytes and better in one by more than 5 %, the noise. Scenes: lego and plush by default; --quick takes
-the bundled excerpt at half size and the best device.
+For each stage of kernels the variants that exist: kernel family, compiler flags, precision, steps; each with its time
+on a scene and its error: what tools.stress.run measures, in a few of its cases. (Whole encodes of any options:
+tools.study.rate_distortion; entropy coders: tools.bench.codec.) A variant is on the Pareto front if no other of its
+stage is at least as good in time and error and better in one by more than 5 %, the noise. Scenes: lego and plush by
+default; --quick takes the bundled excerpt at half size and the best device.
 
 Every device runs in a process of its own. Times of the rasterizer's kernels and of the ridge are the device's own, the
 others the clock's. Each is the best of some.
@@ -20,13 +20,10 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
 
-from potr_cl.codec.container import EntropyCoder
-from potr_cl.codec.decoder import decode
-from potr_cl.codec.encoder import code_scene
 from potr_cl.model.camera import Camera, camera_centres, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
@@ -66,7 +63,7 @@ CASES = (Case("400 splats", random_splats(400, 3, seed=1), tilted_camera(1, 83, 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One variant of one stage: its time and its error (STAGES), and the bytes of the result where it decides these.
+    """One variant of one stage: its time and its error (STAGES).
 
     Attributes:
         default: whether this is what the package does on this device.
@@ -77,16 +74,11 @@ class Row:
     seconds: float
     error: float
     default: bool = False
-    nbytes: int | None = None
 
 
 def on_front(row: Row, rows: Sequence[Row]) -> bool:
-    """Whether no other variant is at least as good in all and, beyond what is noise, better in one."""
-
-    def marks(r: Row) -> tuple[float, float, float]:
-        return r.seconds, r.error, r.nbytes or 0
-
-    pairs = [list(zip(marks(other), marks(row), strict=True)) for other in rows]
+    """Whether no other variant is at least as good in both and, beyond what is noise, better in one."""
+    pairs = [((other.seconds, row.seconds), (other.error, row.error)) for other in rows]
     return not any(all(a <= b for a, b in p) and any(a < b / (1 + NOISE) for a, b in p) for p in pairs)
 
 
@@ -205,25 +197,6 @@ def refit_rows(load: Workload) -> Iterator[Row]:
                 yield Row("re-fit", f"{family}, {steps} steps", best_of(1, work), errors[-1], is_default)
 
 
-# ---------------------------------------------------------------------------------------------------- coding
-
-
-def code_rows(load: Workload) -> Iterator[Row]:
-    """Entropy coders and levels, and decoding what they made."""
-    for coder in [*(EntropyCoder("zstd", level) for level in (1, 9, 19, 22)), EntropyCoder()]:
-        parameters = EncodeOptions.for_preset("best" if coder.name == "bundles" else "paper").parameters
-        data: list[bytes] = []
-
-        def code(coder: EntropyCoder = coder, parameters: Any = parameters, data: list[bytes] = data) -> None:
-            data.append(b"".join(code_scene(load.scene, parameters, load.train, entropy=coder).pieces))
-
-        seconds = best_of(1, code)
-        name = f"{coder.name} {coder.level}" if coder.name == "zstd" else coder.name
-        default, size = coder == EncodeOptions.for_preset("best").code.coder, len(data[0])
-        yield Row("code", name, seconds, size, default)
-        yield Row("decode", name, best_of(load.repeats, lambda d=data[0]: decode(d)), size, default)  # type: ignore[misc]
-
-
 #: By stage: what the time is of, what the error is, and what measures it.
 STAGES: dict[str, tuple[str, str, Callable[[Workload], Iterator[Row]]]] = {
     "project": ("a view's projection", "largest error of a splat's alpha", view_rows),
@@ -233,8 +206,6 @@ STAGES: dict[str, tuple[str, str, Callable[[Workload], Iterator[Row]]]] = {
     "removal": ("a sweep over all tiles of a view", "largest relative error of ΔMSE", view_rows),
     "ridge": ("the kernel, a million splats", "colour error above the optimum, 99.99th percentile", ridge_rows),
     "re-fit": ("the solver", "RMS error on training views", refit_rows),
-    "code": ("coding without looking at views", "bytes", code_rows),
-    "decode": ("decoding", "bytes", code_rows),
 }
 
 
@@ -253,11 +224,11 @@ def report(results: Results, title: str, rows: Sequence[Row]) -> None:
     for stage, (what, error, _) in STAGES.items():
         own = [row for row in rows if row.stage == stage]
         if own:
-            columns = f"variant; seconds of {what}||.3g; {error}||.3g; bytes||,; default; on the Pareto front"
+            columns = f"variant; seconds of {what}||.3g; {error}||.3g; default; on the Pareto front"
             table = results.table(f"{title}: {stage}", f"{title}: {stage}", columns)
             for row in sorted(own, key=lambda r: r.seconds):
                 marks = ["yes" if mark else "" for mark in (row.default, on_front(row, own))]
-                table.add(row.variant, row.seconds, row.error, row.nbytes, *marks)
+                table.add(row.variant, row.seconds, row.error, *marks)
 
 
 def main() -> None:
