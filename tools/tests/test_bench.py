@@ -107,8 +107,6 @@ def test_frames_and_decodes(tables, folder, monkeypatch):
     assert found["frames"][0][:3] == ["excerpt", 1500, "240 x 180"]
     assert {"project", "composite"} <= {row[0] for row in found["kernels_excerpt"]}
     if sys.platform == "linux":
-        # A process of its own for each figure is tried below and by test_encodes_of_cities.
-        monkeypatch.setattr("tools.bench.codec.in_process", lambda work, *given: work(*given))
         monkeypatch.setattr("tools.bench.codec.CODERS", CODERS[-1:])
         monkeypatch.setattr("tools.bench.codec._MADE", ("best",))
         monkeypatch.setattr("tools.bench.codec.processors", lambda: 1)
