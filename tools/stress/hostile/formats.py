@@ -174,6 +174,6 @@ FORMATS: dict[str, Format] = {
     "colmap-binary": _cameras(camera_files.colmap_binary, camera_files.MODEL.changed),
     "colmap-text": _cameras(camera_files.colmap_text, camera_files.MODEL.changed),
     "png": _picture(picture_files.png, picture_files.changed_png),
-    "jpeg": _picture(picture_files.jpeg, picture_files.changed_jpeg),
+    "jpeg": _picture(picture_files.jpeg, picture_files.JPEG.changed),
     "webp": _picture(picture_files.webp, picture_files.changed_webp),
 }

@@ -111,27 +111,15 @@ def changed_png(files: Files, rng: Random) -> Files:
     return {"a.png": damaged(out, rng) if rng.random() < 0.1 else out}
 
 
-def changed_jpeg(files: Files, rng: Random) -> Files:
-    data = files["a.jpg"]
-    markers = [at for at in range(len(data) - 4) if data[at] == 0xFF and data[at + 1] not in (0, 0xFF)]
+def _markers(_: str, data: bytes) -> list[tuple[int, int]]:
+    """Kinds and lengths of a JPEG's segments, and the size that its frame says."""
+    found = [at for at in range(len(data) - 4) if data[at] == 0xFF and data[at + 1] not in (0, 0xFF)]
     frame = max(data.find(b"\xff\xc0"), data.find(b"\xff\xc2"))
-    for _ in range(1 + rng.choice((0, 0, 1, 2))):
-        at, kind, out = rng.choice(markers), rng.randrange(6), bytearray(data)
-        if kind == 0:
-            out[at + 1] = rng.choice((0xC0, 0xC2, 0xC3, 0xC9, 0xD8, 0xD9, 0xDA, 0xE1, 0xEE, 0xFE))
-        elif kind == 1:
-            out[at + 2 : at + 4] = interesting(rng, 2).to_bytes(2, "big")
-        elif kind == 2:  # the size that the frame says
-            place = frame + rng.choice((5, 7))
-            side = rng.choice((0, 1, 7, 9, 100, 3000)) if rng.random() < 0.95 else interesting(rng, 2)
-            out[place : place + 2] = side.to_bytes(2, "big")
-        else:
-            out = bytearray(damaged(data, rng))
-        data = bytes(out)
-        markers = [at for at in markers if at + 4 < len(data)] or [0]
-        if len(data) < 8:
-            break
-    return {"a.jpg": data}
+    places = [*((at + 1, 1) for at in found), *((at + 2, -2) for at in found), *[(frame + 5, -2), (frame + 7, -2)] * 4]
+    return [(at, size) for at, size in places if 0 <= at < len(data) - 2]
+
+
+JPEG = Rules(fields=_markers)
 
 
 def changed_webp(files: Files, rng: Random) -> Files:
