@@ -126,7 +126,7 @@ def test_what_ends_the_process(what, verdicts):
     assert verdicts[what] in ENDS[what][1]
 
 
-@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("form", [*FORMATS, "native"])
 def test_a_number_of_a_seed_is_one_file(form):
     for number in range(30):
         assert changed_files(form, 3, number) == changed_files(form, 3, number)

@@ -31,8 +31,9 @@ def call(monkeypatch, tool, *arguments):
 def test_series():
     name, options = rate_distortion.parse_series("no colours:refit=False,prune.iterations=8,compact.colour_model=rgb")
     assert (name, options) == ("no colours", {"refit": False, "prune.iterations": 8, "compact.colour_model": "rgb"})
-    chosen = rate_distortion.encode_options(options)
+    chosen = rate_distortion.encode_options({**options, "preset": "fast", "q": 0.4})
     assert (chosen.refit.on, chosen.prune.iterations, chosen.compact.colour_model) == (False, 8, "rgb")
+    assert (chosen.preset, chosen.q) == ("fast", 0.4)
     assert rate_distortion.encode_options({}) == EncodeOptions()
     _, options = rate_distortion.parse_series("near:preset=smallest,photos=True")
     for images in (Path("a"), Path("b")):
@@ -58,9 +59,6 @@ def test_a_curve_is_measured_written_and_continued(monkeypatch, folder, tmp_path
 
 @pytest.mark.slow
 def test_series_of_the_sweeps_options_and_their_gaps(monkeypatch, folder, tmp_path, capsys):
-    _, options = rate_distortion.parse_series("lazy:preset=fast,prune.tolerance=0.1,prune.iterations=8")
-    lazy = rate_distortion.encode_options({**options, "q": 0.4})
-    assert (lazy.prune.tolerance, lazy.prune.iterations, lazy.q, lazy.preset) == (0.1, 8, 0.4, "fast")
     out = tmp_path / "out.json"
     series = tuple(f"{name}:preset=paper,prune.iterations=4" for name in ("plain", "same"))
     series += ("lazy:preset=paper,prune.iterations=2",)
@@ -90,28 +88,20 @@ def run_of(path, commit, scenes, machine="a", **points):
 
 
 def test_later_files_replace_points_and_add_others(tmp_path):
+    """A run that goes on where a file of another commit stops leaves points of both."""
     a = run_of(tmp_path / "a", "aaaaaaa", ["s", "t"], best={0.5: 5, 0.1: 1}, fast={0.5: 6})
     b = run_of(tmp_path / "b", "bbbbbbb", ["s"], machine="b", best={0.3: 3, 0.5: 4})
+    content = json.loads(b.read_text())
+    content["scenes"]["s"]["series"]["best"]["encodes"][0]["commit"] = "ccccccc"
+    b.write_text(json.dumps(content))
     both = merged([a, b])
     points = both["scenes"]["s"]["series"]["best"]["encodes"]
-    assert [(p["q"], p["bytes"], p["commit"]) for p in points] == [
-        (0.1, 1, "aaaaaaa"),
-        (0.3, 3, "bbbbbbb"),
-        (0.5, 4, "bbbbbbb"),
-    ]
+    found = [(p["q"], p["bytes"], p["commit"]) for p in points]
+    assert found == [(0.1, 1, "aaaaaaa"), (0.3, 3, "ccccccc"), (0.5, 4, "bbbbbbb")]
     assert [p["bytes"] for p in both["scenes"]["t"]["series"]["best"]["encodes"]] == [1, 5]
-    assert both["commit"] == "aaaaaaa; bbbbbbb"
+    assert both["commit"] == "aaaaaaa; ccccccc; bbbbbbb"
     assert (both["machine"], both["date"]) == ("a; b", "2026-01-01")
     assert both["command"] == ["python aaaaaaa", "python bbbbbbb"]
-
-
-def test_a_point_s_own_commit_counts(tmp_path):
-    """A run that goes on where a file of another commit stops leaves points of both."""
-    path = run_of(tmp_path / "a", "bbbbbbb", ["s"], best={0.1: 1, 0.5: 5})
-    content = json.loads(path.read_text())
-    content["scenes"]["s"]["series"]["best"]["encodes"][0]["commit"] = "aaaaaaa"
-    path.write_text(json.dumps(content))
-    assert merged([path])["commit"] == "aaaaaaa; bbbbbbb"
 
 
 def test_series_in_the_order_asked_for(tmp_path):
