@@ -220,7 +220,7 @@ class JudgedView:
         visible = self.alpha.max(axis=1, initial=0) >= 0.5 / 255
         shown = self.alpha >= 0.5 / 255
         near = np.abs(self.true.depth - self.case.rules.near) < 1e-6 * self.case.rules.near
-        clear = ~shown[near].any(axis=0)
+        clear = np.asarray(~shown[near].any(axis=0))
         # Orders that a float32 depth may have either way, and pairs of splats that share a pixel there.
         depth, distance = self.true.depth[visible], self.distance[visible]
         tied = np.diff(depth) < 8 * ULP * np.maximum(distance[1:], distance[:-1])

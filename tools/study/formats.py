@@ -55,7 +55,7 @@ def study(results: Results, folder: Path, device: Device, args: argparse.Namespa
             path, began = Path(scratch, f"file{form.partition(':')[0]}"), time.perf_counter()
             splats = _write(writer, form, q, path, evaluator, folder, device, args)
             seconds, size = time.perf_counter() - began, path.stat().st_size
-            file = {"writer": writer, "format": form, "bytes": size, **evaluator(load_scene(path))}
+            file: Entry = {"writer": writer, "format": form, "bytes": size, **evaluator(load_scene(path))}
             by_others = _other_readers(args.transform, path, Path(scratch, "read.ply"), evaluator)
             figures = (file["psnr"], file.get("psnr_loss"), *(by_others.get(reader) for reader in READERS))
             table.add(writer, form, q, splats, size / 1e6, *figures, seconds)

@@ -179,13 +179,21 @@ def merged(paths: Sequence[Path], chosen: Sequence[str] = ()) -> dict[str, Any]:
     return {**files[0], "scenes": scenes, **said, "command": commands, "commit": commit}
 
 
-def size_at(points: list[dict[str, Any]], key: str, value: float) -> float | None:
-    """Bytes at which a curve reaches ``value`` of ``key``; None beyond its ends."""
+def size_at(points: Sequence[dict[str, Any]], key: str, value: float, beyond: bool = False) -> float | None:
+    """Bytes at which a curve reaches ``value`` of ``key``, bytes as logarithms.
+
+    Args:
+        beyond: go on straight beyond the curve's ends; else there is nothing there.
+    """
     ordered = sorted(points, key=lambda p: float(p[key]))
-    values = [p[key] for p in ordered]
-    if not values[0] <= value <= values[-1]:
+    values, sizes = np.array([p[key] for p in ordered]), np.log([p["bytes"] for p in ordered])
+    if not (beyond or values[0] <= value <= values[-1]):
         return None
-    return float(np.exp(np.interp(value, values, np.log([p["bytes"] for p in ordered]))))
+    if len(values) == 1:
+        return float(np.exp(sizes[0]))
+    at = min(max(int(np.searchsorted(values, value)), 1), len(values) - 1)
+    slope = (sizes[at] - sizes[at - 1]) / (values[at] - values[at - 1])
+    return float(np.exp(sizes[at] + slope * (value - values[at])))
 
 
 def print_gaps(results: Results, scenes: dict[str, Any], against: str, q: float) -> None:

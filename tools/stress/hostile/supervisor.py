@@ -92,11 +92,11 @@ def read_again(
         # One process is faster; where a file ends it, each gets its own.
         with _place() as folder:
             ended = _run(dataclasses.replace(job, given=sources), folder)
-        for source in sources if ended is not None else ():
+        for one in sources if ended is not None else ():
             with _place() as folder:
-                ended = _run(alone := dataclasses.replace(job, given=[source]), folder)
+                ended = _run(alone := dataclasses.replace(job, given=[one]), folder)
             if ended is not None:
-                keep(findings, alone, 0, given(source), ended)
+                keep(findings, alone, 0, given(one), ended)
     return [_about(findings / source.name) for source in folders]
 
 
