@@ -120,12 +120,12 @@ def processor_time() -> float:
     return time.process_time() + times.children_user + times.children_system
 
 
-def resident(field: str) -> int:
-    """Bytes of this process: "VmHWM", the peak since the last reset, or now, "VmRSS". Linux only."""
-    for line in Path("/proc/self/status").read_text().splitlines():
+def resident(field: str, pid: int | str = "self") -> int:
+    """Bytes of a process: "VmHWM", the peak since the last reset, or now, "VmRSS". Linux only."""
+    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
         if line.startswith(field + ":"):
             return int(line.split()[1]) * 1024
-    raise OSError(f"/proc/self/status has no {field}")
+    raise OSError(f"/proc/{pid}/status has no {field}")
 
 
 def growth(work: Callable[[], Any]) -> int:

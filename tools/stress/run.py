@@ -20,7 +20,8 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any
 
 from hypothesis import strategies as st
@@ -28,17 +29,7 @@ from hypothesis import strategies as st
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import Family, list_devices
 from tools.results import Column, Results
-from tools.stress.cases import (
-    Case,
-    RefitCase,
-    RidgeCase,
-    known_cases,
-    known_refits,
-    known_ridges,
-    refit_problems,
-    ridge_systems,
-    small_scenes,
-)
+from tools.stress.cases import known_cases, known_refits, known_ridges, refit_problems, ridge_systems, small_scenes
 from tools.stress.measures import LIMIT, PROMISES, WHAT, Measures, Worst, limit, note, search, smallest_failure
 from tools.stress.platforms import families
 from tools.stress.solvers import check_refit, check_ridge
@@ -50,35 +41,22 @@ def run_device(device: Device, examples: int, only: str = "") -> dict[str, Any]:
     """All cases, then ``examples`` attempts at each measure whose name begins with one of ``only``, with commas."""
     beginnings = tuple(only.split(","))
     worst: dict[str, Worst] = {}
-
-    def view(case: Case) -> Measures:
-        return check(device, case)
-
-    def system(case: RidgeCase) -> Measures:
-        return check_ridge(device, case)
-
-    def problem(case: RefitCase) -> Measures:
-        return check_refit(device, case)
-
-    lists: tuple[tuple[Callable[[Any], Measures], Iterator[Any]], ...] = (
-        (view, known_cases()),
-        (system, known_ridges()),
-        (problem, known_refits()),
-    )
-    for run, cases in lists:
-        for case in cases:
-            found = run(case)
-            if not any(measure.startswith(beginnings) for measure in found):
-                break  # the list is of other kernels
-            note(worst, {measure: pair for measure, pair in found.items() if measure.startswith(beginnings)}, case.name)
-    searches: dict[str, tuple[Callable[[Any], Measures], st.SearchStrategy[Any]]] = {
-        measure: (view, small_scenes()) for measure in WHAT
-    }
-    searches["ridge"] = system, ridge_systems()
-    for measure in ("re-fit: optimum", "re-fit: loss"):
-        searches[measure] = problem, refit_problems()
+    kinds: list[tuple[Callable[[Any], Measures], Iterable[Any], st.SearchStrategy[Any], Sequence[str]]] = [
+        (
+            partial(check, device),
+            known_cases(),
+            small_scenes(),
+            [m for m in WHAT if not m.startswith(("ridge", "re-fit"))],
+        ),
+        (partial(check_ridge, device), known_ridges(), ridge_systems(), ["ridge"]),
+        (partial(check_refit, device), known_refits(), refit_problems(), ["re-fit: optimum", "re-fit: loss"]),
+    ]
+    for run, cases, _, measures in kinds:
+        for case in cases if any(measure.startswith(beginnings) for measure in measures) else ():
+            note(worst, {m: pair for m, pair in run(case).items() if m.startswith(beginnings)}, case.name)
     failures = {}
-    for measure, (run, strategy) in searches.items():
+    searches = ((measure, run, strategy) for run, _, strategy, measures in kinds for measure in measures)
+    for measure, run, strategy in searches:
         if not measure.startswith(beginnings):
             continue
         if examples:
