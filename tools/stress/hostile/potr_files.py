@@ -154,12 +154,14 @@ def _with_one(values: list[float], others: tuple[float, ...], rng: Random) -> li
 
 
 def _field(file: File, rng: Random) -> None:
-    parts = [(file, _HEADER), *((block, _BLOCK) for block in file.blocks)]
-    parts += [(section, _ENTRY) for _, section in file.all_sections()]
-    kind = rng.choice((_HEADER, _BLOCK, _BLOCK, _BLOCK, _ENTRY, _ENTRY))
-    part = rng.choice([part for part, fields in parts if fields is kind] or [file])
-    name = rng.choice(list(kind if part is not file else _HEADER))
-    setattr(part, name, (kind if part is not file else _HEADER)[name](part, rng))
+    parts: dict[str, list[Any]] = {"block": file.blocks, "entry": [section for _, section in file.all_sections()]}
+    kind = rng.choice(("header", "block", "block", "block", "entry", "entry"))
+    if not parts.get(kind):
+        part, fields = file, _HEADER
+    else:
+        part, fields = rng.choice(parts[kind]), {"block": _BLOCK, "entry": _ENTRY}[kind]
+    name = rng.choice(list(fields))
+    setattr(part, name, fields[name](part, rng))
 
 
 def _order(file: File, rng: Random) -> None:
