@@ -88,8 +88,7 @@ def _settled(device: Device, scene: Scene, view: Camera) -> float:
 
 def is_finite(scene: Scene) -> bool:
     """Whether all parameters of a scene are."""
-    arrays = (scene.means, scene.log_scales, scene.quaternions, scene.opacity_logits, scene.sh)
-    return all(bool(np.isfinite(each).all()) for each in arrays)
+    return all(bool(np.isfinite(each).all()) for each in scene.arrays)
 
 
 #: Colours, and conditions of covariances, beyond which only finiteness is asked for: brighter ones are cut by design,

@@ -122,10 +122,9 @@ def bytes_of_pixels(path: Path) -> int:
 
 
 def _checked_scene(scene: Scene) -> Scene:
-    arrays = (scene.means, scene.log_scales, scene.quaternions, scene.opacity_logits, scene.sh)
-    if len(scene) < 1 or any(len(array) != len(scene) for array in arrays):
+    if len(scene) < 1 or any(len(array) != len(scene) for array in scene.arrays):
         raise WrongResult("a scene without splats, or with some in one array only")
-    if not all(np.isfinite(array).all() for array in arrays):
+    if not all(np.isfinite(array).all() for array in scene.arrays):
         raise WrongResult("values that are not finite")
     return scene
 
@@ -133,8 +132,7 @@ def _checked_scene(scene: Scene) -> Scene:
 def parts_of(result: Any) -> list[bytes]:
     """What was read, to compare it with another reading."""
     if isinstance(result, Scene):
-        arrays = (result.means, result.log_scales, result.quaternions, result.opacity_logits, result.sh)
-        return [array.tobytes() for array in arrays]
+        return [array.tobytes() for array in result.arrays]
     return [repr(result).encode()]
 
 
