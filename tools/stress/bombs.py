@@ -8,6 +8,7 @@ if one is not. (More are among the tests: tests/codec/test_hostile.py, tests/for
 
 from __future__ import annotations
 
+import dataclasses
 import gzip
 import json
 import re
@@ -90,10 +91,10 @@ def _long_metadata() -> Files:
     return {"a.potr": file.bytes()}
 
 
-def _blocks_of_one_splat(number: int) -> Files:
-    """Each costs time of its own."""
+def _blocks(number: int, splats: int) -> Files:
+    """Each costs time of its own, and claims so many splats."""
     file = File.of(potr_files.originals()[4])
-    file.blocks = file.blocks * number
+    file.blocks = [dataclasses.replace(file.blocks[0], splats=splats)] * number
     return {"a.potr": file.bytes()}
 
 
@@ -201,7 +202,8 @@ BOMBS: dict[str, dict[str, Bomb]] = {
     "potr": {
         "one splat, long metadata": _long_metadata,
         "a long description": _long_description,
-        "2,000 blocks of a splat": partial(_blocks_of_one_splat, 2000),
+        "2,000 blocks of a splat": partial(_blocks, 2000, 3),
+        "1,000 blocks of 65,536 splats": partial(_blocks, 1000, 65_536),
     },
     "html": {"one splat, long metadata": lambda: {"a.html": potr_files.page_of(_long_metadata()["a.potr"])}},
     "ply": {

@@ -133,16 +133,15 @@ def view_by_view(device: Device) -> None:
     scene, views = _apart()
     with patch.object(splat_groups, "LARGEST", 8), uploaded(device, scene) as whole:
         visibility = Visibility.of(scene, views, INRIA.near)
-        given: list[tuple[Drawable, int | None]] = [(scene, None)]
-        given += [(whole, None), (whole, 0)] if device.family == "gpu" else []
-        for source, memory in given:
-            for tolerance in (0.0, 0.05):
-                options = SweepOptions(tolerance, memory=memory)
-                with planned_sweep(device, source, views, options, visibility=visibility) as removal:
-                    removal.measure()
-                    removal.remove(np.arange(0, len(scene), 5))
-                    removal.measure()
-                    prune_scene(removal, PruningOptions(1e-2, 3))
+        given: list[tuple[Drawable, int | None, float]] = [(scene, None, 0.0)]
+        given += [(whole, None, 0.0), (whole, 0, 0.05)] if device.family == "gpu" else []
+        for source, memory, tolerance in given:
+            options = SweepOptions(tolerance, memory=memory)
+            with planned_sweep(device, source, views, options, visibility=visibility) as removal:
+                removal.measure()
+                removal.remove(np.arange(0, len(scene), 5))
+                removal.measure()
+                prune_scene(removal, PruningOptions(1e-2, 3))
 
 
 def _apart() -> tuple[Scene, list[Camera]]:
