@@ -6,12 +6,11 @@ point_cloud.ply and cameras.json. They print Markdown; most keep their figures w
 How fast, how large, how much memory (``bench``):
 
 =====================  =================================================================================================
-bench.encode           run time against error of every stage and variant on every device: what is on the Pareto front?
+bench.encode           run time against error of variants of kernels on every device: what is on the Pareto front?
 bench.rasterizer       frames a second, and time by kernel
 bench.pruning          what does pruning keep, against other pruners?
 bench.fit              how fast are the fit's steps?
-bench.decode           how fast does a file decode, by compiled code, NumPy or OpenCL, and in how much memory?
-bench.codec            speed and memory of the codec alone
+bench.codec            how fast does the codec encode, and decode by compiled code, NumPy or OpenCL; in how much memory?
 bench.paired           are whole encodes faster or slower than those of another checkout?
 bench.scaling          how do time and memory of whole commands grow with splats, views and devices?
 bench.levels           how close are levels of detail where they are shown, and do leaves' errors foretell pictures'?

@@ -20,7 +20,7 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -65,8 +65,7 @@ class Results:
         columns = tuple(
             column for each in given for column in ([each] if isinstance(each, Column) else Column.of(each))
         )
-        heads = " | ".join(column.head for column in columns)
-        print(f"\n{title}:\n\n| {heads} |\n{'|---' * len(columns)}|", flush=True)
+        print(f"\n{title}:\n\n{markdown([column.head for column in columns], ())}", flush=True)
         self._tables[name] = Table(title, columns, self._keep)
         return self._tables[name]
 
@@ -107,6 +106,13 @@ class Column:
         if isinstance(cell, str):
             return cell
         return self.format.format(*cell) if isinstance(cell, list) else format(cell, self.format)
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    return "\n".join(
+        ["| " + " | ".join(head) + " |", "|---" * len(head) + "|", *(f"| {' | '.join(r)} |" for r in rows)]
+    )
 
 
 class Table:

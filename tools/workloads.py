@@ -51,28 +51,6 @@ def scene_parser(description: str | None, number: str | int = "+") -> argparse.A
     return parser
 
 
-def study_parser(
-    description: str | None, measure: Callable[[argparse.Namespace], None], report: Callable[[argparse.Namespace], None]
-) -> tuple[argparse.ArgumentParser, argparse.ArgumentParser, argparse.ArgumentParser]:
-    """A command line of two commands: ``measure SCENE … --json FILE`` and ``report FILE … [--json TABLES]``.
-
-    Returns:
-        The parser, whose arguments' ``run`` is the function to call with them; and the commands', for more options.
-    """
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-    commands = parser.add_subparsers(required=True)
-    measuring = commands.add_parser("measure")
-    measuring.add_argument("scenes", nargs="+", type=Path, metavar="SCENE")
-    measuring.add_argument("--json", type=Path, required=True)
-    measuring.add_argument("--device", help="as for potr-cl")
-    measuring.set_defaults(run=measure)
-    reporting = commands.add_parser("report")
-    reporting.add_argument("results", type=Path, nargs="+", help="the JSON that measure wrote")
-    reporting.add_argument("--json", type=Path, metavar="FILE", help="keep the tables for docs/benchmarks")
-    reporting.set_defaults(run=report)
-    return parser, measuring, reporting
-
-
 def log(text: str) -> None:
     """Progress, to standard error."""
     print(f"[{time.strftime('%H:%M:%S')}] {text}", file=sys.stderr, flush=True)
@@ -142,12 +120,12 @@ def processor_time() -> float:
     return time.process_time() + times.children_user + times.children_system
 
 
-def resident(field: str) -> int:
-    """Bytes of this process: "VmHWM", the peak since the last reset, or now, "VmRSS". Linux only."""
-    for line in Path("/proc/self/status").read_text().splitlines():
+def resident(field: str, pid: int | str = "self") -> int:
+    """Bytes of a process: "VmHWM", the peak since the last reset, or now, "VmRSS". Linux only."""
+    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
         if line.startswith(field + ":"):
             return int(line.split()[1]) * 1024
-    raise OSError(f"/proc/self/status has no {field}")
+    raise OSError(f"/proc/{pid}/status has no {field}")
 
 
 def growth(work: Callable[[], Any]) -> int:

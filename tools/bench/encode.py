@@ -2,11 +2,11 @@
 
     python -m tools.bench.encode [SCENE …] [--device NAME] [--quick] [--stage NAME …] [--json FILE]
 
-For each stage the variants that exist: kernel family, compiler flags, precision, steps, entropy coder; each with its
-time and its error against float64 or against the full computation. (tools.study.rate_distortion compares whole encodes
-of any options.) A variant is on the Pareto front if no other of its stage is at least as good in time, error and bytes
-and better in one by more than 5 %, the noise. Scenes: lego and plush by default; --quick takes the bundled excerpt at
-half size and the best device.
+For each stage of kernels the variants that exist: kernel family, compiler flags, precision, steps; each with its time
+on a scene and its error: what tools.stress.run measures, in a few of its cases. (Whole encodes of any options:
+tools.study.rate_distortion; entropy coders: tools.bench.codec.) A variant is on the Pareto front if no other of its
+stage is at least as good in time and error and better in one by more than 5 %, the noise. Scenes: lego and plush by
+default; --quick takes the bundled excerpt at half size and the best device.
 
 Every device runs in a process of its own. Times of the rasterizer's kernels and of the ridge are the device's own, the
 others the clock's. Each is the best of some.
@@ -20,37 +20,31 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
-from potr_cl.codec.container import EntropyCoder
-from potr_cl.codec.decoder import decode
-from potr_cl.codec.encoder import code_scene
 from potr_cl.model.camera import Camera, camera_centres, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import DeviceInfo, Family, choose_device, list_devices
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.rules import GSPLAT, INRIA
+from potr_cl.raster.rules import GSPLAT
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, Precision
 from potr_cl.stages.compaction.view_weights import ViewWeights
 from potr_cl.stages.pruning.removal import RemovalSweep
-from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.views.targets import RenderedTargets
-from tests.reference import raster as reference
-from tests.reference.removal import BruteForce
+from tests.reference.scenes import random_splats, tilted_camera
 from tools.bench.rasterizer import stage_times
 from tools.results import Results
+from tools.stress.cases import Case, layered
+from tools.stress.platforms import families
 from tools.stress.solvers import ridge_errors
-from tools.stress.views import rasterized
+from tools.stress.views import check_rasterizer
 from tools.workloads import SCENES, best_of, excerpt, in_process, log, read, scaled, scene_parser
-
-F64 = NDArray[np.float64]
 
 #: Part by which a time or an error must be lower to be lower.
 NOISE = 0.05
@@ -63,15 +57,16 @@ FLAGS: Mapping[str, tuple[str, ...]] = {
     "unsafe": ("-cl-unsafe-math-optimizations",),
     "fast relaxed": ("-cl-fast-relaxed-math",),
 }
-#: Pixels of a view, and splats, that are computed in float64.
-PIXELS, SPLATS = 300, 150
-#: As in the tests: pixels that come no nearer, relatively, to a threshold cannot flip, nor splats in another order.
-CLEAR, TIE = 1e-4, 1e-6
+#: What errors of kernels are measured in: many splats, and many layers over each other.
+CASES = (
+    Case("400 splats", random_splats(400, 3, seed=1), tilted_camera(1, 83, 61)),
+    dataclasses.replace(layered(100), rules=GSPLAT),
+)
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One variant of one stage: its time and its error (STAGES), and the bytes of the result where it decides these.
+    """One variant of one stage: its time and its error (STAGES).
 
     Attributes:
         default: whether this is what the package does on this device.
@@ -82,16 +77,11 @@ class Row:
     seconds: float
     error: float
     default: bool = False
-    nbytes: int | None = None
 
 
 def on_front(row: Row, rows: Sequence[Row]) -> bool:
-    """Whether no other variant is at least as good in all and, beyond what is noise, better in one."""
-
-    def marks(r: Row) -> tuple[float, float, float]:
-        return r.seconds, r.error, r.nbytes or 0
-
-    pairs = [list(zip(marks(other), marks(row), strict=True)) for other in rows]
+    """Whether no other variant is at least as good in both and, beyond what is noise, better in one."""
+    pairs = [((other.seconds, row.seconds), (other.error, row.error)) for other in rows]
     return not any(all(a <= b for a, b in p) and any(a < b / (1 + NOISE) for a, b in p) for p in pairs)
 
 
@@ -124,11 +114,6 @@ class Workload:
     def repeats(self) -> int:
         return 3 if self.quick else 7
 
-    @property
-    def families(self) -> tuple[Family, ...]:
-        """The device's own kernel family first."""
-        return ("cpu", "gpu") if self.info.family == "cpu" else ("gpu",)
-
     def profiled(self, family: Family, flags: Sequence[str] = ()) -> Device:
         """A device whose kernels are timed, with compiler flags."""
         return Device(self.info, profiling=True, family=family, build_options=flags)
@@ -140,100 +125,33 @@ class Workload:
                 yield f"{family}, {name}", family == self.info.family and not flags, self.profiled(family, flags)
 
 
-# ------------------------------------------------------------------------------------------------ rasterizer
+# ----------------------------------------------------------------------------------------------------- kernels
 
-
-#: The kernels of each stage.
+#: The kernels of each stage, and the measure of its error.
 KERNELS = {
-    "project": ("project",),
-    "tile lists": ("count_tiles", "scan_tiles", "fill_tiles"),
-    "sort": ("sort_tiles",),
-    "composite": ("composite", "composite_frame"),
+    "project": (("project",), "project: alpha"),
+    "tile lists": (("count_tiles", "scan_tiles", "fill_tiles"), "tile lists"),
+    "sort": (("sort_tiles",), "sort"),
+    "composite": (("composite", "composite_frame"), "composite"),
 }
 
 
-def rasterizer_rows(load: Workload) -> Iterator[Row]:
-    """All kernels of the rasterizer: family and flags."""
-    truth, first = RasterizerTruth(load), None
-
-    for name, default, device in (each for family in load.families for each in load.flagged(family)):
+def view_rows(load: Workload) -> Iterator[Row]:
+    """What a view needs, and a sweep of removal over it: family and flags."""
+    for name, default, device in (each for family in families(load.info) for each in load.flagged(family)):
+        found = [check_rasterizer(device, case)[0] for case in CASES]
+        errors = {measure: max(each[measure][0] for each in found) for measure in found[0]}
         runs = [stage_times(device, load.scene, load.some) for _ in range(load.repeats)]
-        times = {kernel: min(run[kernel] for run in runs) for kernel in runs[0]}
-        centre, wrong, pixel, pairs = truth.errors(device, load.scene)
-        first = pairs if first is None else first
-        errors = {"project": centre, "tile lists": len(first ^ pairs), "sort": wrong, "composite": pixel}
-        for stage, kernels in KERNELS.items():
-            yield Row(stage, name, sum(times.get(kernel, 0) for kernel in kernels), errors[stage], default)
-
-
-class RasterizerTruth:
-    """One view in float64: splats on screen, and some pixels."""
-
-    def __init__(self, load: Workload) -> None:
-        self.camera = load.some[0]
-        self.projected = reference.project(load.scene, self.camera, GSPLAT)
-        rng = np.random.default_rng(0)
-        self.pixels: list[tuple[int, int, F64]] = []
-        for _ in range(4 * PIXELS):
-            column, row = int(rng.integers(self.camera.width)), int(rng.integers(self.camera.height))
-            pixel = reference.composite_pixel(self.projected, column, row, GSPLAT)
-            if pixel.margin > CLEAR and pixel.gap > TIE and len(self.pixels) < PIXELS:
-                self.pixels.append((column, row, np.append(pixel.colour, pixel.transmittance)))
-
-    def errors(self, device: Device, scene: Scene) -> tuple[float, float, float, set[bytes]]:
-        """Of centres, of order, of pixels; and the tile lists as a set."""
-        with Rasterizer(device, scene, GSPLAT) as rasterizer:
-            lists = rasterized(rasterizer, self.camera)
-        listed = np.isin(self.projected.index, lists.intersections)
-        centres = np.abs(lists.shapes[self.projected.index[listed], :2] - self.projected.centre[listed])
-        inside = (self.projected.centre[listed] >= 0).all(axis=1)
-        inside &= (self.projected.centre[listed] < (self.camera.width, self.camera.height)).all(axis=1)
-        tiles = np.repeat(np.arange(len(lists.offsets) - 1), np.diff(lists.offsets).astype(np.int64))
-        order = np.lexsort((lists.intersections, lists.shapes[lists.intersections, 6], tiles))
-        wrong = int(np.count_nonzero(lists.intersections[order] != lists.intersections))
-        ours = np.concatenate([lists.image, lists.transmittance[:, None]], axis=1)
-        at = (np.abs(ours[row * self.camera.width + column] - true).max() for column, row, true in self.pixels)
-        pixel = float(max(at, default=0.0))
-        pairs = {pair.tobytes() for pair in np.stack([tiles, lists.intersections], axis=1)}
-        return float(centres[inside].max(initial=0)), wrong, pixel, pairs
-
-
-# -------------------------------------------------------------------------------------------- pruning, colours
-
-
-def removal_rows(load: Workload) -> Iterator[Row]:
-    """Family, flags, and where pixels end; what each sweep is compared with ends its pixels in the same place."""
-    camera, default, usual = load.some[0], SweepOptions(), INRIA.transmittance_threshold
-    variants = [(*flagged, default) for family in load.families for flagged in load.flagged(family)]
-    if default.transmittance_threshold not in (None, usual):
-        ends = dataclasses.replace(default, transmittance_threshold=usual)
-        variants += [(f"{f}, pixels end at {usual:.0e}", False, load.profiled(f), ends) for f in load.families]
-    with Rasterizer(variants[0][2], load.scene) as rasterizer, RemovalSweep(rasterizer, [camera]) as removal:
-        chosen = choose_splats(removal.measure()[1], SPLATS // 3 if load.quick else SPLATS)
-    thresholds = sorted({usual, default.transmittance_threshold or usual}, reverse=True)
-    brute = BruteForce(reference.project(load.scene, camera, INRIA), camera, INRIA)
-    truths = dict(zip(thresholds, brute.effects(chosen, thresholds)[0], strict=True))
-    for label, is_default, device, options in variants:
-        with Rasterizer(device, load.scene) as rasterizer, RemovalSweep(rasterizer, [camera], options) as removal:
-            effect = removal.measure()[0][chosen]
+        for stage, (kernels, measure) in KERNELS.items():
+            seconds = sum(min(run.get(kernel, 0.0) for run in runs) for kernel in kernels)
+            yield Row(stage, name, seconds, errors[measure], default)
+        with Rasterizer(device, load.scene) as rasterizer, RemovalSweep(rasterizer, load.some[:1]) as removal:
 
             def sweep(removal: RemovalSweep = removal) -> None:
                 removal.sweep_everything()
                 removal.measure()
 
-            best = best_of(load.repeats, sweep)
-        true = truths[options.transmittance_threshold or usual] / (3 * camera.width * camera.height)
-        seen = true > 0
-        yield Row("removal", label, best, float(np.median(np.abs(effect[seen] / true[seen] - 1))), is_default)
-
-
-def choose_splats(importance: F64, count: int) -> NDArray[np.int64]:
-    """About ``count`` splats that the views see, evenly over the logarithm of importance."""
-    seen = np.flatnonzero(importance > 0)
-    by_importance = seen[np.argsort(importance[seen], kind="stable")]
-    low, high = np.log(importance[by_importance[[len(seen) // 100, -1]]])
-    at = np.searchsorted(np.log(importance[by_importance]), np.linspace(low, high, count))
-    return np.unique(by_importance[at.clip(0, len(seen) - 1)])
+            yield Row("removal", name, best_of(load.repeats, sweep), errors["removal: effect"], default)
 
 
 def ridge_rows(load: Workload) -> Iterator[Row]:
@@ -244,7 +162,7 @@ def ridge_rows(load: Workload) -> Iterator[Row]:
     with Rasterizer(Device(load.info), scene) as rasterizer, RemovalSweep(rasterizer, views) as sweep:
         sweep.measure()
         weights = ViewWeights.from_importances(len(scene), sweep.view_importances())
-    for family in load.families:
+    for family in families(load.info):
         device = load.profiled(family)
         for precision in get_args(Precision):
             # λ 0.01 and no column dropped: as hard as it gets.
@@ -267,7 +185,7 @@ def refit_rows(load: Workload) -> Iterator[Row]:
         importance = removal.measure()[1]
     kept = load.scene.subset(np.sort(np.argsort(importance)[len(importance) // 2 :]))
     default = EncodeOptions.for_preset("best").refit.steps
-    for family in load.families[: 1 if load.quick else 2]:
+    for family in families(load.info)[: 1 if load.quick else 2]:
         device = Device(load.info, family=family)
         with Rasterizer(device, load.scene) as rasterizer:
             targets = RenderedTargets(rasterizer, views)
@@ -282,36 +200,15 @@ def refit_rows(load: Workload) -> Iterator[Row]:
                 yield Row("re-fit", f"{family}, {steps} steps", best_of(1, work), errors[-1], is_default)
 
 
-# ---------------------------------------------------------------------------------------------------- coding
-
-
-def code_rows(load: Workload) -> Iterator[Row]:
-    """Entropy coders and levels, and decoding what they made."""
-    for coder in [*(EntropyCoder("zstd", level) for level in (1, 9, 19, 22)), EntropyCoder()]:
-        parameters = EncodeOptions.for_preset("best" if coder.name == "bundles" else "paper").parameters
-        data: list[bytes] = []
-
-        def code(coder: EntropyCoder = coder, parameters: Any = parameters, data: list[bytes] = data) -> None:
-            data.append(b"".join(code_scene(load.scene, parameters, load.train, entropy=coder).pieces))
-
-        seconds = best_of(1, code)
-        name = f"{coder.name} {coder.level}" if coder.name == "zstd" else coder.name
-        default, size = coder == EncodeOptions.for_preset("best").code.coder, len(data[0])
-        yield Row("code", name, seconds, size, default)
-        yield Row("decode", name, best_of(load.repeats, lambda d=data[0]: decode(d)), size, default)  # type: ignore[misc]
-
-
 #: By stage: what the time is of, what the error is, and what measures it.
 STAGES: dict[str, tuple[str, str, Callable[[Workload], Iterator[Row]]]] = {
-    "project": ("a view's projection", "largest error of a centre, pixels", rasterizer_rows),
-    "tile lists": ("a view's tile lists", "intersections that another variant has not", rasterizer_rows),
-    "sort": ("a view's depth sort", "intersections out of order", rasterizer_rows),
-    "composite": ("a view's compositing", "largest error of a pixel", rasterizer_rows),
-    "removal": ("a sweep over all tiles of a view", "median relative error of ΔMSE", removal_rows),
+    "project": ("a view's projection", "largest error of a splat's alpha", view_rows),
+    "tile lists": ("a view's tile lists", "255 alpha - 1 of what a list lacks", view_rows),
+    "sort": ("a view's depth sort", "intersections out of order", view_rows),
+    "composite": ("a view's compositing", "largest error of a pixel", view_rows),
+    "removal": ("a sweep over all tiles of a view", "largest relative error of ΔMSE", view_rows),
     "ridge": ("the kernel, a million splats", "colour error above the optimum, 99.99th percentile", ridge_rows),
     "re-fit": ("the solver", "RMS error on training views", refit_rows),
-    "code": ("coding without looking at views", "bytes", code_rows),
-    "decode": ("decoding", "bytes", code_rows),
 }
 
 
@@ -330,11 +227,11 @@ def report(results: Results, title: str, rows: Sequence[Row]) -> None:
     for stage, (what, error, _) in STAGES.items():
         own = [row for row in rows if row.stage == stage]
         if own:
-            columns = f"variant; seconds of {what}||.3g; {error}||.3g; bytes||,; default; on the Pareto front"
+            columns = f"variant; seconds of {what}||.3g; {error}||.3g; default; on the Pareto front"
             table = results.table(f"{title}: {stage}", f"{title}: {stage}", columns)
             for row in sorted(own, key=lambda r: r.seconds):
                 marks = ["yes" if mark else "" for mark in (row.default, on_front(row, own))]
-                table.add(row.variant, row.seconds, row.error, row.nbytes, *marks)
+                table.add(row.variant, row.seconds, row.error, *marks)
 
 
 def main() -> None:

@@ -24,7 +24,7 @@ from potr_cl.codec.decoder import open_file
 from potr_cl.codec.native.library import VECTORS_VARIABLE
 from tools.bench.paired import Asked
 from tools.results import ROOT, Results
-from tools.workloads import plain_parser
+from tools.workloads import plain_parser, resident
 
 #: What the native decoder's variable is set to.
 _NATIVE = {"native": "1", "narrow": "0"}
@@ -74,13 +74,13 @@ def tab_peak(file: Path, workers: int) -> float:
         page.goto(f"http://127.0.0.1:{server.server_address[1]}/README.md")
         page.set_content('<input type="file">')
         page.set_input_files("input", file)
-        before = {pid: _memory(pid, "VmRSS") for pid in _tabs()}
+        before = {pid: resident("VmRSS", pid) / 1e6 for pid in _tabs()}
         page.evaluate(
             "async (workers) => (await import('/dist/potr.js')).decode(document.querySelector('input').files[0], "
             "{ workers }).then((scene) => void (globalThis.scene = scene))",
             workers,
         )
-        peak = max(_memory(pid, "VmHWM") - before[pid] for pid in _tabs() & before.keys())
+        peak = max(resident("VmHWM", pid) / 1e6 - before[pid] for pid in _tabs() & before.keys())
         chromium.close()
         server.shutdown()
     return peak
@@ -90,11 +90,6 @@ def _tabs() -> set[int]:
     """Processes of Chromium that hold pages."""
     lines = {int(path.parent.name): path.read_bytes() for path in Path("/proc").glob("[0-9]*/cmdline")}
     return {pid for pid, line in lines.items() if b"--type=renderer" in line}
-
-
-def _memory(pid: int, field: str) -> float:
-    lines = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
-    return int(lines[field].split()[0]) * 1024e-6
 
 
 def main() -> None:

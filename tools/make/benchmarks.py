@@ -18,14 +18,14 @@ import hashlib
 import json
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from PIL import Image
 
-from tools.results import ROOT, Cell, Column, write_json
+from tools.results import ROOT, Cell, Column, markdown, write_json
 
 PAGES, IMAGES = ROOT / "docs" / "benchmarks", ROOT / "docs" / "images"
 RESULTS = PAGES / "results"
@@ -74,13 +74,12 @@ class Result:
 
     def markdown(self) -> str:
         """Title, table, and the line that says what it is of."""
-        lines = [[column.head for column in self.columns]]
-        lines += [[column.text(cell) for column, cell in zip(self.columns, row, strict=True)] for row in self.rows]
-        table = [f"| {' | '.join(line)} |" for line in lines]
-        table.insert(1, "|---" * len(self.columns) + "|")
+        heads = [column.head for column in self.columns]
+        rows = ([column.text(cell) for column, cell in zip(self.columns, row, strict=True)] for row in self.rows)
         about = [self.machine, self.date or "date unknown", *([f"commit {self.commit}"] if self.commit else [])]
         line = ", ".join(about) + (": " + ", then ".join(f"`{each}`" for each in self.command) if self.command else "")
-        return f"**{self.title}**\n\n" + "\n".join(table) + f"\n\n*{line}.{' ' + self.remark if self.remark else ''}*"
+        remark = f" {self.remark}" if self.remark else ""
+        return f"**{self.title}**\n\n{markdown(heads, rows)}\n\n*{line}.{remark}*"
 
 
 Results = dict[str, Result]
@@ -136,7 +135,7 @@ def problems(results: Results) -> list[str]:
         if path.read_text("utf-8") != text:
             found.append(f"{path}: stale, run python -m tools.make.benchmarks")
     found += [f"{RESULTS}: no page shows '{name}'" for name in sorted(results.keys() - shown)]
-    stale = [plot for plot in PLOTS if kept_digest(plot) != plot.digest(results)]
+    stale = [plot for plot in PLOTS if plot.kept_digest() != plot.digest(results)]
     return found + [f"{plot.path}: drawn of other figures, run python -m tools.make.benchmarks" for plot in stale]
 
 
@@ -148,13 +147,13 @@ _NAMES = {"lego": "lego (NeRF-Synthetic)", "plush": "plush (captured)"}
 def figures_table() -> str:
     """The table at the beginning of the README: sizes, losses and times at quality 0.5."""
     results = load()
-    heads = "at quality 0.5 | PLY | `.potr` | | PSNR against uncompressed | lost on the photographs | encoded in, H200 "
-    lines = [f"| {heads}| 2 CPU cores |", "|---" * 8 + "|"]
+    heads = ("at quality 0.5", "PLY", "`.potr`", "", "PSNR against uncompressed", "lost on the photographs")
+    rows = []
     for preset in ("best", "smallest"):
         for scene, name in _NAMES.items():
             uncompressed = results["rate_distortion/uncompressed"].row(scene=scene)
             file = results[f"rate_distortion/{scene}"].row(preset=preset, q=0.5)
-            cells = [
+            rows.append([
                 name if preset == "best" else f"{scene}, `--preset {preset}`",
                 f"{uncompressed['PLY bytes'] / 1e6:.1f} MB",
                 f"{file['size']:.2f} MB",
@@ -162,9 +161,8 @@ def figures_table() -> str:
                 f"{file['PSNR against uncompressed']:.1f} dB",
                 f"{round(file['lost'], 2) + 0.0:.2f} dB of {uncompressed['PSNR against photographs']:.2f}",
                 *(_encode_time(results["whole_commands/commands"], scene, preset, device) for device in (_GPU, _CPU)),
-            ]
-            lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+            ])  # fmt: skip
+    return markdown((*heads, "encoded in, H200", "2 CPU cores"), rows)
 
 
 def _encode_time(commands: Result, scene: str, preset: str, device: str) -> str:
@@ -195,30 +193,30 @@ class Plot:
     Attributes:
         name: of the file, without its suffix.
         title: the question that it answers.
-        of: file of results that it is drawn of.
+        of: the results that it is drawn of.
+        panels: draws what is in it.
     """
 
     name: str
     title: str
-    of: str
+    of: tuple[str, ...]
+    panels: Callable[[Results, Sequence[Any]], None]
 
     @property
     def path(self) -> Path:
         return IMAGES / f"{self.name}.png"
 
-    @property
-    def results(self) -> list[str]:
-        """Names of the results that it is drawn of."""
-        raise NotImplementedError
-
-    def panels(self, results: Results, axes: Sequence[Any]) -> None:
-        """Draw what is in them."""
-        raise NotImplementedError
-
     def digest(self, results: Results) -> str:
         """Of the figures that it is drawn of."""
-        figures = [[r.title, [c.name for c in r.columns], r.rows] for r in (results[name] for name in self.results)]
+        figures = [[r.title, [c.name for c in r.columns], r.rows] for r in (results[name] for name in self.of)]
         return hashlib.sha256(json.dumps([self.title, *figures]).encode()).hexdigest()
+
+    def kept_digest(self) -> str:
+        """Of the figures that the picture was drawn of; empty without a picture."""
+        if not self.path.exists():
+            return ""
+        with Image.open(self.path) as image:
+            return str(image.info.get("Results", ""))
 
     def draw(self, results: Results) -> None:
         """Write the picture."""
@@ -240,94 +238,62 @@ class Plot:
             pyplot.close(figure)
 
 
-@dataclasses.dataclass(frozen=True)
-class Knobs(Plot):
-    """Bytes at equal PSNR by time, a line a knob through the defaults at (1, 0).
-
-    Attributes:
-        panels_of: names of the results, a panel each, with its title.
-    """
-
-    panels_of: tuple[tuple[str, str], ...]
-
-    @property
-    def results(self) -> list[str]:
-        return [f"{self.of}/{name}" for name, _ in self.panels_of]
-
-    def panels(self, results: Results, axes: Sequence[Any]) -> None:
-        for name, (_, title), axis in zip(self.results, self.panels_of, axes, strict=True):
-            rows = results[name].records()
-            knobs = dict.fromkeys(row["knob"] for row in rows if row["value"] != "default")
-            for knob, style in zip(knobs, [*_STYLES, *({**each, "mfc": "w"} for each in _STYLES)], strict=False):
-                turned = [row for row in rows if row["knob"] == knob]
-                points = sorted([(1.0, 0.0), *((row[_TIME], row["bytes at equal PSNR"]) for row in turned)])
-                axis.plot(*zip(*points, strict=True), label=knob, lw=1, **style)
-            axis.plot([1], [0], marker="*", ms=14, color="k", ls="", label="default")
-            axis.set(title=title, xlabel="time, in that of the default", xscale="log", ylim=(-3, 10))
-            ticks = (0.6, 0.8, 1, 1.3, 1.6)
-            axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
-            axis.minorticks_off()
-        axes[0].set_ylabel("bytes at equal PSNR, %")
+def _ticks(axis: Any, ticks: Sequence[float]) -> None:
+    axis.set_xscale("log")
+    axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    axis.minorticks_off()
 
 
-#: The column of a knob's time.
-_TIME = "time, in that of the default"
+def _knobs(results: Results, axes: Sequence[Any]) -> None:
+    """Bytes at equal PSNR by time, a line a knob through the defaults at (1, 0)."""
+    for (name, title), axis in zip(_KNOBS.items(), axes, strict=True):
+        rows = results[name].records()
+        knobs = dict.fromkeys(row["knob"] for row in rows if row["value"] != "default")
+        for knob, style in zip(knobs, [*_STYLES, *({**each, "mfc": "w"} for each in _STYLES)], strict=False):
+            turned = [row for row in rows if row["knob"] == knob]
+            cells = ((row["time, in that of the default"], row["bytes at equal PSNR"]) for row in turned)
+            axis.plot(*zip(*sorted([(1.0, 0.0), *cells]), strict=True), label=knob, lw=1, **style)
+        axis.plot([1], [0], marker="*", ms=14, color="k", ls="", label="default")
+        axis.set(title=title, xlabel="time, in that of the default", ylim=(-3, 10))
+        _ticks(axis, (0.6, 0.8, 1, 1.3, 1.6))
+    axes[0].set_ylabel("bytes at equal PSNR, %")
 
 
-@dataclasses.dataclass(frozen=True)
-class Curves(Plot):
+_KNOBS = {"time_error/lego_h200": "lego, on a GPU", "time_error/plush_h200": "plush, on a GPU"}
+
+
+def _curves(name: str, title: str, subject: str, series: Sequence[str], against: str, formats: bool = True) -> Plot:
     """PSNR by size, a panel a scene.
 
-    Attributes:
+    Args:
+        subject: file of results.
         series: that get a line each.
         against: "uncompressed" or "photographs".
         formats: whether other formats get a point each.
     """
 
-    series: tuple[str, ...]
-    against: str
-    formats: bool = True
-
-    @property
-    def results(self) -> list[str]:
-        return [f"{self.of}/{name}" for name in (*SCENES, "uncompressed")] + ["other_formats/sizes"] * self.formats
-
-    def panels(self, results: Results, axes: Sequence[Any]) -> None:
+    def panels(results: Results, axes: Sequence[Any]) -> None:
+        others = results["other_formats/sizes"].records()[1:] if formats else []
         for scene, axis in zip(SCENES, axes, strict=True):
-            self._curves(results, scene, axis)
-        axes[0].set_ylabel(f"PSNR against the {self.against}{' renders' * (self.against == 'uncompressed')}, dB")
+            full, rows = results[f"{subject}/uncompressed"].row(scene=scene), results[f"{subject}/{scene}"].records()
+            truth = full["PSNR against photographs"]
+            for each, style in zip(series, _STYLES, strict=True):
+                own = [row for row in rows if row["preset"] == each]
+                axis.plot([r["size"] for r in own], [r[f"PSNR against {against}"] for r in own], label=each, **style)
+            for row, shape in zip(others, _SHAPES, strict=False):
+                value = truth - row[f"{scene}: lost"] if against == "photographs" else row[f"{scene}: PSNR"]
+                label = row["format"].replace("`", "").replace(", 1000 iterations on the photographs", ", fine-tuned")
+                axis.plot(row[f"{scene}: size"], value, marker=shape, ms=8, ls="", mfc="w", mec="0.25", label=label)
+            if against == "photographs":
+                axis.axhline(truth, color="0.5", ls=":", label="uncompressed")
+            _ticks(axis, (0.5, 1, 2, 4, 8, 16))
+            axis.set(title=f"{scene}, {full['PLY bytes'] / 1e6:.1f} MB as PLY", xlabel="MB")
+            if not formats:
+                axis.set_ylim(bottom=truth - 1.6)  # below this a file is smaller than anybody asks for
+        axes[0].set_ylabel(f"PSNR against the {against}{' renders' * (against == 'uncompressed')}, dB")
 
-    def _curves(self, results: Results, scene: str, axis: Any) -> None:
-        """A line for each series, and a point for each other format."""
-        full = results[f"{self.of}/uncompressed"].row(scene=scene)
-        rows, truth = results[f"{self.of}/{scene}"].records(), full["PSNR against photographs"]
-        for name, style in zip(self.series, _STYLES, strict=True):
-            of_it = [row for row in rows if row["preset"] == name]
-            values = [r[f"PSNR against {self.against}"] for r in of_it]
-            axis.plot([r["size"] for r in of_it], values, label=name, **style)
-        others = results["other_formats/sizes"].records()[1:] if self.formats else ()
-        for row, shape in zip(others, _SHAPES, strict=False):
-            lost = self.against == "photographs"
-            value = truth - row[f"{scene}: lost"] if lost else row[f"{scene}: PSNR"]
-            label = row["format"].replace("`", "").replace(", 1000 iterations on the photographs", ", fine-tuned")
-            axis.plot(row[f"{scene}: size"], value, marker=shape, ms=8, ls="", mfc="w", mec="0.25", label=label)
-        if self.against == "photographs":
-            axis.axhline(truth, color="0.5", ls=":", label="uncompressed")
-        ticks = (0.5, 1, 2, 4, 8, 16)
-        axis.set_xscale("log")
-        axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
-        axis.minorticks_off()
-        axis.set(title=f"{scene}, {full['PLY bytes'] / 1e6:.1f} MB as PLY", xlabel="MB")
-        if not self.formats:
-            axis.set_ylim(bottom=truth - 1.6)  # below this a file is smaller than anybody asks for
-
-
-def kept_digest(plot: Plot) -> str:
-    """Of the figures that a picture was drawn of; empty without a picture."""
-    if not plot.path.exists():
-        return ""
-    with Image.open(plot.path) as image:
-        return str(image.info.get("Results", ""))
+    of = tuple(f"{subject}/{each}" for each in (*SCENES, "uncompressed"))
+    return Plot(name, title, of + ("other_formats/sizes",) * formats, panels)
 
 
 _PRESETS = ("best", "fast", "paper", "smallest")
@@ -335,17 +301,14 @@ _FITTED = ("paper", "best", "smallest", "smallest with photographs")
 _NEAR = "How near does a file of a size come to the {}?"
 PLOTS: tuple[Plot, ...] = (
     *(
-        Curves(f"rate_distortion_{to}", _NEAR.format(called), "rate_distortion", _PRESETS, to)
+        _curves(f"rate_distortion_{to}", _NEAR.format(called), "rate_distortion", _PRESETS, to)
         for to, called in (("uncompressed", "uncompressed scene"), ("photographs", "photographs"))
     ),
-    Curves(
+    _curves(
         "photographs", "What does a fit to photographs bring, on photographs that nobody has looked at?",
         "photographs", _FITTED, "photographs", formats=False,
     ),
-    Knobs(
-        "time_error", "What does each knob cost and bring?", "time_error",
-        (("lego_h200", "lego, on a GPU"), ("plush_h200", "plush, on a GPU")),
-    ),
+    Plot("time_error", "What does each knob cost and bring?", tuple(_KNOBS), _knobs),
 )  # fmt: skip
 
 
@@ -380,7 +343,7 @@ def main() -> None:
     for path, text in filled_pages(results).items():
         path.write_text(text, "utf-8")
     for plot in PLOTS:
-        if kept_digest(plot) != plot.digest(results):
+        if plot.kept_digest() != plot.digest(results):
             plot.draw(results)
 
 

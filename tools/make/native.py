@@ -13,6 +13,7 @@ import argparse
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import potr_cl.codec.native
@@ -20,19 +21,15 @@ import potr_cl.codec.native
 SOURCES = Path(potr_cl.codec.native.__file__).parent
 PLAIN = ["-O3"]
 _SANITIZED = [
-    "-O2",
-    "-g",
-    "-fno-omit-frame-pointer",
-    "-fsanitize=address,undefined",
-    "-fno-sanitize-recover=all",
+    "-O2", "-g", "-fno-omit-frame-pointer", "-fsanitize=address,undefined", "-fno-sanitize-recover=all",
     "-DPOTR_SANITIZED",
-]
+]  # fmt: skip
 #: The same as those of setup.py.
 ALWAYS = ["-std=c11", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden", "-fPIC", "-shared"]
 
 
 def compile_library(output: Path, sanitize: bool = False, compiler: str | None = None) -> None:
-    """Compile all sources but the one that is for Python's build.
+    """Compile the library for this machine.
 
     Raises:
         SystemExit: there is no compiler, or it refuses.
@@ -40,8 +37,13 @@ def compile_library(output: Path, sanitize: bool = False, compiler: str | None =
     found = compiler or next(filter(shutil.which, ("cc", "gcc", "clang")), None)
     if found is None:
         sys.exit("there is no C compiler: install gcc or clang")
+    compile_by([found], [*ALWAYS, *(_SANITIZED if sanitize else PLAIN)], output)
+
+
+def compile_by(compiler: Sequence[str], options: Sequence[str], output: Path) -> None:
+    """Compile all sources but the one that is for Python's build. Raises SystemExit if the compiler refuses."""
     sources = sorted(str(source) for source in SOURCES.glob("*.c") if source.name != "module.c")
-    command = [found, *ALWAYS, *(_SANITIZED if sanitize else PLAIN), *sources, "-lm", "-o", str(output)]
+    command = [*compiler, *options, *sources, "-lm", "-o", str(output)]
     if subprocess.run(command, check=False).returncode:
         sys.exit(f"failed: {' '.join(command)}")
 

@@ -19,7 +19,7 @@ import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from tools.make.native import ALWAYS, PLAIN, SOURCES
+from tools.make.native import ALWAYS, PLAIN, compile_by
 from tools.results import ROOT
 
 _FOLDER = "potr_cl/codec/native"
@@ -60,11 +60,8 @@ def compiled(platform: Platform, folder: Path) -> bytes:
         SystemExit: the compiler refuses.
     """
     output = folder / platform.library
-    sources = sorted(str(source) for source in SOURCES.glob("*.c") if source.name != "module.c")
     options = [option for option in ALWAYS if option != "-fPIC" or "windows" not in platform.target]
-    command = [sys.executable, "-m", "ziglang", "cc", "-target", platform.target, *options, *PLAIN, "-s", *sources]
-    if subprocess.run([*command, "-o", str(output)], check=False).returncode:
-        sys.exit(f"failed: {' '.join(command)}")
+    compile_by([sys.executable, "-m", "ziglang", "cc", "-target", platform.target], [*options, *PLAIN, "-s"], output)
     return output.read_bytes()
 
 

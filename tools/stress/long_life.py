@@ -10,21 +10,18 @@ if more than 1.3 times as much as after the tenth turn is resident at the end, w
 
 from __future__ import annotations
 
-import argparse
 import ctypes
 import gc
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import potr_cl
 from potr_cl.opencl.device import Device
-from tools.results import Column, Results
-from tools.workloads import resident
+from tools.results import Results
+from tools.workloads import TEST_DATA, plain_parser, resident
 
-_SCENE = Path(__file__).parents[2] / "tests" / "data" / "plush_excerpt.ply"
-_CAMERAS = _SCENE.with_name("plush_excerpt_cameras.json")
+_SCENE, _CAMERAS = TEST_DATA / "plush_excerpt.ply", TEST_DATA / "plush_excerpt_cameras.json"
 #: The turn with which others are compared, and how many times as much memory may be resident.
 _TENTH, _MOST_GROWTH = 10, 1.3
 
@@ -36,25 +33,18 @@ WORKS: dict[str, Callable[[Device | None], object]] = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = plain_parser(__doc__)
     parser.add_argument("--work", nargs="+", choices=list(WORKS), default=list(WORKS), help="default: all")
     parser.add_argument("--count", type=int, default=300, metavar="N", help="turns; default 300")
     parser.add_argument("--each-opens-a-device", action="store_true", help="default: one is opened for all")
     parser.add_argument("--device", help="as for potr-cl")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="keep the figures")
     args = parser.parse_args()
     device = Device(args.device)
+    opened = ", on a device that each opens" if args.each_opens_a_device else ""
     table = Results(device.info, args.json).table(
-        "long_life",
-        f"Memory of a process that does the same again: {', '.join(args.work)}"
-        + (", on a device that each opens" if args.each_opens_a_device else ""),
-        Column("turns", format=","),
-        Column("time", "s", ".0f"),
-        Column("resident", "MB", ".0f"),
-        Column("after malloc_trim", "MB", ".0f"),
-        Column("on the device", "MB", ".1f"),
-        Column("Python's objects", format=","),
-    )
+        "long_life", f"Memory of a process that does the same again: {', '.join(args.work)}{opened}",
+        "turns||,; time|s|.0f; resident|MB|.0f; after malloc_trim|MB|.0f; on the device|MB|.1f; Python's objects||,",
+    )  # fmt: skip
     tenth, began = 0.0, time.perf_counter()
     for turn in range(1, args.count + 1):
         for work in args.work:

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.errors import NoSuchExample
 
 #: What a check finds: error, and the part of it that rounding the input explains.
-Measures = dict[str, tuple[float, float]]
+Measure = tuple[float, float]
+Measures = dict[str, Measure]
 
 #: Times what rounding the input explains, beyond which an error is the kernel's own.
 LIMIT = 100.0

@@ -40,6 +40,7 @@ from tests.reference.scenes import random_scene
 from tools.make.native import compile_library
 from tools.stress.fuzz import campaign, fuzz_parser
 from tools.stress.hostile import potr_files
+from tools.stress.hostile.changes import Files
 from tools.stress.hostile.formats import MIB, Format, WrongResult, parts_of
 
 #: SH degree and splats of files whose integers have many bits, and whose lanes end at different steps.
@@ -59,9 +60,9 @@ def _originals() -> list[bytes]:
     return files
 
 
-def _changed(rng: Random) -> dict[str, bytes]:
+def _make(rng: Random) -> Files:
     often = (*potr_files.HOW_OFTEN, *(max(1, 2400 // size) for _, size in _MORE))
-    return {"a.potr": potr_files.changed(rng, _originals(), often)}
+    return {"a.potr": rng.choices(_originals(), often)[0]}
 
 
 def _read(path: Path) -> Any:
@@ -84,7 +85,7 @@ def _read(path: Path) -> Any:
     return native
 
 
-FORM = Format(lambda: [{"a.potr": data} for data in _originals()], _changed, _read, 512 * MIB, 1 << 16)
+FORM = Format(_make, potr_files.changed, _read, 512 * MIB, 1 << 16)
 
 
 def _outcome(work: Callable[[], list[bytes]]) -> list[bytes] | str:

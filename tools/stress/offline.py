@@ -15,7 +15,6 @@ that are spilled. Scratch is read and written by way of the GPU's memory, where 
 
 from __future__ import annotations
 
-import argparse
 import os
 import re
 import shutil
@@ -30,6 +29,7 @@ from pathlib import Path
 from potr_cl.opencl.source import kernel_source
 from tests.reference.gpu_programs import gpu_programs, gpu_sources
 from tools.results import Cell, Results
+from tools.workloads import plain_parser
 
 AMD = ("gfx906", "gfx90a", "gfx1030", "gfx1100", "gfx1201")
 #: Work-items of the narrowest sub-group of each (cl/include/registers.clh).
@@ -37,7 +37,7 @@ INTEL = {"tgllp": 8, "dg2": 8, "pvc": 16}
 APPLE = "apple"
 _VERSIONS = (19, 18, 17, 16)
 _CHECKED = ("-pedantic", "-Wall", "-Werror", "-Wno-unused-function", "-Wno-gnu-line-marker", "-Wno-unused-variable")
-_LOCAL, _GROUP = 32768, 256
+_LOCAL = 32768
 
 
 @dataclass(frozen=True)
@@ -54,11 +54,6 @@ class Program:
     def defines(self) -> list[str]:
         """For a compiler's command line; as GPUs get them that may have a watchdog (:mod:`potr_cl.opencl.pieces`)."""
         return ["-DIN_PIECES=1", *(f"-D{name}={value}" for name, value in self.macros)]
-
-    @property
-    def needs_extensions(self) -> bool:
-        """Whether it is for devices with 64-bit atomics."""
-        return ("INT64_ATOMICS", "1") in self.macros
 
 
 @dataclass(frozen=True, order=True)
@@ -104,47 +99,37 @@ def clang() -> tuple[str, Path] | None:
     return None
 
 
-def compile_for_amd(program: Program, target: str, file: Path) -> dict[str, Use]:
-    """What each kernel of a program takes on a GPU of AMD's.
-
-    Raises:
-        OfflineError: the compiler refuses it.
-    """
+def _by_clang(program: Program, target: str, file: Path, *options: str) -> None:
     found = clang()
     assert found is not None
-    command, library = found
-    options = ["-target", "amdgcn-mesa-mesa3d", f"-mcpu={target}", "-O3", "-S"]
-    builtins = ["-Xclang", "-mlink-builtin-bitcode", "-Xclang", str(library / f"{target}-amdgcn-mesa-mesa3d.bc")]
-    assembly = file.with_suffix(".s")
-    _run([command, *_LANGUAGE, *program.defines, *options, *builtins, "-o", str(assembly), str(file)], program, target)
-    text = assembly.read_text()
-    uses = {}
+    language = ("-x", "cl", "-cl-std=CL1.2", "-Xclang", "-finclude-default-header")
+    _run([found[0], *language, *program.defines, *options, str(file)], program, target)
+
+
+def compile_for_amd(program: Program, target: str, file: Path) -> dict[str, Use]:
+    """What each kernel of a program takes on a GPU of AMD's."""
+    found, assembly = clang(), file.with_suffix(".s")
+    assert found is not None
+    options = ["-target", "amdgcn-mesa-mesa3d", f"-mcpu={target}", "-O3", "-S", "-o", str(assembly)]
+    builtins = ["-Xclang", "-mlink-builtin-bitcode", "-Xclang", str(found[1] / f"{target}-amdgcn-mesa-mesa3d.bc")]
+    _by_clang(program, target, file, *options, *builtins)
+    text, uses = assembly.read_text(), {}
     for match in re.finditer(r"^\s*\.amdgpu_hsa_kernel (\w+)$|^\s*\.globl\s+(\w+)", text, re.MULTILINE):
-        name = match[1] or match[2]
         info = text[match.end() : text.find("COMPUTE_PGM_RSRC2:TIDIG_COMP_CNT", match.end())]
         figures = [re.search(rf"^; {label}: (\d+)", info, re.MULTILINE) for label in _AMD_LABELS]
         if figures[0] is not None:
-            uses[name] = Use(*(0 if figure is None else int(figure[1]) for figure in figures))
+            uses[match[1] or match[2]] = Use(*(0 if figure is None else int(figure[1]) for figure in figures))
     return uses
 
 
-_LANGUAGE = ("-x", "cl", "-cl-std=CL1.2", "-Xclang", "-finclude-default-header")
 _AMD_LABELS = ("ScratchSize", "NumVgprs", "Occupancy", "LDSByteSize")
 
 
 def compile_for_intel(program: Program, target: str, file: Path) -> dict[str, Use]:
-    """What each kernel of a program spills on a GPU of Intel's.
-
-    Raises:
-        OfflineError: the compiler refuses it.
-    """
+    """What each kernel of a program spills on a GPU of Intel's."""
     options = " ".join(["-cl-std=CL1.2", *program.defines, f"-DSUB_GROUP={INTEL[target]}"])
-    with tempfile.TemporaryDirectory() as folder:
-        said = _run(
-            [_ocloc() or "", "compile", "-file", str(file), "-device", target, "-options", options, "-out_dir", folder],
-            program,
-            target,
-        )
+    words = ["-file", str(file), "-device", target, "-options", options, "-out_dir", str(file.parent)]
+    said = _run([_ocloc() or "", "compile", *words], program, target)
     uses = dict.fromkeys(_kernels(program), Use())
     for name, spilled in re.findall(r"kernel (\w+)\s.*spilled around (\d+)", said):
         uses[name] = max(uses.get(name, Use()), Use(scratch=int(spilled)))
@@ -152,17 +137,10 @@ def compile_for_intel(program: Program, target: str, file: Path) -> dict[str, Us
 
 
 def check_for_apple(program: Program, target: str, file: Path) -> dict[str, Use]:
-    """Whether a program is OpenCL C 1.2 without any extension, as Apple's compiler takes it; nothing is measured.
-
-    Raises:
-        OfflineError: it is not.
-    """
-    if program.needs_extensions:
+    """Whether a program is OpenCL C 1.2 without any extension, as Apple's compiler takes it; nothing is measured."""
+    if ("INT64_ATOMICS", "1") in program.macros:  # for devices with 64-bit atomics
         return {}
-    found = clang()
-    assert found is not None
-    strict = ["-target", "spir64", "-Xclang", "-cl-ext=-all", "-fsyntax-only", *_CHECKED]
-    _run([found[0], *_LANGUAGE, *program.defines, *strict, str(file)], program, target)
+    _by_clang(program, target, file, "-target", "spir64", "-Xclang", "-cl-ext=-all", "-fsyntax-only", *_CHECKED)
     return dict.fromkeys(_kernels(program), Use())
 
 
@@ -194,10 +172,8 @@ def _ocloc() -> str | None:
 
 
 def _kernels(program: Program) -> list[str]:
-    text = kernel_source(program.source)
-    return re.findall(
-        r"^kernel\b[^;{(]*?(?:__attribute__\(\(.*?\)\)\)?\s*)?void (\w+)\(", text, re.MULTILINE | re.DOTALL
-    )
+    kernel = r"^kernel\b[^;{(]*?(?:__attribute__\(\(.*?\)\)\)?\s*)?void (\w+)\("
+    return re.findall(kernel, kernel_source(program.source), re.MULTILINE | re.DOTALL)
 
 
 def _run(command: Sequence[str], program: Program, target: str) -> str:
@@ -219,28 +195,23 @@ def _cell(use: Use | None, target: str) -> Cell:
     return f"{use.registers} / {use.scratch} / {use.waves}"
 
 
-def main() -> int:
+def main() -> None:
     """Compile all, print a row a kernel, fail where a program is refused."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = plain_parser(__doc__)
     parser.add_argument("sources", nargs="*", metavar="SOURCE", help="kernel files, as refit/blocks.cl (default: all)")
     parser.add_argument("--targets", nargs="+", choices=[APPLE, *AMD, *INTEL], metavar="NAME")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1, metavar="P")
-    parser.add_argument("--json", type=Path, metavar="FILE")
-    options = parser.parse_args()
-    targets = options.targets or available()
+    args = parser.parse_args()
+    targets = args.targets or available()
     for missing in [target for target in [APPLE, *AMD, *INTEL] if target not in available()]:
         print(f"no compiler for {missing} is here", file=sys.stderr)
-    sources = options.sources or gpu_sources()
-    results = Results(None, options.json)
-    columns = "; ".join(["kernel", "programs||,", *targets])
-    table = results.table(
-        "offline",
-        "Registers / bytes of scratch / waves a SIMD (AMD), registers spilled (Intel), of the worst program",
-        columns,
-    )
-    failures = []
-    with ThreadPoolExecutor(options.processes) as threads:
-        for source in sources:
+    table = Results(None, args.json).table(
+        "offline", "Registers / bytes of scratch / waves a SIMD (AMD), registers spilled (Intel), of the worst program",
+        "; ".join(["kernel", "programs||,", *targets]),
+    )  # fmt: skip
+    failures = 0
+    with ThreadPoolExecutor(args.processes) as threads:
+        for source in args.sources or gpu_sources():
             worst: dict[str, dict[str, Use]] = {}
             pairs = [(program, target) for target in targets for program in programs(source, target)]
             jobs = [threads.submit(measure, *pair) for pair in pairs]
@@ -250,14 +221,14 @@ def main() -> int:
                         there = worst.setdefault(name, {})
                         there[target] = max(there.get(target, use), use)
                 except OfflineError as error:
-                    failures.append(str(error))
+                    failures += 1
                     print(error, file=sys.stderr)
             count = len(programs(source))
             for name, uses in worst.items():
                 table.add(f"{source} {name}", count, *(_cell(uses.get(target), target) for target in targets))
-    print(f"\n{len(failures)} refused")
-    return 1 if failures else 0
+    print(f"\n{failures} refused")
+    sys.exit(failures > 0)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -24,6 +24,8 @@ F64 = NDArray[np.float64]
 
 #: Half a unit in the last place of a float32, relatively.
 ULP = 2.0**-24
+#: Draws of rounding errors. Seed of all of them.
+DRAWS, SEED = 3, 0
 
 
 def rounded(values: F64, rng: np.random.Generator) -> F64:

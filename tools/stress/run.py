@@ -4,8 +4,8 @@
 
 Each stage is judged on what it was given, so that an error belongs to one kernel: projection on the scene, tile lists,
 order and compositing on the ellipses that projection left, removal effects on the same, derivatives of pictures on the
-scene (tools.stress.derivatives), the ridge on its own systems, the re-fit on small scenes. Inputs (tools.stress.cases):
-cases made by hand, and some that hypothesis makes worse and worse.
+scene (tools.stress.fits), the ridge on its own systems, the re-fit on small scenes. Inputs (tools.stress.cases):
+cases made by hand, and views that hypothesis makes worse and worse.
 
 Beside each error stands what the kernel cannot help: how much the float64 result moves when the numbers that the kernel
 gets are rounded to float32 (random relative changes of up to 2^-24, a few draws). An error of a few times that is the
@@ -20,25 +20,14 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any
-
-from hypothesis import strategies as st
 
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import Family, list_devices
 from tools.results import Column, Results
-from tools.stress.cases import (
-    Case,
-    RefitCase,
-    RidgeCase,
-    known_cases,
-    known_refits,
-    known_ridges,
-    refit_problems,
-    ridge_systems,
-    small_scenes,
-)
+from tools.stress.cases import known_cases, known_refits, known_ridges, small_scenes
 from tools.stress.measures import LIMIT, PROMISES, WHAT, Measures, Worst, limit, note, search, smallest_failure
 from tools.stress.platforms import families
 from tools.stress.solvers import check_refit, check_ridge
@@ -50,41 +39,22 @@ def run_device(device: Device, examples: int, only: str = "") -> dict[str, Any]:
     """All cases, then ``examples`` attempts at each measure whose name begins with one of ``only``, with commas."""
     beginnings = tuple(only.split(","))
     worst: dict[str, Worst] = {}
-
-    def view(case: Case) -> Measures:
-        return check(device, case)
-
-    def system(case: RidgeCase) -> Measures:
-        return check_ridge(device, case)
-
-    def problem(case: RefitCase) -> Measures:
-        return check_refit(device, case)
-
-    lists: tuple[tuple[Callable[[Any], Measures], Iterator[Any]], ...] = (
-        (view, known_cases()),
-        (system, known_ridges()),
-        (problem, known_refits()),
-    )
-    for run, cases in lists:
-        for case in cases:
-            found = run(case)
-            if not any(measure.startswith(beginnings) for measure in found):
-                break  # the list is of other kernels
-            note(worst, {measure: pair for measure, pair in found.items() if measure.startswith(beginnings)}, case.name)
-    searches: dict[str, tuple[Callable[[Any], Measures], st.SearchStrategy[Any]]] = {
-        measure: (view, small_scenes()) for measure in WHAT
-    }
-    searches["ridge"] = system, ridge_systems()
-    for measure in ("re-fit: optimum", "re-fit: loss"):
-        searches[measure] = problem, refit_problems()
+    kinds: list[tuple[Callable[[Any], Measures], Iterable[Any], Sequence[str]]] = [
+        (partial(check, device), known_cases(), [m for m in WHAT if not m.startswith(("ridge", "re-fit"))]),
+        (partial(check_ridge, device), known_ridges(), ["ridge"]),
+        (partial(check_refit, device), known_refits(), ["re-fit: optimum", "re-fit: loss"]),
+    ]
+    for run, cases, measures in kinds:
+        for case in cases if any(measure.startswith(beginnings) for measure in measures) else ():
+            note(worst, {m: pair for m, pair in run(case).items() if m.startswith(beginnings)}, case.name)
     failures = {}
-    for measure, (run, strategy) in searches.items():
-        if not measure.startswith(beginnings):
-            continue
-        if examples:
-            search(measure, strategy, run, worst, examples)
+    view, _, of_views = kinds[0]
+    for measure in filter(lambda measure: measure.startswith(beginnings), WHAT):
+        searched = bool(examples) and measure in of_views
+        if searched:
+            search(measure, small_scenes(), view, worst, examples)
         if measure in worst and not worst[measure].ratio <= limit(measure):
-            smallest = smallest_failure(measure, strategy, run, 10 * examples) if examples else None
+            smallest = smallest_failure(measure, small_scenes(), view, 10 * examples) if searched else None
             failures[measure] = smallest or worst[measure].ratio_at
     kept = {name: dataclasses.asdict(w) for name, w in worst.items() if name.startswith(beginnings)}
     return {"worst": kept, "failures": failures}

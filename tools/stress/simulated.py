@@ -51,15 +51,13 @@ from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster import launcher as raster_launcher
 from potr_cl.raster import preparing_memory as long_lists_module
-from potr_cl.raster.picked_splats import Picker
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.rules import GSPLAT, INRIA
-from potr_cl.raster.scene_buffers import gathered, uploaded
-from potr_cl.stages.fitting.derivatives import PictureDerivatives
+from potr_cl.raster.rules import INRIA
+from potr_cl.raster.scene_buffers import Drawable, uploaded
 from potr_cl.stages.pruning.buffers import Survivors
 from potr_cl.stages.pruning.controller import prune_scene
 from potr_cl.stages.pruning.exchange import AddedChanges, AlivePacking, ChangedTotals
-from potr_cl.stages.pruning.removal import RemovalSweep, planned_sweep
+from potr_cl.stages.pruning.removal import planned_sweep
 from potr_cl.stages.pruning.schedule import PruningOptions
 from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.stages.refitting import coefficients, sliced_arrays
@@ -69,19 +67,19 @@ from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.refitting.sliced_arrays import Layout
 from potr_cl.views import reached
-from potr_cl.views.reached import surely_seen
 from potr_cl.views.targets import RenderedTargets
 from potr_cl.views.visibility import Visibility
-from tests.reference import raster as reference
 from tests.reference.scenes import plain_splats, random_splats, straight_camera, tilted_camera
 from tools.results import Results
+from tools.stress.cases import Case
+from tools.stress.fits import check_derivatives
+from tools.stress.measures import limit
 from tools.stress.platforms import check_similarity
+from tools.stress.views import check_rasterizer
 from tools.workloads import plain_parser
 
 #: Kernel families and vector widths.
 KINDS = (("gpu", 1), ("cpu", 4), ("cpu", 8), ("cpu", 16))
-#: As in the tests: pixels that come no nearer, relatively, to 1/255 and 1e-4 cannot flip; and what those may be off by.
-_CLEAR, _TOLERANCE = 1e-4, 2e-5
 #: Work-items of a dot product: few of those that devices have, most of which would have nothing to do.
 _DOT_ITEMS = 1024
 
@@ -95,16 +93,22 @@ def _views(count: int = 2) -> list[Camera]:
     return [tilted_camera(seed, 24, 16) for seed in range(count)]
 
 
-def pictures(device: Device) -> None:
-    """Both rules, short lists and long ones, against float64."""
-    for rules, size in ((INRIA, 60), (GSPLAT, 400)):
-        scene, view = random_splats(size, 3, seed=1), tilted_camera(1, 40, 24)
-        with Rasterizer(device, scene, rules) as rasterizer:
-            image, _ = rasterizer.render(view)
-            rasterizer.render_device(view)
-        wanted = reference.render(scene, view, rules)
-        error = np.abs(image - wanted.image)[wanted.margin > _CLEAR].max()
-        assert error <= _TOLERANCE, error
+def views(device: Device) -> None:
+    """All that a view needs, removal and the fit's derivatives, against float64: of short lists; and of a tile whose
+    list GPU kernels take in three batches, whose pixels go on to the end, with its re-fit."""
+    centres = np.random.default_rng(1).uniform((-0.1, -0.1, 1), (0.1, 0.1, 3), (300, 3))
+    scene, view = plain_splats(centres, sigma=0.03, logit=-4), straight_camera(16, 16)
+    for case in (
+        Case("short lists", random_splats(60, 3, seed=1), tilted_camera(1, 40, 24), INRIA),
+        Case("batches", scene, view),
+    ):
+        found, clear = check_rasterizer(device, case)
+        found |= check_derivatives(device, case, clear)
+        wrong = {m: pair for m, pair in found.items() if not pair[0] <= limit(m) * pair[1]}
+        assert not wrong, f"{case.name}: {wrong}"
+    with Rasterizer(device, scene) as rasterizer:
+        targets = RenderedTargets(rasterizer, [view])
+        refit_colours(device, scene, [view], targets, RefitOptions(steps=1, gain=0, drop=1e-9))
 
 
 def long_lists(device: Device) -> None:
@@ -123,55 +127,21 @@ def all_stages(device: Device) -> None:
             encode(random_splats(60, degree, seed=2), _views(5), options, device=device)
 
 
-def several_batches(device: Device) -> None:
-    """Removal, re-fit and derivatives of a tile whose list GPU kernels take in three batches, whose pixels go on to the
-    end."""
-    scene, views = _tower()
-    with Rasterizer(device, scene) as rasterizer:
-        with RemovalSweep(rasterizer, views, SweepOptions(0)) as removal:
-            removal.measure()
-            removal.remove(np.arange(0, len(scene), 7))
-            removal.measure()
-        options = RefitOptions(steps=1, gain=0, drop=1e-9)
-        refit_colours(device, scene, views, RenderedTargets(rasterizer, views), options)
-    _derivatives(device, scene, views)
-
-
-def _tower() -> tuple[Scene, list[Camera]]:
-    centres = np.random.default_rng(1).uniform((-0.1, -0.1, 1), (0.1, 0.1, 3), (300, 3))
-    return plain_splats(centres, sigma=0.03, logit=-4), [straight_camera(16, 16)]
-
-
 def view_by_view(device: Device) -> None:
-    """Pruning of a scene of which views see little: on GPUs view by view, with named splats; with resident views, and
-    with streamed ones."""
-    if device.family != "gpu":
-        return
+    """Pruning of a scene of which views see little: in parts; on GPUs view by view, too, with named splats, with
+    resident views and with streamed ones."""
     scene, views = _apart()
     with patch.object(splat_groups, "LARGEST", 8), uploaded(device, scene) as whole:
         visibility = Visibility.of(scene, views, INRIA.near)
-        for memory in (None, 0):
-            with planned_sweep(
-                device, whole, views, SweepOptions(0.0, memory=memory), visibility=visibility
-            ) as removal:
+        given: list[tuple[Drawable, int | None, float]] = [(scene, None, 0.0)]
+        given += [(whole, None, 0.0), (whole, 0, 0.05)] if device.family == "gpu" else []
+        for source, memory, tolerance in given:
+            options = SweepOptions(tolerance, memory=memory)
+            with planned_sweep(device, source, views, options, visibility=visibility) as removal:
                 removal.measure()
                 removal.remove(np.arange(0, len(scene), 5))
                 removal.measure()
-            with planned_sweep(
-                device, whole, views, SweepOptions(0.05, memory=memory), visibility=visibility
-            ) as removal:
                 prune_scene(removal, PruningOptions(1e-2, 3))
-
-
-def part_by_part(device: Device) -> None:
-    """The same scene in parts that see much of the same."""
-    scene, views = _apart()
-    with patch.object(splat_groups, "LARGEST", 8):
-        visibility = Visibility.of(scene, views)
-        assert len(visibility.clusters()) > 1
-        with planned_sweep(device, scene, views, SweepOptions(0.0), visibility=visibility) as removal:
-            removal.measure()
-            prune_scene(removal, PruningOptions(1e-2, 3))
 
 
 def _apart() -> tuple[Scene, list[Camera]]:
@@ -184,20 +154,6 @@ def _apart() -> tuple[Scene, list[Camera]]:
         for k in range(3)
     ]
     return plain_splats(means, 0.1, -1, rng.uniform(0, 1, (120, 3))), views
-
-
-def some_of_a_scene(device: Device) -> None:
-    """Splats picked by their groups, gathered, and told to be seen."""
-    scene, views = random_splats(5000, 1, seed=3), _views()
-    groups = np.random.default_rng(0).integers(0, 9, len(scene)).astype(np.uint32)
-    wanted = np.arange(9) % 2 == 0
-    with uploaded(device, scene) as whole, Picker(device, groups) as picker, Memory(device) as memory:
-        numbers, count = picker.pick(memory, wanted)
-        expected = np.flatnonzero(wanted[groups])
-        assert np.array_equal(device.download(numbers, (count,), np.uint32), expected)
-        surely_seen(whole, views)
-        with gathered(whole, expected[:100]) as part, Rasterizer(device, part) as rasterizer:
-            rasterizer.render(views[0])
 
 
 def refits(device: Device) -> None:
@@ -258,13 +214,6 @@ def marks(device: Device) -> None:
             added.add(totals, changes, 61, memory.upload(np.arange(61, dtype=np.uint32), "numbers"))
 
 
-def _derivatives(device: Device, scene: Scene, views: list[Camera]) -> None:
-    pixels = sum(view.width * view.height for view in views)
-    with PictureDerivatives(device, scene) as found, Memory(device) as memory:
-        target = memory.upload(np.full((pixels, 3), 0.5, np.float32), "the targets")
-        found.add(views, target)
-
-
 def decoding(device: Device) -> None:
     """Files to the device's memory: bundles, packed or not, and look-up tables."""
     scene = random_splats(300, 3, seed=8)
@@ -292,8 +241,7 @@ def filling(device: Device) -> None:
 
 
 STEPS: tuple[Step, ...] = (
-    pictures, long_lists, all_stages, several_batches, view_by_view, part_by_part, some_of_a_scene, refits,
-    packing, marks, decoding, clusters, check_similarity, filling,
+    views, long_lists, all_stages, view_by_view, refits, packing, marks, decoding, clusters, check_similarity, filling,
 )  # fmt: skip
 
 

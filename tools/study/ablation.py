@@ -1,20 +1,17 @@
 """What each part of the codec contributes, one added after the other.
 
-    python -m tools.study.ablation measure SCENE … --json OUT.json [--quality Q]
-    python -m tools.study.ablation report OUT.json [--json RESULTS.json]
+    python -m tools.study.ablation SCENE … [--quality Q] [--json FILE]
 
 The steps are those of the paper's table "Ablation study": serialisation and quantisation, entropy coding, pruning,
 SH compaction, YCoCg; those before YCoCg quantise R, G and B. The others are ours: the re-fit with steps of equal worth
 and bundles; and views between the training views, which make the preset best. A second table has the bytes a
-splat of each property, compared with the float32 values of a PLY (normals left out). ``report`` prints both, and --json
-keeps them for docs/benchmarks.
+splat of each property, compared with the float32 values of a PLY (normals left out).
 """
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import json
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -29,9 +26,9 @@ from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.report.file import file_report
 from potr_cl.stages.stage import State
-from tools.results import Column, Results, circumstances, write_json
+from tools.results import Column, Results
 from tools.study.evaluation import EvaluatedScene
-from tools.workloads import reduced, study_parser
+from tools.workloads import reduced, scene_parser
 
 #: The paper's properties, the sections of a file that hold each, and float32 values a splat in a PLY of degree 3.
 PROPERTIES = {
@@ -82,74 +79,58 @@ def _plain(evaluator: EvaluatedScene, options: EncodeOptions, state: State, rgb:
     return _figures(evaluator, b"".join(coded.pieces), rgb)
 
 
-def measure_steps(evaluator: EvaluatedScene, device: Device, q: float) -> list[dict[str, Any]]:
+def measured_steps(evaluator: EvaluatedScene, device: Device, q: float) -> Iterator[tuple[str, dict[str, Any]]]:
     """All steps on one scene, the first without entropy coding."""
     options, views = EncodeOptions.for_preset("paper", q=q), train_views(evaluator.cameras)
     plain = _plain(evaluator, options, State.of(evaluator.source, views), True)
-    serialised = {**plain, "bytes": plain["serialised_bytes"], "bytes_a_splat": plain["serialised_bytes_a_splat"]}
-    steps = [{"step": "serialisation and quantisation", **serialised}, {"step": "entropy coding", **plain}]
+    serialised = {"bytes": plain["serialised_bytes"], "bytes_a_splat": plain["serialised_bytes_a_splat"]}
+    yield "serialisation and quantisation", {**plain, **serialised}
+    yield "entropy coding", plain
     for name, changed, rgb in (
         ("pruning", options.changed(compact=False), True),
         ("SH compaction", options.changed(compact={"colour_model": "rgb"}), True),
         ("RGB → YCoCg", options, False),
     ):
-        left = reduced(evaluator.source, views, changed, device)
-        steps.append({"step": name, **_plain(evaluator, changed, left, rgb)})
+        yield name, _plain(evaluator, changed, reduced(evaluator.source, views, changed, device), rgb)
     best = EncodeOptions.for_preset("best", q=q)
     for name, changed in (
         ("re-fit, steps of equal worth, contexts", best.changed(between=False)),
         ("views between the training views: preset best", best),
     ):
-        encoded = encode(evaluator.source, views, changed, device=device)
-        steps.append({"step": name, **_figures(evaluator, encoded.data)})
-    return steps
+        yield name, _figures(evaluator, encode(evaluator.source, views, changed, device=device).data)
 
 
-def _measure(args: argparse.Namespace) -> None:
-    device = Device(args.device)
-    about = circumstances(device.info)
-    results: dict[str, Any] = {**about, "device": device.info.name, "q": args.quality, "scenes": {}}
-    for folder in args.scenes:
-        with EvaluatedScene(folder, device) as evaluator:
-            steps = measure_steps(evaluator, device, args.quality)
-            results["scenes"][evaluator.name] = {**evaluator.facts(), "steps": steps}
-            write_json(args.json, results)
-
-
-def _report(args: argparse.Namespace) -> None:
-    measured = json.loads(args.results[0].read_text())
-    results = Results(None, args.json, measured)
-    for name, entry in measured["scenes"].items():
-        table = results.table(
-            name,
-            f"The steps of the paper's ablation, then those to preset best: {name}, q = {measured['q']:g}",
-            "step; splats||,; size|MB|.3f; PSNR against uncompressed|dB|.2f; SSIM against uncompressed||.4f; "
-            "PSNR against photographs|dB|.2f; SSIM against photographs||.4f",
-        )
-        plain, steps = entry["uncompressed"], entry["steps"]
-        truth = (plain.get("truth_psnr"), plain.get("truth_ssim"))
-        table.add("uncompressed", entry["source_splats"], entry["source_bytes"] / 1e6, None, None, *truth)
-        for s in steps:
-            figures = (s["psnr"], s["ssim"], s.get("truth_psnr"), s.get("truth_ssim"))
-            table.add(f"+ {s['step']}", s["splats"], s["bytes"] / 1e6, *figures)
-        parts = results.table(
-            f"bytes_{name}",
-            f"Bytes a splat after each step: {name}, q = {measured['q']:g}",
-            "step",
-            *(Column(prop, format=".2f") for prop in (*PROPERTIES, "all")),
-        )
-        floats = [4.0 * values for _, values in PROPERTIES.values()]
-        parts.add("as PLY", *floats, sum(floats))
-        for s in steps:
-            own = [s["bytes_a_splat"][prop] for prop in PROPERTIES]
-            parts.add(f"+ {s['step']}", *own, sum(own))
+def study(results: Results, evaluator: EvaluatedScene, device: Device, q: float) -> None:
+    """The two tables of a scene."""
+    name, facts = evaluator.name, evaluator.facts()
+    table = results.table(
+        name, f"The steps of the paper's ablation, then those to preset best: {name}, q = {q:g}",
+        "step; splats||,; size|MB|.3f; PSNR against uncompressed|dB|.2f; SSIM against uncompressed||.4f; "
+        "PSNR against photographs|dB|.2f; SSIM against photographs||.4f",
+    )  # fmt: skip
+    truth = [facts["uncompressed"].get(figure) for figure in ("truth_psnr", "truth_ssim")]
+    table.add("uncompressed", facts["source_splats"], facts["source_bytes"] / 1e6, None, None, *truth)
+    steps = {}
+    for step, s in measured_steps(evaluator, device, q):
+        figures = (s.get(figure) for figure in ("psnr", "ssim", "truth_psnr", "truth_ssim"))
+        table.add(f"+ {step}", s["splats"], s["bytes"] / 1e6, *figures)
+        steps[f"+ {step}"] = [s["bytes_a_splat"][prop] for prop in PROPERTIES]
+    heads = (Column(prop, format=".2f") for prop in (*PROPERTIES, "all"))
+    parts = results.table(f"bytes_{name}", f"Bytes a splat after each step: {name}, q = {q:g}", "step", *heads)
+    floats = [4.0 * values for _, values in PROPERTIES.values()]
+    for step, own in {"as PLY": floats, **steps}.items():
+        parts.add(step, *own, sum(own))
 
 
 def main() -> None:
-    parser, measure, _ = study_parser(__doc__, _measure, _report)
-    measure.add_argument("--quality", type=float, default=0.5)
+    parser = scene_parser(__doc__)
+    parser.add_argument("--quality", type=float, default=0.5)
     args = parser.parse_args()
-    args.run(args)
+    device = Device(args.device)
+    results = Results(device.info, args.json)
+    for folder in args.scenes:
+        with EvaluatedScene(folder, device) as evaluator:
+            study(results, evaluator, device, args.quality)
 
 
 if __name__ == "__main__":

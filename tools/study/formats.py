@@ -1,13 +1,13 @@
 """Other formats: how small and good our encodes to them are, and what other programs make of the same scenes.
 
-    python -m tools.study.formats measure SCENE … --json OUT.json [--q Q …] [--formats NAME …] [--transform COMMAND]
-    python -m tools.study.formats report OUT.json --curves CURVES.json … [--series best] [--json TABLES.json]
+    python -m tools.study.formats SCENE … [--q Q …] [--formats NAME …] [--transform COMMAND] [--curves CURVES.json …]
+        [--series best] [--json FILE]
 
-``measure`` encodes each scene straight to each format, and converts all of it, judged by all test views through our own
-readers and, where they are there, through splat-transform (npm's @playcanvas/splat-transform) and gaussforge (PyPI's).
-With --others splat-transform writes the scene, too. ``report`` prints that; how much smaller an encode of the same
-PSNR, and of the same loss on photographs, is than others' files; and the same for .potr files, by interpolation along
-the curves of tools.study.rate_distortion. Files of others are those that OUT.json has and those of the table "sizes" of
+Each scene is encoded straight to each format, and all of it converted, judged by all test views through our own readers
+and, where they are there, through splat-transform (npm's @playcanvas/splat-transform) and gaussforge (PyPI's). With
+--others splat-transform writes the scene, too. Then: how much smaller an encode of the same PSNR, and of the same loss
+on photographs, is than others' files; and the same for .potr files, by interpolation along the curves of
+tools.study.rate_distortion. Files of others are those that were just written and those of the table "sizes" of
 docs/benchmarks/results/other_formats.json, whose authors' programs have written them.
 """
 
@@ -29,46 +29,65 @@ from potr_cl.opencl.device import Device
 from potr_cl.outputs.registry import output_of_suffix
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from tools.results import ROOT, Cell, Column, Results, circumstances, write_json
+from tools.results import ROOT, Cell, Column, Results
 from tools.study.evaluation import EvaluatedScene
 from tools.study.rate_distortion import merged, size_at
-from tools.workloads import log, study_parser
+from tools.workloads import log, scene_parser
 
 #: Suffixes, with a version behind a colon.
 FORMATS = (".spz:2", ".spz:4", ".sog", ".compressed.ply")
+READERS = ("splat-transform", "gaussforge")
 KNOWN = ROOT / "docs" / "benchmarks" / "results" / "other_formats.json"
 Entry = dict[str, Any]
 
 
-# ------------------------------------------------------------------------------------------- measurement
+def study(results: Results, folder: Path, device: Device, args: argparse.Namespace) -> None:
+    """The tables of a scene."""
+    with EvaluatedScene(folder, device) as evaluator, tempfile.TemporaryDirectory() as scratch:
+        name = evaluator.name
+        readers = (Column(f"PSNR by {reader}", "dB", ".2f") for reader in READERS)
+        table = results.table(
+            f"outputs_{name}", f"Other formats: {name}, all test views",
+            "writer; format; q||g; splats||,; size|MB|.2f; PSNR|dB|.2f; lost|dB|.2f", *readers, "time|s|.1f",
+        )  # fmt: skip
+        files = []
+        for writer, form, q in _plan(args):
+            path, began = Path(scratch, f"file{form.partition(':')[0]}"), time.perf_counter()
+            splats = _write(writer, form, q, path, evaluator, folder, device, args)
+            seconds, size = time.perf_counter() - began, path.stat().st_size
+            file: Entry = {"writer": writer, "format": form, "bytes": size, **evaluator(load_scene(path))}
+            by_others = _other_readers(args.transform, path, Path(scratch, "read.ply"), evaluator)
+            figures = (file["psnr"], file.get("psnr_loss"), *(by_others.get(reader) for reader in READERS))
+            table.add(writer, form, q, splats, size / 1e6, *figures, seconds)
+            files.append(file)
+    theirs, encodes = others(name, files), [file for file in files if file["writer"] == "encode"]
+    for form in dict.fromkeys(file["format"] for file in encodes):
+        same = [file for file in theirs if file["format"] == form.partition(":")[0]]
+        against(results, f"{form}_{name}", form, [file for file in encodes if file["format"] == form], same)
+    if args.curves:
+        curves = merged(args.curves, [args.series])["scenes"].get(name, {"series": {}})["series"]
+        if not curves.get(args.series, {"encodes": []})["encodes"]:
+            raise UsageError(f"there is no curve '{args.series}' of {name}")
+        against(results, name, args.series, curves[args.series]["encodes"], theirs)
 
 
-def _measure(args: argparse.Namespace) -> None:
-    device = Device(args.device)
-    results: Entry = {**circumstances(device.info), "device": device.info.name, "scenes": {}}
-    for folder in args.scenes:
-        with EvaluatedScene(folder, device) as evaluator, tempfile.TemporaryDirectory() as scratch:
-            entry = results["scenes"][evaluator.name] = {**evaluator.facts(), "files": []}
-            for writer, name, q in _plan(args):
-                suffix, _, version = name.partition(":")
-                path, began = Path(scratch, f"file{suffix}"), time.perf_counter()
-                splats = len(evaluator.source)
-                if writer == "encode":
-                    output = output_of_suffix(suffix, version=int(version) if version else None)
-                    options = EncodeOptions(q=q, output=output).changed(fit={"steps": args.fit})
-                    encoded = encode(evaluator.source, train_views(evaluator.cameras), options, device=device)
-                    encoded.save(path)
-                    splats = len(encoded.order)
-                elif writer == "convert":
-                    save_scene(path, evaluator.source)
-                else:
-                    _transform(args.transform, folder / "point_cloud.ply", path)
-                point = {"writer": writer, "format": name, "q": q, "splats": splats, "bytes": path.stat().st_size}
-                point |= {"seconds": time.perf_counter() - began, **evaluator(load_scene(path))}
-                point["readers"] = _other_readers(args.transform, path, Path(scratch, "read.ply"), evaluator)
-                entry["files"].append(point)
-                write_json(args.json, results)
-                log(f"{evaluator.name}: {writer} {name} {q}: {point['bytes']} bytes, {point['psnr']} dB")
+def _write(
+    writer: str, form: str, q: float, path: Path, evaluator: EvaluatedScene, folder: Path, device: Device,
+    args: argparse.Namespace,
+) -> int:  # fmt: skip
+    """Have a file written; its splats."""
+    if writer == "encode":
+        suffix, _, version = form.partition(":")
+        output = output_of_suffix(suffix, version=int(version) if version else None)
+        options = EncodeOptions(q=q, output=output).changed(fit={"steps": args.fit})
+        encoded = encode(evaluator.source, train_views(evaluator.cameras), options, device=device)
+        encoded.save(path)
+        return len(encoded.order)
+    if writer == "convert":
+        save_scene(path, evaluator.source)
+    else:
+        _transform(args.transform, folder / "point_cloud.ply", path)
+    return len(evaluator.source)
 
 
 def _plan(args: argparse.Namespace) -> list[tuple[str, str, float]]:
@@ -104,9 +123,6 @@ def _other_readers(command: str, path: Path, ply: Path, evaluator: EvaluatedScen
     except (ImportError, UsageError) as error:
         log(f"gaussforge: {error}")
     return found
-
-
-# ------------------------------------------------------------------------------------------------ report
 
 
 def others(scene: str, files: list[Entry]) -> list[Entry]:
@@ -152,43 +168,22 @@ def _how_small(points: list[Entry], key: str, file: Entry) -> tuple[Cell, Cell]:
     return f"below {least['bytes'] / 1e6:.2f}", f"more than {file['bytes'] / least['bytes']:.1f}"
 
 
-def _report(args: argparse.Namespace) -> None:
-    measured = [json.loads(path.read_text()) for path in args.results]
-    results = Results(None, args.json, measured[0])
-    scenes = [pair for each in measured for pair in each["scenes"].items()]
-    for scene, entry in scenes:
-        readers = list(dict.fromkeys(reader for file in entry["files"] for reader in file["readers"]))
-        table = results.table(
-            f"outputs_{scene}", f"Other formats: {scene}, all test views",
-            "writer; format; q||g; splats||,; size|MB|.2f; PSNR|dB|.2f; lost|dB|.2f",
-            *(Column(f"PSNR by {reader}", "dB", ".2f") for reader in readers), "time|s|.1f",
-        )  # fmt: skip
-        for f in entry["files"]:
-            row = f["writer"], f["format"], f["q"], f["splats"], f["bytes"] / 1e6, f["psnr"], f.get("psnr_loss")
-            table.add(*row, *(f["readers"].get(reader) for reader in readers), f["seconds"])
-        files = others(scene, entry["files"])
-        encodes = [file for file in entry["files"] if file["writer"] == "encode"]
-        for name in dict.fromkeys(file["format"] for file in encodes):
-            same = [file for file in files if file["format"] == name.partition(":")[0]]
-            against(results, f"{name}_{scene}", name, [file for file in encodes if file["format"] == name], same)
-        if args.curves:
-            curves = merged(args.curves, [args.series])["scenes"].get(scene, {"series": {}})["series"]
-            if not curves.get(args.series, {"encodes": []})["encodes"]:
-                raise UsageError(f"there is no curve '{args.series}' of {scene}")
-            against(results, scene, args.series, curves[args.series]["encodes"], files)
-
-
 def main() -> None:
-    parser, measure, report = study_parser(__doc__, _measure, _report)
-    measure.add_argument("--q", type=float, nargs="*", default=(0.1, 0.3, 0.5, 0.8), help="qualities of encodes")
-    measure.add_argument("--formats", nargs="*", default=FORMATS, metavar="NAME", help="a suffix, or .spz:VERSION")
-    measure.add_argument("--fit", type=int, default=0, metavar="STEPS", help="fit all parameters too")
-    measure.add_argument("--transform", default="splat-transform", metavar="COMMAND")
-    measure.add_argument("--others", action="store_true", help="have splat-transform write the scene, too")
-    report.add_argument("--curves", type=Path, nargs="*", default=[], help="of tools.study.rate_distortion")
-    report.add_argument("--series", default="best", metavar="NAME", help="of the curves")
+    parser = scene_parser(__doc__)
+    parser.add_argument("--q", type=float, nargs="*", default=(0.1, 0.3, 0.5, 0.8), help="qualities of encodes")
+    parser.add_argument("--formats", nargs="*", default=FORMATS, metavar="NAME", help="a suffix, or .spz:VERSION")
+    parser.add_argument("--fit", type=int, default=0, metavar="STEPS", help="fit all parameters too")
+    parser.add_argument("--transform", default="splat-transform", metavar="COMMAND")
+    parser.add_argument("--others", action="store_true", help="have splat-transform write the scene, too")
+    parser.add_argument("--curves", type=Path, nargs="*", default=[], help="of tools.study.rate_distortion")
+    parser.add_argument("--series", default="best", metavar="NAME", help="of the curves")
     args = parser.parse_args()
-    args.run(args)
+    if args.curves:
+        merged(args.curves, [args.series])  # refuses a series that is not there before anything is measured
+    device = Device(args.device)
+    results = Results(device.info, args.json)
+    for folder in args.scenes:
+        study(results, folder, device, args)
 
 
 if __name__ == "__main__":

@@ -40,7 +40,6 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.report.file import file_report
 from tools.results import Cell, Column, Results, circumstances, write_json
 from tools.study.evaluation import EvaluatedScene
-from tools.workloads import study_parser
 
 #: Columns of the table of stages, and what an encode calls them.
 _STAGES = {
@@ -180,13 +179,21 @@ def merged(paths: Sequence[Path], chosen: Sequence[str] = ()) -> dict[str, Any]:
     return {**files[0], "scenes": scenes, **said, "command": commands, "commit": commit}
 
 
-def size_at(points: list[dict[str, Any]], key: str, value: float) -> float | None:
-    """Bytes at which a curve reaches ``value`` of ``key``; None beyond its ends."""
+def size_at(points: Sequence[dict[str, Any]], key: str, value: float, beyond: bool = False) -> float | None:
+    """Bytes at which a curve reaches ``value`` of ``key``, bytes as logarithms.
+
+    Args:
+        beyond: go on straight beyond the curve's ends; else there is nothing there.
+    """
     ordered = sorted(points, key=lambda p: float(p[key]))
-    values = [p[key] for p in ordered]
-    if not values[0] <= value <= values[-1]:
+    values, sizes = np.array([p[key] for p in ordered]), np.log([p["bytes"] for p in ordered])
+    if not (beyond or values[0] <= value <= values[-1]):
         return None
-    return float(np.exp(np.interp(value, values, np.log([p["bytes"] for p in ordered]))))
+    if len(values) == 1:
+        return float(np.exp(sizes[0]))
+    at = min(max(int(np.searchsorted(values, value)), 1), len(values) - 1)
+    slope = (sizes[at] - sizes[at - 1]) / (values[at] - values[at - 1])
+    return float(np.exp(sizes[at] + slope * (value - values[at])))
 
 
 def print_gaps(results: Results, scenes: dict[str, Any], against: str, q: float) -> None:
@@ -267,10 +274,19 @@ def _report(args: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    parser, measure, report = study_parser(__doc__, _measure, _report)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True)
+    measure, report = commands.add_parser("measure"), commands.add_parser("report")
+    measure.set_defaults(run=_measure)
+    measure.add_argument("scenes", nargs="+", type=Path, metavar="SCENE")
+    measure.add_argument("--json", type=Path, required=True)
+    measure.add_argument("--device", help="as for potr-cl")
     measure.add_argument("--qualities", nargs="+", type=float, default=QUALITIES, metavar="Q")
     measure.add_argument("--seconds", type=float, default=math.inf, metavar="S")
     measure.add_argument("--series", nargs="+", default=["default"], metavar="NAME[:OPTION=VALUE,…]")
+    report.set_defaults(run=_report)
+    report.add_argument("results", type=Path, nargs="+", help="the JSON that measure wrote")
+    report.add_argument("--json", type=Path, metavar="FILE", help="keep the tables for docs/benchmarks")
     report.add_argument("--series", nargs="+", default=[], metavar="NAME", help="these alone, in this order")
     report.add_argument("--against", metavar="NAME")
     report.add_argument("--at", type=float, default=0.5, metavar="Q")

@@ -23,7 +23,7 @@ from potr_cl.opencl.discovery import choose_device
 from potr_cl.pipeline.encode import encode
 from tools.results import Results
 from tools.study.evaluation import EvaluatedScene
-from tools.study.rate_distortion import encode_options
+from tools.study.rate_distortion import encode_options, size_at
 from tools.workloads import scene_parser
 
 #: What is turned, by name: the preset, the option, and its values.
@@ -41,39 +41,29 @@ KNOBS: dict[str, tuple[str, str, tuple[Any, ...]]] = {
 QUALITIES, AROUND = (0.3, 0.5), (0.2, 0.25, 0.35, 0.4, 0.45, 0.55)
 
 
-class Encodes:
-    """Encodes of one scene on one device."""
-
-    def __init__(self, evaluator: EvaluatedScene, device: Device) -> None:
-        self._evaluator, self._device = evaluator, device
-        self._clock = time.process_time if device.info.family == "cpu" else time.perf_counter
-
-    def one(self, preset: str, q: float, changes: dict[str, Any]) -> tuple[float, float, float]:
-        """Seconds, bytes and PSNR."""
-        options = encode_options({"preset": preset, "q": q, **changes})
-        began = self._clock()
-        encoded = encode(self._evaluator.source, self._evaluator.cameras, options, device=self._device)
-        seconds = self._clock() - began
-        psnr = self._evaluator(open_file(b"".join(encoded.pieces)).scene())["psnr"]
-        return seconds, float(encoded.nbytes), float(psnr or np.inf)
+Point = dict[str, float]
 
 
-def gap(curve: Sequence[tuple[float, float, float]], point: tuple[float, float, float]) -> float:
-    """Bytes of a point more than of a curve at its PSNR, in percent; both are (seconds, bytes, PSNR).
+def encoded(evaluator: EvaluatedScene, device: Device, preset: str, q: float, changes: dict[str, Any]) -> Point:
+    """Seconds, bytes and PSNR of an encode."""
+    options = encode_options({"preset": preset, "q": q, **changes})
+    clock = time.process_time if device.info.family == "cpu" else time.perf_counter
+    began = clock()
+    made = encode(evaluator.source, evaluator.cameras, options, device=device)
+    seconds = clock() - began
+    psnr = evaluator(open_file(b"".join(made.pieces)).scene())["psnr"]
+    return {"seconds": seconds, "bytes": made.nbytes, "psnr": float(psnr or np.inf)}
 
-    Beyond the curve's ends it goes on straight, bytes as logarithms.
-    """
-    ordered = sorted(curve, key=lambda each: each[2])
-    psnr, size = np.array([each[2] for each in ordered]), np.log([each[1] for each in ordered])
-    at = min(max(int(np.searchsorted(psnr, point[2])), 1), len(psnr) - 1)
-    slope = (size[at] - size[at - 1]) / (psnr[at] - psnr[at - 1])
-    return float(100 * np.expm1(np.log(point[1]) - size[at] - slope * (point[2] - psnr[at])))
+
+def gap(curve: list[Point], point: Point) -> float:
+    """Bytes of a point more than of a curve at its PSNR, in percent; beyond its ends the curve goes on straight."""
+    return 100 * (point["bytes"] / (size_at(curve, "psnr", point["psnr"], beyond=True) or np.nan) - 1)
 
 
 def study(results: Results, folder: Path, device: Device, knobs: Sequence[str], qualities: Sequence[float]) -> None:
     """The table of a scene."""
     with EvaluatedScene(folder, device) as evaluator:
-        encodes, curves = Encodes(evaluator, device), dict[str, dict[float, tuple[float, float, float]]]()
+        curves = dict[str, dict[float, Point]]()
         table = results.table(
             evaluator.name, f"Run time against error, {evaluator.name}",
             "knob; value; time, in that of the default||.2f; bytes at equal PSNR|%|+.2f; an encode|s|.2f",
@@ -81,16 +71,16 @@ def study(results: Results, folder: Path, device: Device, knobs: Sequence[str], 
         for name in knobs:
             preset, option, values = KNOBS[name]
             if preset not in curves:
-                encodes.one(preset, qualities[-1], {})
-                curves[preset] = {q: encodes.one(preset, q, {}) for q in (*qualities, *AROUND)}
-                seconds = [curves[preset][q][0] for q in qualities]
+                encoded(evaluator, device, preset, qualities[-1], {})
+                curves[preset] = {q: encoded(evaluator, device, preset, q, {}) for q in (*qualities, *AROUND)}
+                seconds = [curves[preset][q]["seconds"] for q in qualities]
                 table.add(f"all of {preset}", "default", 1.0, 0.0, float(np.mean(seconds)))
             curve = curves[preset]
             for value in values:
-                turned = {q: encodes.one(preset, q, {option: value}) for q in qualities}
-                times = [turned[q][0] / curve[q][0] for q in qualities]
+                turned = {q: encoded(evaluator, device, preset, q, {option: value}) for q in qualities}
+                times = [turned[q]["seconds"] / curve[q]["seconds"] for q in qualities]
                 gaps = [gap(list(curve.values()), turned[q]) for q in qualities]
-                seconds = [turned[q][0] for q in qualities]
+                seconds = [turned[q]["seconds"] for q in qualities]
                 table.add(name, _said(value), *map(float, map(np.mean, (times, gaps, seconds))))
 
 

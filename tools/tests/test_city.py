@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import os
-import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +13,7 @@ from potr_cl.model.camera import test_views as judging
 from potr_cl.model.camera import train_views
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
-from tools.make.city import Building, City, write_city
+from tools.make.city import Building, City, main, write_city
 
 
 @pytest.fixture(scope="module")
@@ -64,11 +61,9 @@ def test_a_copy_looks_like_its_scene(building):
     assert np.abs(pictures[0] - pictures[1]).max() < 2e-3
 
 
-def test_the_command(data, tmp_path):
+def test_the_command(data, tmp_path, monkeypatch, capsys):
     source = f"{data / 'plush_excerpt.ply'},{data / 'plush_excerpt_cameras.json'}"
-    command = [sys.executable, "-m", "tools.make.city", source, "-o", str(tmp_path), "--splats", "2e3", "--views", "4"]
-    root = Path(__file__).parents[2]
-    done = subprocess.run(
-        [*command, "--size", "40x30"], cwd=root, capture_output=True, text=True, env=dict(os.environ), check=True
-    )
-    assert done.stdout.startswith("2000 splats, 2 copies, 24 views")
+    words = [source, "-o", str(tmp_path), "--splats", "2e3", "--views", "4", "--size", "40x30"]
+    monkeypatch.setattr(sys, "argv", ["city", *words])
+    main()
+    assert capsys.readouterr().out.startswith("2000 splats, 2 copies, 24 views")

@@ -14,7 +14,7 @@ import pytest
 from potr_cl.codec.sections import Coder
 from potr_cl.formats.registry import SCENE_FORMATS
 from tests.reference.file_parts import File, sealed
-from tools.stress.hostile.bomb_files import BOMBS
+from tools.stress.bombs import BOMBS
 from tools.stress.hostile.formats import FORMATS
 from tools.stress.hostile.judge import Verdict
 from tools.stress.hostile.potr_files import originals
@@ -126,7 +126,7 @@ def test_what_ends_the_process(what, verdicts):
     assert verdicts[what] in ENDS[what][1]
 
 
-@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("form", [*FORMATS, "native"])
 def test_a_number_of_a_seed_is_one_file(form):
     for number in range(30):
         assert changed_files(form, 3, number) == changed_files(form, 3, number)

@@ -14,7 +14,6 @@ from tools.make.native import compile_library
 from tools.results import ROOT
 from tools.stress import native as stress
 from tools.stress.hostile.formats import WrongResult
-from tools.stress.hostile.worker import changed_files
 
 #: Tells C of one number more than there is.
 BEYOND = """
@@ -68,12 +67,6 @@ def test_changed_files_are_read_alike(tmp_path, library, monkeypatch):
     assert (files, findings) == (15, 0)
     assert read + refused == files
     assert read > 0 < refused
-
-
-def test_a_file_of_a_seed_is_always_the_same():
-    files = [changed_files("native", 3, number)["a.potr"] for number in range(40)]
-    assert files == [changed_files("native", 3, number)["a.potr"] for number in range(40)]
-    assert len(set(files)) > 30
 
 
 def test_a_difference_is_a_finding():

@@ -31,8 +31,9 @@ def call(monkeypatch, tool, *arguments):
 def test_series():
     name, options = rate_distortion.parse_series("no colours:refit=False,prune.iterations=8,compact.colour_model=rgb")
     assert (name, options) == ("no colours", {"refit": False, "prune.iterations": 8, "compact.colour_model": "rgb"})
-    chosen = rate_distortion.encode_options(options)
+    chosen = rate_distortion.encode_options({**options, "preset": "fast", "q": 0.4})
     assert (chosen.refit.on, chosen.prune.iterations, chosen.compact.colour_model) == (False, 8, "rgb")
+    assert (chosen.preset, chosen.q) == ("fast", 0.4)
     assert rate_distortion.encode_options({}) == EncodeOptions()
     _, options = rate_distortion.parse_series("near:preset=smallest,photos=True")
     for images in (Path("a"), Path("b")):
@@ -58,9 +59,6 @@ def test_a_curve_is_measured_written_and_continued(monkeypatch, folder, tmp_path
 
 @pytest.mark.slow
 def test_series_of_the_sweeps_options_and_their_gaps(monkeypatch, folder, tmp_path, capsys):
-    _, options = rate_distortion.parse_series("lazy:preset=fast,prune.tolerance=0.1,prune.iterations=8")
-    lazy = rate_distortion.encode_options({**options, "q": 0.4})
-    assert (lazy.prune.tolerance, lazy.prune.iterations, lazy.q, lazy.preset) == (0.1, 8, 0.4, "fast")
     out = tmp_path / "out.json"
     series = tuple(f"{name}:preset=paper,prune.iterations=4" for name in ("plain", "same"))
     series += ("lazy:preset=paper,prune.iterations=2",)
@@ -90,28 +88,20 @@ def run_of(path, commit, scenes, machine="a", **points):
 
 
 def test_later_files_replace_points_and_add_others(tmp_path):
+    """A run that goes on where a file of another commit stops leaves points of both."""
     a = run_of(tmp_path / "a", "aaaaaaa", ["s", "t"], best={0.5: 5, 0.1: 1}, fast={0.5: 6})
     b = run_of(tmp_path / "b", "bbbbbbb", ["s"], machine="b", best={0.3: 3, 0.5: 4})
+    content = json.loads(b.read_text())
+    content["scenes"]["s"]["series"]["best"]["encodes"][0]["commit"] = "ccccccc"
+    b.write_text(json.dumps(content))
     both = merged([a, b])
     points = both["scenes"]["s"]["series"]["best"]["encodes"]
-    assert [(p["q"], p["bytes"], p["commit"]) for p in points] == [
-        (0.1, 1, "aaaaaaa"),
-        (0.3, 3, "bbbbbbb"),
-        (0.5, 4, "bbbbbbb"),
-    ]
+    found = [(p["q"], p["bytes"], p["commit"]) for p in points]
+    assert found == [(0.1, 1, "aaaaaaa"), (0.3, 3, "ccccccc"), (0.5, 4, "bbbbbbb")]
     assert [p["bytes"] for p in both["scenes"]["t"]["series"]["best"]["encodes"]] == [1, 5]
-    assert both["commit"] == "aaaaaaa; bbbbbbb"
+    assert both["commit"] == "aaaaaaa; ccccccc; bbbbbbb"
     assert (both["machine"], both["date"]) == ("a; b", "2026-01-01")
     assert both["command"] == ["python aaaaaaa", "python bbbbbbb"]
-
-
-def test_a_point_s_own_commit_counts(tmp_path):
-    """A run that goes on where a file of another commit stops leaves points of both."""
-    path = run_of(tmp_path / "a", "bbbbbbb", ["s"], best={0.1: 1, 0.5: 5})
-    content = json.loads(path.read_text())
-    content["scenes"]["s"]["series"]["best"]["encodes"][0]["commit"] = "aaaaaaa"
-    path.write_text(json.dumps(content))
-    assert merged([path])["commit"] == "aaaaaaa; bbbbbbb"
 
 
 def test_series_in_the_order_asked_for(tmp_path):
@@ -155,13 +145,11 @@ def test_tables_of_curves_and_formats(monkeypatch, folder, tmp_path, capsys):
     }
     (tmp_path / "known.json").write_text(json.dumps({"sizes": sizes}))
     monkeypatch.setattr(formats, "KNOWN", tmp_path / "known.json")
-    files = tmp_path / "formats.json"
-    words = ("--json", files, "--q", 0.3, 0.5, "--formats", ".spz:2", "--transform", "/nowhere")
-    call(monkeypatch, formats, "measure", folder, *words)
     for point in (point for series in measured["scenes"]["excerpt"]["series"].values() for point in series["encodes"]):
         point["psnr_loss"] = 50 - point["psnr"]
     out.write_text(json.dumps(measured))
-    call(monkeypatch, formats, "report", files, "--json", kept, "--curves", out)
+    words = (folder, "--formats", ".spz:2", "--transform", "/nowhere", "--json", kept, "--curves", out)
+    call(monkeypatch, formats, *words, "--q", 0.3, 0.5)
     tables = json.loads(kept.read_text())
     assert [row[:3] for row in tables["outputs_excerpt"]["rows"]] == [
         ["encode", ".spz:2", 0.3],
@@ -173,11 +161,11 @@ def test_tables_of_curves_and_formats(monkeypatch, folder, tmp_path, capsys):
     assert spz[3:5] == pytest.approx([points[0]["bytes"] / 1e6, 5e4 / points[0]["bytes"]])
     assert other[0] == "Other"
     assert other[3].startswith("below")
-    call(monkeypatch, formats, "report", files, "--json", kept, "--curves", out, "--series", "fast")
+    call(monkeypatch, formats, *words, "--q", 0.3, "--series", "fast")
     heads = [column["name"] for column in json.loads(kept.read_text())["excerpt"]["columns"]]
     assert "fast at that PSNR" in heads
     with pytest.raises(UsageError, match="there is no series 'smallest'"):
-        call(monkeypatch, formats, "report", files, "--curves", out, "--series", "smallest")
+        call(monkeypatch, formats, *words, "--series", "smallest")
 
 
 def test_rgb_streams_keep_r_g_and_b():
@@ -190,19 +178,15 @@ def test_rgb_streams_keep_r_g_and_b():
 
 
 @pytest.mark.slow
-def test_ablation(monkeypatch, folder, tmp_path, capsys):
+def test_ablation(monkeypatch, folder, tmp_path):
     out = tmp_path / "out.json"
-    call(monkeypatch, ablation, "measure", folder, "--json", out)
-    steps = json.loads(out.read_text())["scenes"]["excerpt"]["steps"]
-    sizes = [step["bytes"] for step in steps]
-    assert len(steps) == 7
+    call(monkeypatch, ablation, folder, "--json", out)
+    tables = {name: table["rows"] for name, table in json.loads(out.read_text()).items()}
+    (_, *steps), (ply, *parts) = tables["excerpt"], tables["bytes_excerpt"]
+    sizes = [size for _, _, size, *_ in steps]
+    assert len(steps) == len(parts) == 7
     assert sizes[:6] == sorted(sizes[:6], reverse=True), "a part of the codec adds bytes"
-    assert steps[0]["psnr"] == steps[1]["psnr"]
-    for step in steps[1:]:
-        listed = sum(step["bytes_a_splat"].values()) * step["splats"]
-        assert 0 < step["bytes"] - listed < 3000, "more than the header is missing"
-    call(monkeypatch, ablation, "report", out, "--json", tmp_path / "results.json")
-    assert "| as PLY | 12.00 |" in capsys.readouterr().out
-    results = json.loads((tmp_path / "results.json").read_text())
-    assert [len(results[name]["rows"]) for name in ("excerpt", "bytes_excerpt")] == [8, 8]
-    assert results["excerpt"]["machine"] == json.loads(out.read_text())["machine"]
+    assert steps[0][3] == steps[1][3]
+    assert ply[:2] == ["as PLY", 12.0]
+    for (_, splats, size, *_), (*_, a_splat) in list(zip(steps, parts, strict=True))[1:]:
+        assert 0 < 1e6 * size - a_splat * splats < 3000, "more than the header is missing"

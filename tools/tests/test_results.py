@@ -28,6 +28,8 @@ def test_a_table_is_printed_and_kept(tmp_path: Path, capsys: pytest.CaptureFixtu
     other = results.table("both", "Two in a cell", Column("times", "s", "{:.1f} / {:.2f}"))
     other.add([1.25, 2.5])
     stages.add("all", 1462.5, None)
+    with pytest.raises(ValueError, match="zip"):
+        stages.add("too few cells")
     printed = capsys.readouterr().out
     assert "\nThe stages:\n\n| stage | wall, ms | share |\n|---|---|---|\n| prune | 731.2 | 50% |\n" in printed
     assert "| 1.2 / 2.50 |" in printed
@@ -35,21 +37,11 @@ def test_a_table_is_printed_and_kept(tmp_path: Path, capsys: pytest.CaptureFixtu
 
     kept = json.loads(path.read_text())
     assert list(kept) == ["stages", "both"]
-    about = kept["stages"]
-    assert about.keys() == {"title", "machine", "date", "command", "commit", "columns", "rows"}
-    assert about["title"] == "The stages"
-    assert about["columns"] == [
-        {"name": "stage"},
-        {"name": "wall", "unit": "ms", "format": ".1f"},
-        {"name": "share", "format": ".0%"},
-    ]
-    assert about["rows"] == [["prune", 731.23, 0.5], ["all", 1462.5, None]]
-
-
-def test_a_row_fits_its_table() -> None:
-    table = Results(None).table("t", "A table", Column("a"), Column("b"))
-    with pytest.raises(ValueError, match="zip"):
-        table.add(1)
+    assert kept["stages"].keys() == {"title", "machine", "date", "command", "commit", "columns", "rows"}
+    assert kept["stages"]["title"] == "The stages"
+    wall, share = {"name": "wall", "unit": "ms", "format": ".1f"}, {"name": "share", "format": ".0%"}
+    assert kept["stages"]["columns"] == [{"name": "stage"}, wall, share]
+    assert kept["stages"]["rows"] == [["prune", 731.23, 0.5], ["all", 1462.5, None]]
 
 
 def test_what_json_cannot_hold(tmp_path: Path) -> None:
@@ -67,13 +59,9 @@ def test_a_result_knows_its_command(tmp_path: Path) -> None:
         "from tools.results import circumstances\nprint(circumstances()['command'][0])\n"
     )
     run = subprocess.run(
-        [sys.executable, "-m", "some_tool", "--scene", "a b"],
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+        [sys.executable, "-m", "some_tool", "--scene", "a b"], env=os.environ | {"PYTHONPATH": str(ROOT)},
+        cwd=tmp_path, capture_output=True, text=True, check=True,
+    )  # fmt: skip
     assert run.stdout == "python -m some_tool --scene 'a b'\n"
 
 

@@ -27,13 +27,6 @@ def device(request):
 CASE = stress_cases.Case("some splats", random_splats(40, 1, seed=1), tilted_camera(1, 37, 26))
 
 
-def spoiled(monkeypatch, change) -> measures.Measures:
-    """What the checks find once ``change`` has been at the device's results."""
-    untouched = views.rasterized
-    monkeypatch.setattr(views, "rasterized", lambda *args: change(untouched(*args)))
-    return views.check(Device(), CASE)
-
-
 @pytest.mark.slow
 def test_every_kernel_stays_within_what_rounding_explains(device, monkeypatch):
     """In the cases made by hand; a search is tried below."""
@@ -109,25 +102,28 @@ def test_the_cap_that_a_device_gets_is_no_fault(device):
 
 
 @pytest.mark.parametrize(
-    ("measure", "change"),
+    ("measure", "part", "change"),
     [
-        ("composite", lambda lists: dataclasses.replace(lists, image=lists.image + 1e-3)),
-        ("composite", lambda lists: dataclasses.replace(lists, image=lists.image * np.nan)),
-        ("render", lambda lists: dataclasses.replace(lists, transmittance=lists.transmittance * 0.99)),
-        ("project: alpha", lambda lists: dataclasses.replace(lists, shapes=lists.shapes * (1 + 1e-2))),
-        ("project: colour", lambda lists: dataclasses.replace(lists, colours=lists.colours + 1e-3)),
-        ("project: depth", lambda lists: dataclasses.replace(lists, shapes=lists.shapes * (1 + 1e-4))),
-        ("sort", lambda lists: dataclasses.replace(lists, intersections=lists.intersections[::-1])),
-        (
-            "tile lists",
-            lambda lists: dataclasses.replace(
-                lists, intersections=np.full_like(lists.intersections, lists.intersections[0])
-            ),
-        ),
+        ("composite", "image", lambda image: image + 1e-3),
+        ("composite", "image", lambda image: image * np.nan),
+        ("render", "transmittance", lambda transmittance: transmittance * 0.99),
+        ("project: alpha", "shapes", lambda shapes: shapes * (1 + 1e-2)),
+        ("project: colour", "colours", lambda colours: colours + 1e-3),
+        ("project: depth", "shapes", lambda shapes: shapes * (1 + 1e-4)),
+        ("sort", "intersections", lambda numbers: numbers[::-1]),
+        ("tile lists", "intersections", lambda numbers: np.full_like(numbers, numbers[0])),
     ],
 )
-def test_faults_are_noticed(monkeypatch, measure, change):
-    error, expected = spoiled(monkeypatch, change)[measure]
+def test_faults_are_noticed(monkeypatch, measure, part, change):
+    """Once something has been at what the device leaves."""
+    untouched = views.rasterized
+
+    def spoiled(*given):
+        lists = untouched(*given)
+        return dataclasses.replace(lists, **{part: change(getattr(lists, part))})
+
+    monkeypatch.setattr(views, "rasterized", spoiled)
+    error, expected = views.check(Device(), CASE)[measure]
     assert not error <= measures.LIMIT * expected if measure != "sort" else error > 0
 
 

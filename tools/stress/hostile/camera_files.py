@@ -1,22 +1,23 @@
-"""Changed camera files: cameras.json, transforms.json with what may lie beside it, COLMAP models as .bin and .txt."""
+"""cameras.json, transforms.json with what may lie beside it, COLMAP models as .bin and .txt: small good ones, and what
+is worth changing in them."""
 
 from __future__ import annotations
 
 import json
 import math
 import struct
-from functools import cache
 from random import Random
 
-from tools.stress.hostile.changes import TEXTS, Files, Rules, changed_files
-from tools.stress.hostile.picture_files import small_png
+from tools.stress.hostile.changes import TEXTS, Files, Rules
+from tools.stress.hostile.picture_files import saved_as
 
 _SIMPLE_PINHOLE, _PINHOLE = 0, 1
 _SIDES = (0, 1, -1, 64.5, 65536, 65537, 2**31, True, None, "64", 1e400)
 _FOCAL = (0, -1, 1e-300, 1e300, float("nan"), float("inf"), "60", None, [60])
 _NAMES = (*TEXTS, "view_0.png", "images/view_0.png", 0, None)
 _MATRICES = ([[0.0] * 3] * 3, [[1e300] * 4] * 4, [[1.0] * 4] * 4, [[1, 0, 0]], [1, 2, 3], [0.0] * 16, None)
-_PICTURES = (small_png(), small_png()[:40], b"no picture", b"GIF89a", b"")
+_PNG = saved_as("RGB", "PNG")
+_PICTURES = (_PNG, _PNG[:40], b"no picture", b"GIF89a", b"")
 _HINTS = {
     **dict.fromkeys(("width", "height", "w", "h"), _SIDES),
     **dict.fromkeys(("fx", "fy", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "k1", "k4"), _FOCAL),
@@ -34,31 +35,30 @@ def _turn(angle: float) -> list[list[float]]:
     return [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]
 
 
-@cache
-def cameras_json() -> bytes:
-    """A good cameras.json with three views."""
+def cameras(_: Random) -> Files:
+    """Three views."""
     shared = {"width": 64, "height": 48, "fx": 60.0, "fy": 61.0}
     views = [
         {"id": k, "img_name": f"view_{k}.png", "position": [float(k), 0.5, -2.0], "rotation": _turn(k), **shared}
         for k in range(3)
     ]
-    return json.dumps(views).encode()
+    return {"cameras.json": json.dumps(views).encode()}
 
 
-@cache
-def transforms_json(sides: bool = True) -> bytes:
-    """A good transforms.json of nerfstudio with three frames; without sides the pictures tell these."""
+def transforms(rng: Random) -> Files:
+    """Three frames of nerfstudio; alone, beside its dataparser's file, or with pictures that alone tell the width."""
+    beside = rng.choice(({}, {"dataparser_transforms.json": _BESIDE}, {f"images/view_{k}.png": _PNG for k in range(3)}))
     frames = []
     for k in range(3):
-        rows = [[*row, k + 1.0] for k, row in enumerate(_turn(k))]
+        rows = [[*row, n + 1.0] for n, row in enumerate(_turn(k))]
         frames.append({"file_path": f"images/view_{k}.png", "transform_matrix": [*rows, [0.0, 0.0, 0.0, 1.0]]})
     content = {
-        "camera_model": "OPENCV", "fl_x": 60.0, "fl_y": 61.0, "cx": 32.0, "cy": 24.0, **({"w": 64} if sides else {}),
-        "h": 48, "k1": 0.0, "p1": 0.0,
+        "camera_model": "OPENCV", "fl_x": 60.0, "fl_y": 61.0, "cx": 32.0, "cy": 24.0, "h": 48, "k1": 0.0, "p1": 0.0,
         "applied_transform": [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0]],
         "train_filenames": ["images/view_0.png", "images/view_1.png"], "frames": frames,
-    }  # fmt: skip
-    return json.dumps(content).encode()
+    } | ({} if len(beside) == 3 else {"w": 64})  # fmt: skip
+    name = rng.choice(("transforms.json", "transforms.json", "transforms_test.json"))
+    return {name: json.dumps(content).encode(), **beside}
 
 
 _BESIDE = json.dumps(
@@ -66,19 +66,7 @@ _BESIDE = json.dumps(
 ).encode()
 
 
-def cameras_originals() -> list[Files]:
-    return [{"cameras.json": cameras_json()}]
-
-
-def transforms_originals() -> list[Files]:
-    return [
-        {"transforms.json": transforms_json()},
-        {"transforms.json": transforms_json(), "dataparser_transforms.json": _BESIDE},
-        {"transforms.json": transforms_json(False), **{f"images/view_{k}.png": small_png() for k in range(3)}},
-    ]
-
-
-def colmap_binary_originals() -> list[Files]:
+def colmap_binary(_: Random) -> Files:
     """Cameras: number, lens, sides, parameters; images: number, pose, camera, name, points."""
     lenses = struct.pack("<Q", 2)
     for number, model, params in ((1, _PINHOLE, (60.0, 61.0, 32.0, 24.0)), (2, _SIMPLE_PINHOLE, (60.0, 32.0, 24.0))):
@@ -87,7 +75,7 @@ def colmap_binary_originals() -> list[Files]:
     for k in range(3):
         poses += struct.pack("<I7dI", k + 1, 1.0, 0.0, 0.0, 0.0, float(k), 0.0, 2.0, 1 + k % 2)
         poses += b"view_%d.png\0" % k + struct.pack("<Q", k % 2) + bytes(24 * (k % 2))
-    return [{"images.bin": poses, "cameras.bin": lenses}]
+    return {"images.bin": poses, "cameras.bin": lenses}
 
 
 #: Of the counts, and of the first camera and image.
@@ -97,31 +85,13 @@ _FIELDS = {
 }
 
 
-def colmap_text_originals() -> list[Files]:
-    cameras = b"# cameras\n1 PINHOLE 64 48 60.0 61.0 32.0 24.0\n2 SIMPLE_PINHOLE 64 48 60.0 32.0 24.0\n"
+def colmap_text(_: Random) -> Files:
+    lenses = b"# cameras\n1 PINHOLE 64 48 60.0 61.0 32.0 24.0\n2 SIMPLE_PINHOLE 64 48 60.0 32.0 24.0\n"
     poses = (b"1 1.0 0.0 0.0 0.0 0.0 0.0 2.0 1 view_0.png", b"2 0.8 0.6 0.0 0.0 1.0 0.0 2.0 2 a b.png\n1.0 2.0 -1")
     images = b"# images\n%b\n\n%b\n3 1.0 0.0 0.0 0.0 2.0 0.0 2.0 1 view_2.png\n\n" % poses
-    return [{"images.txt": images, "cameras.txt": cameras}]
+    return {"images.txt": images, "cameras.txt": lenses}
 
 
-_IN_JSON = Rules(_HINTS, beside={"images/view_0.png": _PICTURES})
-_BESIDE_JSON = Rules(_HINTS, beside={"images/view_0.png": _PICTURES, "dataparser_transforms.json": (_BESIDE, b"{}")})
-_IN_MODEL = Rules(fields=lambda name, data: _FIELDS.get(name, ()))
-
-
-def changed_cameras(rng: Random) -> Files:
-    return changed_files(cameras_originals()[0], rng, _IN_JSON)
-
-
-def changed_transforms(rng: Random) -> Files:
-    files = changed_files(rng.choice(transforms_originals()), rng, _BESIDE_JSON)
-    name = rng.choice(("transforms.json", "transforms.json", "transforms_test.json"))
-    return {name: files.pop("transforms.json"), **files}
-
-
-def changed_colmap_binary(rng: Random) -> Files:
-    return changed_files(colmap_binary_originals()[0], rng, _IN_MODEL)
-
-
-def changed_colmap_text(rng: Random) -> Files:
-    return changed_files(colmap_text_originals()[0], rng, _IN_MODEL)
+VIEWS = Rules(_HINTS, beside={"images/view_0.png": _PICTURES})
+FRAMES = Rules(_HINTS, beside={"images/view_0.png": _PICTURES, "dataparser_transforms.json": (_BESIDE, b"{}")})
+MODEL = Rules(fields=lambda name, data: _FIELDS.get(name, ()))

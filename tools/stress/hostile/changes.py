@@ -1,7 +1,7 @@
-"""Changes that break parsers, of one file or several (:func:`changed_files`), of bytes, numbers, texts and JSON.
+"""Changes that break parsers, of one file or several (:class:`Rules`), of bytes, numbers, texts and JSON.
 
 All of them take a ``random.Random``, so that a seed repeats them. A format says only what its good files are, and what
-is worth changing in them: :class:`Rules`.
+is worth changing in them.
 """
 
 from __future__ import annotations
@@ -10,9 +10,15 @@ import dataclasses
 import gzip
 import json
 import struct
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from pathlib import Path
 from random import Random
 from typing import Any
+
+from potr_cl.formats import save_scene
+from tests.reference.scenes import random_scene
 
 #: A file or several that belong together, by their names; the first is what is read.
 Files = dict[str, bytes]
@@ -189,6 +195,15 @@ def damaged_json(data: bytes, rng: Random, hints: Hints | None = None) -> bytes:
 # ---------------------------------------------------------------------------------------------------- files
 
 
+@cache
+def saved(name: str, splats: int, degree: int) -> Files:
+    """What the package writes of a random scene under a name, which comes first."""
+    with tempfile.TemporaryDirectory() as folder:
+        save_scene(Path(folder, name), random_scene(splats, degree, seed=splats))
+        others = sorted(path.name for path in Path(folder).iterdir() if path.name != name)
+        return {each: Path(folder, each).read_bytes() for each in (name, *others)}
+
+
 @dataclasses.dataclass(frozen=True)
 class Rules:
     """What is worth changing in the files of a format.
@@ -205,36 +220,34 @@ class Rules:
     others: Callable[[str, bytes, Random], bytes | None] = lambda name, data, rng: None
     beside: Mapping[str, Sequence[bytes]] = dataclasses.field(default_factory=dict)
 
+    def changed(self, files: Files, rng: Random) -> Files:
+        """Some files with one to three changes: of the first, mostly, of others, or of which there are."""
+        files = dict(files)
+        for _ in range(1 + rng.choice((0, 0, 1))):
+            names = list(files)
+            name = names[0] if rng.random() < 0.5 else rng.choice(names)
+            if len(names) > 1 and rng.random() < 0.08:
+                other = rng.choice(names[1:])
+                files[other], files[name] = files[name], files[other]
+            elif len(names) > 1 and rng.random() < 0.08:
+                del files[rng.choice(names[1:])]
+            elif self.beside and rng.random() < 0.15:
+                beside = rng.choice(list(self.beside))
+                files[beside] = rng.choice(self.beside[beside])
+            else:
+                files[name] = self._of_one(name, files[name], rng)
+        return files
 
-def changed_files(files: Files, rng: Random, rules: Rules) -> Files:
-    """Some files with one to three changes: of the first, mostly, of others, or of which there are."""
-    files = dict(files)
-    for _ in range(1 + rng.choice((0, 0, 1))):
-        names = list(files)
-        name = names[0] if rng.random() < 0.5 else rng.choice(names)
-        if len(names) > 1 and rng.random() < 0.08:
-            other = rng.choice(names[1:])
-            files[other], files[name] = files[name], files[other]
-        elif len(names) > 1 and rng.random() < 0.08:
-            del files[rng.choice(names[1:])]
-        elif rules.beside and rng.random() < 0.15:
-            beside = rng.choice(list(rules.beside))
-            files[beside] = rng.choice(rules.beside[beside])
-        else:
-            files[name] = _changed(name, files[name], rng, rules)
-    return files
-
-
-def _changed(name: str, data: bytes, rng: Random, rules: Rules) -> bytes:
-    other = rules.others(name, data, rng) if rng.random() < 0.4 else None
-    if other is not None:
-        return other
-    fields = rules.fields(name, data) if data and rng.random() < 0.75 else ()
-    if fields:
-        return with_number(data, rng, fields)
-    if name.endswith((".json", ".gltf")):
-        return damaged_json(data, rng, rules.hints)
-    return damaged_text(data, rng) if name.endswith(".txt") else damaged(data, rng)
+    def _of_one(self, name: str, data: bytes, rng: Random) -> bytes:
+        other = self.others(name, data, rng) if rng.random() < 0.4 else None
+        if other is not None:
+            return other
+        fields = self.fields(name, data) if data and rng.random() < 0.75 else ()
+        if fields:
+            return with_number(data, rng, fields)
+        if name.endswith((".json", ".gltf")):
+            return damaged_json(data, rng, self.hints)
+        return damaged_text(data, rng) if name.endswith(".txt") else damaged(data, rng)
 
 
 def with_number(data: bytes, rng: Random, fields: Sequence[tuple[int, int]]) -> bytes:

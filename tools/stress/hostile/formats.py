@@ -1,4 +1,4 @@
-"""What is attacked: FORMATS, a line each, with what makes changed files, what reads them, and what a file may cost."""
+"""What is attacked: FORMATS, a line each, with what makes and changes files, what reads them, what a file may cost."""
 
 from __future__ import annotations
 
@@ -26,13 +26,14 @@ from tools.stress.hostile import (
     potr_files,
     sog_files,
     splat_files,
-    spz_files,
-)  # fmt: skip
+)
 from tools.stress.hostile.changes import Files
 
 MIB = 1 << 20
 #: Bytes that a pixel of a photograph may take while it is read.
 A_PIXEL = 64
+#: Good files that are read before changed ones.
+_GOOD = 30
 
 
 class WrongResult(Exception):
@@ -44,8 +45,8 @@ class Format:
     """A kind of input.
 
     Attributes:
-        good: files as they should be, each with those that belong to it: what the changed ones are made of.
-        changed: makes a changed file, or several that belong together.
+        make: makes a small good file, or several that belong together.
+        change: changes them.
         read: reads the first of them, as the package's user does. Raises WrongResult if what comes out cannot be right.
         constant, a_byte: memory that reading may take, in bytes: so much for any file, and so much for each byte of it.
         beyond: bytes besides that a certain file may take.
@@ -53,13 +54,20 @@ class Format:
             show that a library looked there.
     """
 
-    good: Callable[[], list[Files]]
-    changed: Callable[[Random], Files]
+    make: Callable[[Random], Files]
+    change: Callable[[Files, Random], Files]
     read: Callable[[Path], Any]
     constant: int
     a_byte: int
     beyond: Callable[[Path], int] = lambda path: 0
     twice: bool = False
+
+    def good(self) -> list[Files]:
+        """Some as they should be."""
+        return [self.make(Random(seed)) for seed in range(_GOOD)]
+
+    def changed(self, rng: Random) -> Files:
+        return self.change(self.make(rng), rng)
 
     def allowance(self, path: Path, size: int) -> int:
         """Bytes that reading a file of some size may take."""
@@ -114,10 +122,9 @@ def bytes_of_pixels(path: Path) -> int:
 
 
 def _checked_scene(scene: Scene) -> Scene:
-    arrays = (scene.means, scene.log_scales, scene.quaternions, scene.opacity_logits, scene.sh)
-    if len(scene) < 1 or any(len(array) != len(scene) for array in arrays):
+    if len(scene) < 1 or any(len(array) != len(scene) for array in scene.arrays):
         raise WrongResult("a scene without splats, or with some in one array only")
-    if not all(np.isfinite(array).all() for array in arrays):
+    if not all(np.isfinite(array).all() for array in scene.arrays):
         raise WrongResult("values that are not finite")
     return scene
 
@@ -125,53 +132,46 @@ def _checked_scene(scene: Scene) -> Scene:
 def parts_of(result: Any) -> list[bytes]:
     """What was read, to compare it with another reading."""
     if isinstance(result, Scene):
-        arrays = (result.means, result.log_scales, result.quaternions, result.opacity_logits, result.sh)
-        return [array.tobytes() for array in arrays]
+        return [array.tobytes() for array in result.arrays]
     return [repr(result).encode()]
 
 
-def _scene(
-    good: Callable[[], list[Any]], changed: Callable[[Random], Any], constant: int, a_byte: int, name: str = "",
-    read: Callable[[Path], Any] = read_scene,
-) -> Format:  # fmt: skip
-    """A format of scenes; with a name: of files that stand alone."""
-    return _format(good, changed, name, read, constant * MIB, a_byte, twice=True)
+Make = Callable[[Random], Files]
+Change = Callable[[Files, Random], Files]
 
 
-def _cameras(good: Callable[[], list[Files]], changed: Callable[[Random], Files]) -> Format:
-    return Format(good, changed, read_cameras, 32 * MIB, 128)
+def _scene(make: Make, change: Change, constant: int, a_byte: int, read: Callable[[Path], Any] = read_scene) -> Format:
+    return Format(make, change, read, constant * MIB, a_byte, twice=True)
 
 
-def _picture(good: Callable[[], list[bytes]], changed: Callable[[Random], bytes], name: str) -> Format:
-    return _format(good, changed, name, read_picture, MIB, 64, beyond=bytes_of_pixels)
+def _cameras(make: Make, change: Change) -> Format:
+    return Format(make, change, read_cameras, 32 * MIB, 128)
 
 
-def _format(good: Callable[[], Any], changed: Callable[[Random], Any], name: str, *others: Any, **more: Any) -> Format:
-    if not name:
-        return Format(good, changed, *others, **more)
-    return Format(lambda: [{name: data} for data in good()], lambda rng: {name: changed(rng)}, *others, **more)
+def _picture(make: Make, change: Change) -> Format:
+    return Format(make, change, read_picture, MIB, 64, beyond=bytes_of_pixels)
 
 
 #: By name. docs/security.md states the costs.
 FORMATS: dict[str, Format] = {
-    "potr": _scene(potr_files.originals, potr_files.changed, 64, 8192, "a.potr", read_potr),
-    "html": _scene(potr_files.page_originals, potr_files.changed_page, 64, 8192, "a.html"),
-    "ply": _scene(ply_files.plain_originals, ply_files.changed_plain, 32, 64, "a.ply"),
-    "compressed.ply": _scene(ply_files.compressed_originals, ply_files.changed_compressed, 32, 64, "a.compressed.ply"),
-    "spz": _scene(spz_files.originals, spz_files.changed, 64, 2048, "a.spz"),
-    "sog": _scene(sog_files.originals, sog_files.changed, 64, 2048, "a.sog"),
-    "sog-folder": _scene(sog_files.folder_originals, sog_files.changed_folder, 64, 2048),
-    "sog-levels": _scene(sog_files.level_originals, sog_files.changed_levels, 64, 2048),
-    "glb": _scene(gltf_files.originals, gltf_files.changed, 64, 2048),
-    "gltf": _scene(gltf_files.gltf_originals, gltf_files.changed_gltf, 64, 2048),
-    "splat": _scene(splat_files.splat_originals, splat_files.changed_splat, 32, 64, "a.splat"),
-    "ksplat": _scene(splat_files.ksplat_originals, splat_files.changed_ksplat, 32, 64, "a.ksplat"),
-    "ply.gz": _scene(spz_files.gzip_originals, spz_files.changed_gzip, 64, 4096, "a.ply.gz"),
-    "cameras.json": _cameras(camera_files.cameras_originals, camera_files.changed_cameras),
-    "transforms.json": _cameras(camera_files.transforms_originals, camera_files.changed_transforms),
-    "colmap-binary": _cameras(camera_files.colmap_binary_originals, camera_files.changed_colmap_binary),
-    "colmap-text": _cameras(camera_files.colmap_text_originals, camera_files.changed_colmap_text),
-    "png": _picture(picture_files.good_pngs, picture_files.changed_png, "a.png"),
-    "jpeg": _picture(picture_files.jpeg_originals, picture_files.changed_jpeg, "a.jpg"),
-    "webp": _picture(picture_files.webp_originals, picture_files.changed_webp, "a.webp"),
+    "potr": _scene(potr_files.potr, potr_files.changed, 64, 8192, read_potr),
+    "html": _scene(potr_files.page, potr_files.changed_page, 64, 8192),
+    "ply": _scene(ply_files.plain, ply_files.changed, 32, 64),
+    "compressed.ply": _scene(ply_files.compressed, ply_files.changed, 32, 64),
+    "spz": _scene(splat_files.spz, splat_files.changed_spz, 64, 2048),
+    "sog": _scene(sog_files.sog, sog_files.changed, 64, 2048),
+    "sog-folder": _scene(sog_files.folder, sog_files.FOLDER.changed, 64, 2048),
+    "sog-levels": _scene(sog_files.levels, sog_files.FOLDER.changed, 64, 2048),
+    "glb": _scene(gltf_files.binary, gltf_files.changed_binary, 64, 2048),
+    "gltf": _scene(gltf_files.text, gltf_files.TEXT.changed, 64, 2048),
+    "splat": _scene(splat_files.splat, splat_files.SPLAT.changed, 32, 64),
+    "ksplat": _scene(splat_files.ksplat, splat_files.KSPLAT.changed, 32, 64),
+    "ply.gz": _scene(splat_files.gzipped_ply, splat_files.changed_gzip, 64, 4096),
+    "cameras.json": _cameras(camera_files.cameras, camera_files.VIEWS.changed),
+    "transforms.json": _cameras(camera_files.transforms, camera_files.FRAMES.changed),
+    "colmap-binary": _cameras(camera_files.colmap_binary, camera_files.MODEL.changed),
+    "colmap-text": _cameras(camera_files.colmap_text, camera_files.MODEL.changed),
+    "png": _picture(picture_files.png, picture_files.changed_png),
+    "jpeg": _picture(picture_files.jpeg, picture_files.JPEG.changed),
+    "webp": _picture(picture_files.webp, picture_files.changed_webp),
 }

@@ -1,4 +1,5 @@
-"""Changed pictures: PNG with its chunks' checksums made right, JPEG, WebP, and other kinds under their names."""
+"""Pictures: small good ones, and changes of PNG with its chunks' checksums made right, of JPEG, of WebP; other kinds
+under their names."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ from random import Random
 import numpy as np
 from PIL import Image
 
-from tools.stress.hostile.changes import Rules, changed_files, damaged, interesting, with_number
+from tools.stress.hostile.changes import Files, Rules, damaged, interesting, with_number
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 #: Beginnings of kinds that nobody should open because of a name that ends in .png.
@@ -48,52 +49,36 @@ def chunks(data: bytes) -> list[tuple[bytes, bytes]]:
     return found
 
 
-def png(width: int, height: int, depth: int, colour: int, pixels: bytes, *others: bytes) -> bytes:
-    """A PNG file from its rows, each with the number of its filter in front."""
-    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0))
+def png_of(width: int, height: int, pixels: bytes, *others: bytes) -> bytes:
+    """A PNG file in colours from its rows, each with the number of its filter in front, and further chunks."""
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
     return b"".join((_SIGNATURE, head, *others, chunk(b"IDAT", zlib.compress(pixels)), chunk(b"IEND", b"")))
 
 
 @cache
-def small_png() -> bytes:
-    """A good PNG of 8 x 6 pixels."""
-    return _saved("RGB", "PNG")
-
-
-@cache
-def _saved(mode: str, kind: str, *options: tuple[str, int | bytes | str]) -> bytes:
+def saved_as(mode: str, kind: str, *options: tuple[str, int | bytes | str]) -> bytes:
+    """A good picture of 8 x 6 pixels."""
     pixels = np.random.default_rng(0).integers(0, 256, (6, 8, 4), np.uint8)
     out = io.BytesIO()
     Image.fromarray(pixels).convert(mode).save(out, kind, **dict(options))
     return out.getvalue()
 
 
-@cache
-def png_originals() -> list[bytes]:
-    rows = b"".join(b"\0" + bytes(range(k, k + 16)) for k in range(4))
-    return [
-        *(_saved(mode, "PNG") for mode in ("RGB", "RGBA", "L", "LA", "P", "1")),
-        png(8, 4, 16, 0, rows),
-        png(4, 4, 8, 6, rows),
-        png(16, 4, 8, 3, rows, chunk(b"PLTE", bytes(range(60))), chunk(b"tRNS", bytes(20))),
-    ]
+def png(rng: Random) -> Files:
+    """Of 8 bits a channel."""
+    return {"a.png": saved_as(rng.choice(("RGB", "RGBA", "L", "LA", "P", "1")), "PNG")}
 
 
-def good_pngs() -> list[bytes]:
-    """Those with 8 bits a channel."""
-    return [data for data in png_originals() if data[24] <= 8]
+def jpeg(rng: Random) -> Files:
+    progressive = ("progressive", 1), ("quality", 30), ("comment", "a")
+    kinds = [(mode, (("quality", quality),)) for mode, quality in (("RGB", 50), ("L", 20), ("CMYK", 20))]
+    mode, options = rng.choice([*kinds, ("RGB", progressive)])
+    return {"a.jpg": saved_as(mode, "JPEG", *options)}
 
 
-def jpeg_originals() -> list[bytes]:
-    kinds = ("RGB", 50), ("L", 20), ("CMYK", 20)
-    plain = [_saved(mode, "JPEG", ("quality", quality)) for mode, quality in kinds]
-    return [*plain, _saved("RGB", "JPEG", ("progressive", 1), ("quality", 30), ("comment", "a"))]
-
-
-def webp_originals() -> list[bytes]:
-    more = ({"quality": 20}, {"lossless": 1})
-    plain = [_saved(mode, "WEBP", ("method", 0), *each.items()) for mode in ("RGB", "RGBA") for each in more]
-    return [*plain, _saved("RGB", "WEBP", ("lossless", 1), ("method", 0), ("exif", b"Exif\0\0II*\0"))]
+def webp(rng: Random) -> Files:
+    options = rng.choice(((("quality", 20),), (("lossless", 1),), (("lossless", 1), ("exif", b"Exif\0\0II*\0"))))
+    return {"a.webp": saved_as(rng.choice(("RGB", "RGBA")), "WEBP", ("method", 0), *options)}
 
 
 def _inside(name: str, content: bytes, rng: Random) -> bytes | None:
@@ -108,49 +93,37 @@ def _inside(name: str, content: bytes, rng: Random) -> bytes | None:
     return None if raw is None else zlib.compress(raw + bytes(rng.choice((0, 0, 1 << 16))))
 
 
-_RULES = Rules(
+_CHUNKS_OF = Rules(
     fields=lambda name, data: [(8 + k, 1) for k in range(5)] if name.endswith("IHDR") and len(data) == 13 else (),
     others=_inside,
     beside={f"{at}{kind.decode()}": _CONTENTS for at in "05" for kind in _CHUNKS},
 )
 
 
-def changed_png(rng: Random) -> bytes:
+def changed_png(files: Files, rng: Random) -> Files:
     """Parts are chunks, in the order of their names."""
     if rng.random() < 0.06:
         other = rng.choice(_OTHER_KINDS)
-        return other if rng.random() < 0.5 else damaged(other, rng)
-    parts = {f"{at}{kind.decode()}": content for at, (kind, content) in enumerate(chunks(rng.choice(png_originals())))}
-    made = changed_files(parts, rng, _RULES)
+        return {"a.png": other if rng.random() < 0.5 else damaged(other, rng)}
+    parts = {f"{at}{kind.decode()}": content for at, (kind, content) in enumerate(chunks(files["a.png"]))}
+    made = _CHUNKS_OF.changed(parts, rng)
     out = _SIGNATURE + b"".join(chunk(name[1:].encode(), made[name]) for name in sorted(made))
-    return damaged(out, rng) if rng.random() < 0.1 else out
+    return {"a.png": damaged(out, rng) if rng.random() < 0.1 else out}
 
 
-def changed_jpeg(rng: Random) -> bytes:
-    data = rng.choice(jpeg_originals())
-    markers = [at for at in range(len(data) - 4) if data[at] == 0xFF and data[at + 1] not in (0, 0xFF)]
+def _markers(_: str, data: bytes) -> list[tuple[int, int]]:
+    """Kinds and lengths of a JPEG's segments, and the size that its frame says."""
+    found = [at for at in range(len(data) - 4) if data[at] == 0xFF and data[at + 1] not in (0, 0xFF)]
     frame = max(data.find(b"\xff\xc0"), data.find(b"\xff\xc2"))
-    for _ in range(1 + rng.choice((0, 0, 1, 2))):
-        at, kind, out = rng.choice(markers), rng.randrange(6), bytearray(data)
-        if kind == 0:
-            out[at + 1] = rng.choice((0xC0, 0xC2, 0xC3, 0xC9, 0xD8, 0xD9, 0xDA, 0xE1, 0xEE, 0xFE))
-        elif kind == 1:
-            out[at + 2 : at + 4] = interesting(rng, 2).to_bytes(2, "big")
-        elif kind == 2:  # the size that the frame says
-            place = frame + rng.choice((5, 7))
-            side = rng.choice((0, 1, 7, 9, 100, 3000)) if rng.random() < 0.95 else interesting(rng, 2)
-            out[place : place + 2] = side.to_bytes(2, "big")
-        else:
-            out = bytearray(damaged(data, rng))
-        data = bytes(out)
-        markers = [at for at in markers if at + 4 < len(data)] or [0]
-        if len(data) < 8:
-            break
-    return data
+    places = [*((at + 1, 1) for at in found), *((at + 2, -2) for at in found), *[(frame + 5, -2), (frame + 7, -2)] * 4]
+    return [(at, size) for at, size in places if 0 <= at < len(data) - 2]
 
 
-def changed_webp(rng: Random) -> bytes:
-    data = rng.choice(webp_originals())
+JPEG = Rules(fields=_markers)
+
+
+def changed_webp(files: Files, rng: Random) -> Files:
+    data = files["a.webp"]
     kind = rng.randrange(5)
     if kind == 0:
         sizes = b"".join(interesting(rng, 3).to_bytes(3, "little") for _ in range(2))
@@ -163,4 +136,4 @@ def changed_webp(rng: Random) -> bytes:
     if kind > 2 or rng.random() < 0.3:
         data = damaged(data, rng)
     sealed = len(data) > 8 and rng.random() < 0.8
-    return data[:4] + struct.pack("<I", len(data) - 8) + data[8:] if sealed else data
+    return {"a.webp": data[:4] + struct.pack("<I", len(data) - 8) + data[8:] if sealed else data}

@@ -1,4 +1,5 @@
-"""Changed .potr files: header, table of blocks, and every stream behind its coder, mostly with checksums made right.
+""".potr files: small good ones, and changes of header, table of blocks, and every stream behind its coder, mostly with
+checksums made right.
 
 They are taken apart by :mod:`tests.reference.file_parts`, which shares no mistake with the package's own reader.
 """
@@ -10,9 +11,10 @@ import dataclasses
 import itertools
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable
 from functools import cache
 from random import Random
+from typing import Any
 
 import numpy as np
 import zstandard
@@ -27,7 +29,7 @@ from potr_cl.formats.scenes.page import BEGIN, END
 from potr_cl.model.scene import Scene
 from tests.reference.file_parts import STREAMS, File, Section
 from tests.reference.scenes import random_scene, ring_of_cameras
-from tools.stress.hostile.changes import damaged, damaged_json, interesting, interesting_double
+from tools.stress.hostile.changes import Files, damaged, damaged_json, interesting, interesting_double
 
 _CRC = struct.Struct("<I")
 _BYTES = (b"OCCU", b"SEVE", b"MULT", b"LEAF", b"TAIL", b"STEP")
@@ -89,9 +91,15 @@ def file_of(scenes: list[Scene], parameters: HyperParameters, entropy: str, most
     return b"".join(code_levels(levels, metadata, EntropyCoder(entropy, 3), 1).pieces)
 
 
-def changed(rng: Random, files: Sequence[bytes] = (), often: Sequence[int] = HOW_OFTEN) -> bytes:
-    """One of some files, by default of the originals, changed."""
-    data = rng.choices(files or originals(), often)[0]
+def potr(rng: Random) -> Files:
+    return {"a.potr": rng.choices(originals(), HOW_OFTEN)[0]}
+
+
+def changed(files: Files, rng: Random) -> Files:
+    return {name: _changed(data, rng) for name, data in files.items()}
+
+
+def _changed(data: bytes, rng: Random) -> bytes:
     if rng.random() < 0.15:  # as it comes, checksums and all
         for _ in range(1 + rng.randrange(3)):
             data = damaged(data, rng)
@@ -110,61 +118,50 @@ def changed(rng: Random, files: Sequence[bytes] = (), often: Sequence[int] = HOW
     return out if rng.random() < 0.97 else damaged(out, rng)
 
 
-def _header(file: File, rng: Random) -> None:
-    kind = rng.randrange(6)
-    if kind == 0:
-        file.version = rng.choice((0, 1, 2, interesting(rng, 2)))
-    elif kind == 1:
-        file.quantiser = rng.choice((0, 1, 2, interesting(rng, 1)))
-    elif kind == 2:
-        file.degree = rng.choice((0, 1, 2, 3, 4, interesting(rng, 1)))
-    elif kind == 3:
-        file.flags = rng.choice((0, 1, 2, 3, 4, interesting(rng, 1)))
-    elif kind == 4:
-        file.reserved = interesting(rng, 2)
+#: What may stand in a field of a header, of a block and of a table's entry, by the part that it stands in.
+Fields = dict[str, Callable[[Any, Random], Any]]
+_HEADER: Fields = {
+    "version": lambda _, rng: rng.choice((0, 1, 2, interesting(rng, 2))),
+    "quantiser": lambda _, rng: rng.choice((0, 1, 2, interesting(rng, 1))),
+    "degree": lambda _, rng: rng.choice((0, 1, 2, 3, 4, interesting(rng, 1))),
+    "flags": lambda _, rng: rng.choice((0, 1, 2, 3, 4, interesting(rng, 1))),
+    "reserved": lambda _, rng: interesting(rng, 2),
+    "count": lambda file, rng: rng.choice((0, len(file.blocks) + 1, interesting(rng, 4))),
+}
+_BLOCK: Fields = {
+    "level": lambda _, rng: rng.choice((0, 1, 2, 255)),
+    "coder": lambda _, rng: rng.choice((0, 1, 2, 255)),
+    "depth": lambda b, rng: rng.choice((0, 1, 52, 53, b.depth + 1, max(b.depth - 1, 0), interesting(rng, 1))),
+    "splats": lambda b, rng: rng.choice((interesting(rng, 4), interesting(rng, 2), b.splats + 1, b.splats - 1, 0)),
+    "reals": lambda b, rng: _with_one(b.reals, (float("nan"), float("inf"), -1e38, 0.0, 1e38, -3.4e38, 1.0), rng),
+    "side": lambda _, rng: interesting_double(rng),
+    "factors": lambda b, rng: _with_one(b.factors, (0.0, 9e-4, 1e-3, 1.0, 1e9, 2e9, float("nan"), -1.0), rng),
+    "count": lambda b, rng: rng.choice((0, len(b.sections) + 1, max(len(b.sections) - 1, 0), 32, 33, 255)),
+}
+#: An entry that says something else of the same bytes.
+_ENTRY: Fields = {
+    "name": lambda _, rng: rng.choice((*STREAMS, *_BYTES, b"meta", b"newA", b"\0\0\0\0", b"a\x1b[m", rng.randbytes(4))),
+    "raw": lambda s, rng: rng.choice((interesting(rng, 4), interesting(rng, 2), s.raw + 1, s.raw * 2 % 2**32)),
+    "crc": lambda _, rng: interesting(rng, 4),
+    "size": lambda s, rng: rng.choice((interesting(rng, 4), len(s.stored) + 1, max(len(s.stored) - 1, 0))),
+    "stored": lambda s, rng: damaged(s.stored, rng),
+}
+
+
+def _with_one(values: list[float], others: tuple[float, ...], rng: Random) -> list[float]:
+    at = rng.randrange(len(values))
+    return [*values[:at], rng.choice(others), *values[at + 1 :]]
+
+
+def _field(file: File, rng: Random) -> None:
+    parts: dict[str, list[Any]] = {"block": file.blocks, "entry": [section for _, section in file.all_sections()]}
+    kind = rng.choice(("header", "block", "block", "block", "entry", "entry"))
+    if not parts.get(kind):
+        part, fields = file, _HEADER
     else:
-        file.count = rng.choice((0, len(file.blocks) + 1, interesting(rng, 4)))
-
-
-def _block(file: File, rng: Random) -> None:
-    """What a block says of itself."""
-    if not file.blocks:
-        return
-    block = rng.choice(file.blocks)
-    kind = rng.randrange(9)
-    if kind == 0:
-        block.level = rng.choice((0, 1, 2, 255))
-    elif kind == 1:
-        block.coder = rng.choice((0, 1, 2, 255))
-    elif kind == 2:
-        block.depth = rng.choice((0, 1, 52, 53, block.depth + 1, max(block.depth - 1, 0), interesting(rng, 1)))
-    elif kind <= 4:
-        block.splats = rng.choice((interesting(rng, 4), interesting(rng, 2), block.splats + 1, block.splats - 1, 0))
-    elif kind == 5:
-        block.reals[rng.randrange(10)] = rng.choice((float("nan"), float("inf"), -1e38, 0.0, 1e38, -3.4e38, 1.0))
-    elif kind == 6:
-        block.side = interesting_double(rng)
-    elif kind == 7:
-        block.factors[rng.randrange(5)] = rng.choice((0.0, 9e-4, 1e-3, 1.0, 1e9, 2e9, float("nan"), -1.0))
-    else:
-        block.count = rng.choice((0, len(block.sections) + 1, max(len(block.sections) - 1, 0), 32, 33, 255))
-
-
-def _table(file: File, rng: Random) -> None:
-    """An entry that says something else of the same bytes."""
-    _, section = rng.choice(file.all_sections())
-    kind = rng.randrange(5)
-    if kind == 0:
-        names = (*STREAMS, *_BYTES, b"meta", b"newA", b"NewB", b"\0\0\0\0", b"a\x1b[m", rng.randbytes(4))
-        section.name = rng.choice(names)
-    elif kind == 1:
-        section.raw = rng.choice((interesting(rng, 4), interesting(rng, 2), section.raw + 1, section.raw * 2 % 2**32))
-    elif kind == 2:
-        section.crc = interesting(rng, 4)
-    elif kind == 3:
-        section.size = rng.choice((interesting(rng, 4), len(section.stored) + 1, max(len(section.stored) - 1, 0)))
-    else:
-        section.stored = damaged(section.stored, rng)
+        part, fields = rng.choice(parts[kind]), {"block": _BLOCK, "entry": _ENTRY}[kind]
+    name = rng.choice(list(fields))
+    setattr(part, name, fields[name](part, rng))
 
 
 def _order(file: File, rng: Random) -> None:
@@ -326,22 +323,19 @@ def _changed_description(stored: bytes, weights: int, rng: Random) -> bytes:
     return zstandard.ZstdCompressor(level=1).compress(bytes(raw))
 
 
-_CHANGES = (
-    _header, _block, _block, _block, _table, _table, _order, _order, _claim,
-    _behind_the_coder, _behind_the_coder, _behind_the_coder, _behind_the_coder,
-    _in_bundles, _in_bundles, _in_bundles, _in_bundles, _in_bundles,
-)  # fmt: skip
+_CHANGES = (*[_field] * 6, *[_order] * 2, _claim, *[_behind_the_coder] * 4, *[_in_bundles] * 5)
 
 
-def page_originals() -> list[bytes]:
-    """Web pages with good files."""
-    return [page_of(data) for data in originals()]
+def page(rng: Random) -> Files:
+    return {"a.html": page_of(potr(rng)["a.potr"])}
 
 
-def changed_page(rng: Random) -> bytes:
-    """A page with a changed file in it, or whose text is changed."""
-    page = page_of(changed(rng))
-    return damaged(page, rng) if rng.random() < 0.5 else page
+def changed_page(files: Files, rng: Random) -> Files:
+    """Its text, or the file in it."""
+    ((name, data),) = files.items()
+    if rng.random() < 0.5:
+        return {name: damaged(data, rng)}
+    return {name: page_of(_changed(base64.b64decode(data.partition(BEGIN)[2].partition(END)[0]), rng))}
 
 
 def page_of(potr: bytes) -> bytes:

@@ -1,4 +1,5 @@
-"""Changed SOG: archives, folders, streamed folders with levels; their descriptions, and the pictures in them."""
+"""SOG archives, folders, streamed folders with levels: small good ones of the package's own making, and what is worth
+changing in them, in descriptions and in pictures."""
 
 from __future__ import annotations
 
@@ -13,33 +14,16 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from tools.stress.hostile.changes import TEXTS, Files, Rules, changed_files, damaged, interesting, with_number
+from tools.stress.hostile.changes import TEXTS, Files, Rules, damaged, interesting, saved, with_number
 
-_PICTURES = ("means_l.webp", "means_u.webp", "quats.webp", "scales.webp", "sh0.webp")
-_PALETTE = ("shN_centroids.webp", "shN_labels.webp")
-_COEFFICIENTS = (0, 3, 8, 15)
 _NAMES: tuple[Any, ...] = (
-    ["../meta.json"] * 2,
-    ["/dev/zero", "a/../../b"],
-    [],
-    ["meta.json"] * 2,
-    list(_PICTURES[2:4]),
-    "abc",
+    ["../meta.json"] * 2, ["/dev/zero", "a/../../b"], [], ["meta.json"] * 2, ["quats.webp", "scales.webp"], "abc",
     [0, None],
-)
+)  # fmt: skip
 _COUNTS = (0, 1, 2, 5, 16, 17, 64, 65537, -1, 1.0, True, None, "5", 10**9, 2**31, 2**40)
 _BOUNDS: tuple[Any, ...] = (
-    [],
-    [0],
-    [1e39] * 3,
-    [800.0] * 3,
-    ["1", 2, 3],
-    [[1, 2, 3]] * 3,
-    5,
-    None,
-    [float("nan")] * 3,
-    [1, 2, 3, 4],
-)
+    [], [0], [1e39] * 3, [800.0] * 3, ["1", 2, 3], [[1, 2, 3]] * 3, 5, None, [float("nan")] * 3, [1, 2, 3, 4],
+)  # fmt: skip
 _HINTS = {
     **dict.fromkeys(("count", "file", "offset", "lodLevels"), _COUNTS), **dict.fromkeys(("mins", "maxs"), _BOUNDS),
     **dict.fromkeys(("files", "filenames", "environment"), _NAMES), "bands": (0, 1, 2, 3, 4, 1.0, True, "1"),
@@ -67,35 +51,13 @@ def _saved(image: Image.Image, kind: str, lossless: bool) -> bytes:
     return out.getvalue()
 
 
-def description(splats: int, bands: int) -> dict[str, Any]:
-    """What meta.json says of some splats."""
-    book = [k / 64 - 2 for k in range(256)]
-    meta: dict[str, Any] = {
-        "version": 2, "count": splats, "antialias": False,
-        "means": {"mins": [-1.0, -2.0, -3.0], "maxs": [1.0, 2.0, 3.0], "files": list(_PICTURES[:2])},
-        "scales": {"codebook": book, "files": [_PICTURES[3]]}, "quats": {"files": [_PICTURES[2]]},
-        "sh0": {"codebook": book, "files": [_PICTURES[4]]},
-    }  # fmt: skip
-    if bands:
-        meta["shN"] = {"count": 5, "bands": bands, "codebook": book, "files": list(_PALETTE)}
-    return meta
-
-
-def parts(splats: int, bands: int) -> Files:
-    """A folder's files; the description comes first."""
-    side = int(np.ceil(np.sqrt(splats)))
-    files = {"meta.json": json.dumps(description(splats, bands)).encode()}
-    files |= dict.fromkeys(_PICTURES, picture(side, side))
-    if bands:
-        files |= {_PALETTE[0]: picture(64 * _COEFFICIENTS[bands], 1), _PALETTE[1]: picture(side, side, mode="RGB")}
-    return files
-
-
-def equal_splats(side: int, splats: int) -> Files:
-    """A folder whose pictures have one colour."""
-    return parts(4, 0) | dict.fromkeys(_PICTURES, one_colour(side)) | {
-        "meta.json": json.dumps(description(splats, 0)).encode()
-    }  # fmt: skip
+def parts(splats: int, degree: int, side: int = 0, **meta: Any) -> Files:
+    """A folder's files; the description, parts of which may be said, comes first. With a side: of pictures of one
+    colour."""
+    files = saved("meta.json", splats, degree)
+    if side:
+        files = {name: data if name == "meta.json" else one_colour(side) for name, data in files.items()}
+    return files | {"meta.json": json.dumps(json.loads(files["meta.json"]) | meta).encode()}
 
 
 def archive(files: Files, method: int = zipfile.ZIP_STORED) -> bytes:
@@ -115,18 +77,15 @@ def streamed(meta: Any, folders: dict[str, tuple[int, int]]) -> Files:
     return files
 
 
-def folder_originals() -> list[Files]:
-    """Good folders of every SH degree."""
-    return [parts(5, bands) for bands in range(4)]
+def folder(rng: Random) -> Files:
+    return parts(rng.choice((1, 4, 30)), rng.choice((0, 0, 1, 2, 3)))
 
 
-def originals() -> list[bytes]:
-    """Good files of every SH degree."""
-    return list(map(archive, folder_originals()))
+def sog(rng: Random) -> Files:
+    return {"a.sog": archive(folder(rng), rng.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)))}
 
 
-def level_originals() -> list[Files]:
-    """A good streamed SOG folder."""
+def levels(_: Random) -> Files:
     leaves = [
         {"lods": {"0": {"file": 0, "offset": 0, "count": 2}, "1": {"file": 1, "offset": 0, "count": 4}}},
         {"lods": {"0": {"file": 0, "offset": 2, "count": 3}}},
@@ -136,32 +95,23 @@ def level_originals() -> list[Files]:
         "environment": "env/meta.json",
         "tree": {"bound": {"min": [0, 0, 0], "max": [1, 1, 1]}, "children": leaves},
     }  # fmt: skip
-    return [streamed(tree, {"0": (5, 1), "1": (4, 0), "env": (3, 0)})]
+    return streamed(tree, {"0": (5, 1), "1": (4, 0), "env": (3, 0)})
 
 
-def changed_folder(rng: Random) -> Files:
-    """A small folder, changed."""
-    return changed_files(parts(rng.choice((1, 4, 30)), rng.choice((0, 0, 1, 2, 3))), rng, _RULES)
-
-
-def changed_levels(rng: Random) -> Files:
-    """A small streamed SOG folder, changed."""
-    return changed_files(level_originals()[0], rng, _RULES)
-
-
-def changed(rng: Random) -> bytes:
-    """A small archive, changed: of the files in it, or its own records."""
-    files = changed_folder(rng)
+def changed(files: Files, rng: Random) -> Files:
+    """Of the files in an archive, or of its own records."""
+    with zipfile.ZipFile(io.BytesIO(files["a.sog"])) as given:
+        inner = FOLDER.changed({name: given.read(name) for name in given.namelist()}, rng)
+        method = given.infolist()[0].compress_type
     if rng.random() < 0.1:
         odd = rng.choice((*TEXTS, "meta.json", "../up.webp", "/abs.webp")).encode("utf-8", "replace").decode()
-        files[odd] = rng.randbytes(40)
-    out = archive(files, rng.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)))
-    kind = rng.randrange(16)
+        inner[odd] = rng.randbytes(40)
+    out, kind = archive(inner, method), rng.randrange(16)
     if kind == 0:
-        return rng.choice((b"\0" * 7, b"#!/bin/sh\n", out)) + out
-    if kind == 1:
-        return damaged(out, rng)
-    return with_number(out, rng, _records(out)) if kind < 5 else out
+        out = rng.choice((b"\0" * 7, b"#!/bin/sh\n", out)) + out
+    elif kind == 1:
+        out = damaged(out, rng)
+    return {"a.sog": with_number(out, rng, _records(out)) if 1 < kind < 5 else out}
 
 
 def _records(data: bytes) -> list[tuple[int, int]]:
@@ -200,4 +150,4 @@ def _picture(name: str, _: bytes, rng: Random) -> bytes | None:
     return bytes(data)
 
 
-_RULES = Rules(_HINTS, others=_picture)
+FOLDER = Rules(_HINTS, others=_picture)
