@@ -296,6 +296,30 @@ def _curves(name: str, title: str, subject: str, series: Sequence[str], against:
     return Plot(name, title, of + ("other_formats/sizes",) * formats, panels)
 
 
+def _gpus(results: Results, axes: Sequence[Any]) -> None:
+    """Whole commands by the number of GPUs: seconds by part, and times as fast as one."""
+    rows = results["scaling/gpu_points"].records()
+    names = [f"{row['splats'] / 1e6:.0f} M\n{row['devices']}" for row in rows]
+    parts = [name for name in list(rows[0])[4:] if all(isinstance(row[name], float) for row in rows)]
+    parts = [name for name in parts[: parts.index("judging") + 1] if any(row[name] for row in rows)]
+    bottom = [0.0] * len(rows)
+    for number, part in enumerate(parts):
+        heights = [row[part] for row in rows]
+        grey = str(0.15 + 0.75 * number / len(parts))
+        axes[0].bar(names, heights, bottom=bottom, label=part, color=grey, edgecolor="k", lw=0.5)
+        bottom = [low + height for low, height in zip(bottom, heights, strict=True)]
+    axes[0].set_axisbelow(True)
+    axes[0].set(title="seconds by part", xlabel="million splats, GPUs", ylabel="s")
+    told = [row for row in results["scaling/gpu_foretold"].records() if row["times as fast as one"]]
+    for splats, style in zip(dict.fromkeys(row["splats"] for row in told), _STYLES, strict=False):
+        own = [(row["devices"], row["times as fast as one"]) for row in told if row["splats"] == splats]
+        axes[1].plot(*zip(*own, strict=True), label=f"{splats / 1e6:.0f} million splats", **style)
+    axes[1].plot([1, 4], [1, 4], color="0.5", ls=":", label="if all were shared out")
+    axes[1].set(title="times as fast as one", xlabel="GPUs")
+    axes[1].set_xticks([1, 2, 4])
+    axes[1].legend(loc="upper left", fontsize=9)
+
+
 _PRESETS = ("best", "fast", "paper", "smallest")
 _FITTED = ("paper", "best", "smallest", "smallest with photographs")
 _NEAR = "How near does a file of a size come to the {}?"
@@ -309,6 +333,7 @@ PLOTS: tuple[Plot, ...] = (
         "photographs", _FITTED, "photographs", formats=False,
     ),
     Plot("time_error", "What does each knob cost and bring?", tuple(_KNOBS), _knobs),
+    Plot("gpus", "What do more GPUs bring?", ("scaling/gpu_points", "scaling/gpu_foretold"), _gpus),
 )  # fmt: skip
 
 
