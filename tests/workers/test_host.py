@@ -18,6 +18,7 @@ from potr_cl.opencl.discovery import choose_device, choose_devices
 from potr_cl.opencl.memory import Memory
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.raster import resident
 from potr_cl.stages.pruning import removal
 from potr_cl.stages.pruning.helpers import RemovalPart
 from potr_cl.stages.refitting.helpers import ColourPart
@@ -29,6 +30,7 @@ from potr_cl.workers.pool import Part
 from tests.cases.cameras import small
 from tests.cases.streets import street
 from tests.devices import open_device
+from tests.reference.surfaces import together
 
 #: Splats go, colours are made sparse and re-fitted on the way, coefficients are given up, and AC is rounded.
 OPTIONS = EncodeOptions.for_preset(
@@ -242,31 +244,46 @@ def test_python_takes_several_devices(plush_excerpt, plush_excerpt_cameras):
 
 
 @pytest.mark.slow
-def test_large_scenes_view_by_view(monkeypatch):
-    """Each device looks at its views with what these may draw."""
-    scene, cameras = street(4, 200)
+@pytest.mark.parametrize("kept", [True, False], ids=["kept", "copied for each stage"])
+def test_large_scenes_view_by_view(kept, monkeypatch):
+    """Each device, the first one too, looks at its views with what these may draw; some splats nobody sees.
+
+    Nobody but the first device makes the scene ready: it goes from there to the others.
+    """
+    seen, cameras = street(4, 200, across=True)
+    behind = seen.subset(np.arange(200))
+    scene = together(seen, dataclasses.replace(behind, means=behind.means - np.float32([500, 0, 0])))
     options = EncodeOptions.for_preset("best", between=False, prune={"iterations": 3}, refit={"steps": 1})
     options = dataclasses.replace(options, cameras_anyway=True)
     alone = open_device("gpu")
     expected = encode(scene, cameras, options, device=alone)
+    assert expected.unseen.splats >= 200
     monkeypatch.setattr(splat_groups, "LARGEST", 32)
     monkeypatch.setattr(visibility, "LEAST_SPLATS", 1)
-    shares = []
-
-    made = removal.RemovalSweep.__init__
+    monkeypatch.setattr(resident, "fits_whole", lambda device, scene: True)
+    if not kept:
+        monkeypatch.setattr(resident, "_PART", 1 << 40)
+    shares, plans, ready = [], [], []
+    made, by_view, uploaded = removal.RemovalSweep.__init__, removal.plans.by_view, resident.uploaded
 
     def noting(self, *given, **named):
         made(self, *given, **named)
         shares.append(self.resident_views)
 
     monkeypatch.setattr(removal.RemovalSweep, "__init__", noting)
+    monkeypatch.setattr(removal.plans, "by_view", lambda *given: plans.append(len(given[2])) or by_view(*given))
+    monkeypatch.setattr(resident, "uploaded", lambda *given: ready.append(given[0]) or uploaded(*given))
     devices = [open_device("gpu") for _ in range(3)]
     with HostPool(devices) as pool:
         found = encode(scene, cameras, options, device=devices[0], pool=pool)
-    assert len(shares) == 3
+    assert len(shares) == len(plans) == 3
+    assert sum(plans) == len(cameras)
     *helpers, master = sorted(shares)
     assert master == len(cameras), "the master's own, and those of others"
     assert 0 < sum(helpers) < len(cameras)
+    # For the re-fit's pictures each has it made ready once more, if it is not kept.
+    assert ready[0] is devices[0]
+    assert len(ready) == (1 if kept else 4)
     assert found.data == expected.data
     assert [device.allocated for device in devices] == [0] * 3
 
