@@ -124,9 +124,9 @@ def _as_it_is(scene: Scene) -> Scene:
     return scene
 
 
-#: A scene that takes more than this part of the device's memory is not kept: others may need the room. Fifty million
-#: splats stay on a GPU of 80 GB.
-_PART = 6
+#: A scene that takes more than this part of the device's own memory, or of the host's, is not kept: others may need the
+#: room. Fifty million splats stay on a GPU of 80 GB.
+_PART, _PART_OF_HOST = 6, 10
 #: Nor is it there for a while if it takes more than this one.
 _AWHILE = 3
 #: The whole scene is on the device too where that has so many times as much memory.
@@ -158,7 +158,8 @@ class ResidentScene(Owner, SceneHandle):
             self.bring_to(each)
 
     def _placed(self, device: Device) -> SceneBuffers | None:
-        if _PART * self._scene.nbytes <= _allowed(device, self._budget):
+        part = _PART_OF_HOST if device.info.shares_host_memory else _PART
+        if part * self._scene.nbytes <= _allowed(device, self._budget):
             # To make a scene ready on the host takes many times as long as to copy it from device to device.
             first = None if device is self._device else self._on[self._device].result()
             with suppress(DeviceMemoryError):

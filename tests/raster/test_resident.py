@@ -137,7 +137,8 @@ def test_without_what_no_view_sees_the_scene_is_still_uploaded_once(
     assert found.unseen is not None
     assert found.unseen.splats > 0
     assert [len(sh) for sh in uploads] == [len(scene)]
-    monkeypatch.setattr(resident, "_PART", 1 << 40)
+    for name in ("_PART", "_PART_OF_HOST"):
+        monkeypatch.setattr(resident, name, 1 << 40)
     assert encode(scene, cameras, options, device=device).data == found.data
     assert [len(sh) for sh in uploads[1:]] == [len(scene) - found.unseen.splats]
 

@@ -262,7 +262,7 @@ def test_large_scenes_view_by_view(kept, monkeypatch):
     monkeypatch.setattr(visibility, "LEAST_SPLATS", 1)
     monkeypatch.setattr(resident, "fits_whole", lambda device, scene: True)
     if not kept:
-        monkeypatch.setattr(resident, "_PART", 1 << 40)
+        monkeypatch.setattr(resident, "_PART_OF_HOST", 1 << 40)
     shares, plans, ready = [], [], []
     made, by_view, uploaded = removal.RemovalSweep.__init__, removal.plans.by_view, resident.uploaded
 

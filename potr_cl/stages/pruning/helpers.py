@@ -24,12 +24,7 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner, Scratch
 from potr_cl.opencl.relay import Lent, Relay
-from potr_cl.raster.resident import (
-    DeviceScene,
-    SceneHandle,
-    scene_on,
-    whole_on_device,
-)
+from potr_cl.raster.resident import DeviceScene, SceneHandle, scene_on, whole_on_device
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
 from potr_cl.stages.pruning.buffers import Bits
 from potr_cl.stages.pruning.exchange import AddedChanges, AlivePacking, ChangedTotals, Changes
