@@ -213,6 +213,8 @@ def report(results: Results, measured: Sequence[Row]) -> None:
         for figure in FIGURES:
             powers, deviation = exponents(numbers, figure)
             fitted.add(figure, *(powers.get(name) for name in NUMBERS), 100 * deviation)
+    if len({row["devices"] for row in numbers}) < 2:
+        return
     table = results.table(
         "foretold", "Whole commands, measured and foretold from the two smallest numbers of devices",
         "splats||,.0f; views||.0f; devices||.0f; measured|s|.1f; times as fast as one||.2f; foretold|s|.1f; off|%|+.0f",
