@@ -78,7 +78,7 @@ def test_encode_with_a_fit(paths, capsys):
 
 @pytest.mark.parametrize("command", ["encode", "fit"])
 def test_an_interrupted_fit_keeps_its_last_whole_round(paths, command, capsys, monkeypatch):
-    """Asked by a first Ctrl-C after its second round; tests/host/test_signals.py sends real ones."""
+    """Asked by a first Ctrl-C after its second round; tests/host/test_process.py sends real ones."""
     asked, rounds = process.Asked(), []
 
     @contextmanager
