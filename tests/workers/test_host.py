@@ -262,7 +262,8 @@ def test_large_scenes_view_by_view(kept, monkeypatch):
     monkeypatch.setattr(visibility, "LEAST_SPLATS", 1)
     monkeypatch.setattr(resident, "fits_whole", lambda device, scene: True)
     if not kept:
-        monkeypatch.setattr(resident, "_PART_OF_HOST", 1 << 40)
+        for name in ("_PART", "_PART_OF_HOST"):
+            monkeypatch.setattr(resident, name, 1 << 40)
     shares, plans, ready = [], [], []
     made, by_view, uploaded = removal.RemovalSweep.__init__, removal.plans.by_view, resident.uploaded
 

@@ -46,6 +46,7 @@ from tools.workloads import log, plain_parser
 #: What is varied, and what is fitted with it.
 NUMBERS = ("splats", "views", "devices")
 FIGURES = ("all", "pruning", "re-fit", "host peak", "splats left")
+_SENT = "sent to the first"
 #: The parts of a command by the stages that the encoder times; the rest is the first one.
 PARTS: Mapping[str, Sequence[str]] = {
     "start, reading, proof": (),
@@ -60,7 +61,7 @@ PARTS: Mapping[str, Sequence[str]] = {
 _COLUMNS = (
     "splats||,.0f; views||.0f; devices||.0f; all|s|.1f; "
     + "; ".join(f"{part}|s|.1f" for part in PARTS)
-    + "; sent to the first|GB|.1f; busy|%|.0f; device peak|GB|.1f; host peak|GB|.1f; splats left||,.0f; PSNR|dB|.2f"
+    + f"; {_SENT}|GB|.1f; busy|%|.0f; device peak|GB|.1f; host peak|GB|.1f; splats left||,.0f; PSNR|dB|.2f"
     + "; file"
 )
 #: Bytes a second that come to a device from another one, through the host's memory (H100, PCIe 5).
@@ -128,7 +129,7 @@ def measure(folder: Path, point: Point, options: Sequence[str]) -> Row:
     shared, quality = report["shared"], report["quality"]
     return {
         **dict(zip(NUMBERS, point, strict=True)), "all": seconds, **parts,
-        "sent to the first": None if shared is None else shared["received"] / 1e9,
+        _SENT: None if shared is None else shared["received"] / 1e9,
         "busy": float(np.mean([busy for busy, _ in used])) if used else None,
         "device peak": max(mebibytes for _, mebibytes in used) * 2**20 / 1e9 if used else None,
         "host peak": usage.ru_maxrss * 1024 / 1e9, "splats left": report["splats"],
@@ -204,7 +205,7 @@ def main() -> None:
 
 def report(results: Results, measured: Sequence[Row]) -> None:
     """The tables of exponents, and of what is foretold."""
-    numbers = [{name: float(row[name] or 0) for name in (*NUMBERS, *FIGURES)} for row in measured]
+    numbers = [{name: float(row[name] or 0) for name in (*NUMBERS, *FIGURES, _SENT)} for row in measured]
     if len(numbers) > len(NUMBERS):
         fitted = results.table(
             "exponents", "Exponents that fit them",
@@ -220,13 +221,10 @@ def report(results: Results, measured: Sequence[Row]) -> None:
         "splats||,.0f; views||.0f; devices||.0f; measured|s|.1f; times as fast as one||.2f; foretold|s|.1f; off|%|+.0f",
     )  # fmt: skip
     for (splats, views), alike in groupby(numbers, key=lambda row: (row["splats"], row["views"])):
-        times = {int(row["devices"]): row["all"] for row in alike}
-        received = {int(row["devices"] or 0): float(row["sent to the first"] or 0) * 1e9 for row in measured
-                    if (row["splats"], row["views"]) == (splats, views)}  # fmt: skip
-        known = {n: (seconds, received[n]) for n, seconds in times.items()}
-        for n in sorted({*times, 8}) if len(times) > 1 else ():
-            told, took = foretold(known, n), times.get(n)
-            faster = None if took is None or 1 not in times else times[1] / took
+        known = {int(row["devices"]): (row["all"], 1e9 * row[_SENT]) for row in alike}
+        for n in sorted({*known, 8}) if len(known) > 1 else ():
+            told, took = foretold(known, n), known[n][0] if n in known else None
+            faster = None if took is None or 1 not in known else known[1][0] / took
             table.add(splats, views, n, took, faster, told, None if took is None else 100 * (told / took - 1))
 
 
