@@ -91,6 +91,30 @@ inline void store_sums(vlong sums, Place place, const int there[LANES], global l
 #define ONE_VIEW (PICKED && LANES == 1)
 #define AT_A_TIME 12
 
+#if WEIGHTS && !PICKED
+/* Views whose parts of the blocks are found before any of them is added: blocks come from memory, once for so many. */
+#define OF_BLOCKS 4
+
+/* blocks += the sum of w^2 x basis x basis of some views. */
+inline void add_blocks(
+    int views,
+    const vfloat *weights,
+    const VREAL basis[OF_BLOCKS][SH_COUNT],
+    size_t block,
+    ulong block_stride,
+    global long *blocks)
+{
+    for (int i = 0; i < SH_COUNT; ++i)
+        for (int j = i; j < SH_COUNT; ++j) {
+            global long *column = blocks + AT(i, j) * block_stride;
+            vlong sum = VLOAD(block, column);
+            for (int k = 0; k < views; ++k)
+                sum += to_fixed_lanes(weights[k] * basis[k][i] * basis[k][j]);
+            VSTORE(sum, block, column);
+        }
+}
+#endif
+
 /* The totals of some of a set's views, times the view's scale, onto the coefficients: result += basis x (Y, Co, Cg) of
    the free channels' sums, view by view. What views have lies `apart`. With WEIGHTS also blocks += the sum of
    w^2 x basis x basis, for `block_stride` splats from number `first_block` on. Both are columns of integers; the scales
@@ -128,6 +152,13 @@ kernel void gather(
 #if !ONE_VIEW
     vlong results[3 * SH_COUNT];
     int any_view = 0;
+#endif
+#if WEIGHTS && !PICKED
+    const size_t block = index - first_block / LANES;
+    const int has_block = !SOME_BLOCKS || (index >= first_block / LANES && block < block_stride / LANES);
+    vfloat weights[OF_BLOCKS];
+    VREAL bases[OF_BLOCKS][SH_COUNT];
+    int views_of_block = 0;
 #endif
     for (uint number = first_view; number < first_view + view_count; ++number) {
         const size_t place = number * apart / LANES + index;
@@ -176,19 +207,20 @@ kernel void gather(
                 }
             }
 #elif WEIGHTS
-        const vfloat weight = sums[3];
-        const size_t block = index - first_block / LANES;
-#if SOME_BLOCKS
-        if (index < first_block / LANES || block >= block_stride / LANES)
-            continue;
-#endif
-        for (int i = 0; i < SH_COUNT; ++i)
-            for (int j = i; j < SH_COUNT; ++j) {
-                global long *column = blocks + AT(i, j) * block_stride;
-                VSTORE(VLOAD(block, column) + to_fixed_lanes(weight * basis[i] * basis[j]), block, column);
-            }
+        weights[views_of_block] = sums[3];
+        for (int m = 0; m < SH_COUNT; ++m)
+            bases[views_of_block][m] = basis[m];
+        if (++views_of_block == OF_BLOCKS) {
+            if (has_block)
+                add_blocks(OF_BLOCKS, weights, bases, block, block_stride, blocks);
+            views_of_block = 0;
+        }
 #endif
     }
+#if WEIGHTS && !PICKED
+    if (has_block && views_of_block)
+        add_blocks(views_of_block, weights, bases, block, block_stride, blocks);
+#endif
 #if !ONE_VIEW
     if (any_view)
         for (int i = 0; i < 3 * SH_COUNT; ++i)
