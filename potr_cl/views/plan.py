@@ -93,12 +93,12 @@ def whole(numbers: Sequence[int], splats: int, memory: int) -> ViewPlan:
 
 
 def in_launches(
-    parts: Sequence[Sequence[int]], strides: Mapping[int, int], cache: ViewCache, most_views: int, splat: int
+    numbers: Sequence[int], strides: Mapping[int, int], cache: ViewCache, most_views: int, splat: int
 ) -> ViewPlan:
     """Views that a launch does together, each with room for as many splats as the first of them.
 
     Args:
-        parts: numbers of views; no launch does views of two parts. In each, views have fewer and fewer splats.
+        numbers: of views, which have fewer and fewer splats.
         strides: room that each view's splats need.
         cache: keeps them.
         most_views: how many views a launch can do.
@@ -107,12 +107,12 @@ def in_launches(
     # The largest view has its room in any case.
     room = max(cache.room // (LEAST_SETS * (GEOMETRY + splat)), *strides.values(), 0)
     groups: list[ViewGroup] = []
-    for left in map(tuple, parts):
-        while left:
-            stride = strides[left[0]]
-            most = int(min(room // stride, most_views))
-            groups.append(ViewGroup(left[:most], stride, most=most))
-            left = left[most:]
+    left = tuple(numbers)
+    while left:
+        stride = strides[left[0]]
+        most = int(min(room // stride, most_views))
+        groups.append(ViewGroup(left[:most], stride, most=most))
+        left = left[most:]
     cache.largest = max((len(group.numbers) * group.count for group in groups), default=0)
     return ViewPlan(groups, CacheBudget(cache), in_sets=True)
 

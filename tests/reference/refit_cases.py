@@ -91,13 +91,17 @@ class Linearised:
         self.gradient: Array = as_rows(vectors, result)
         self.room = colour_map.own.room
 
-    def normal(self, direction: Array, part: int | None = None) -> Array:
-        """A transposed W A times a direction, by a part of the views or by all."""
+    def normal(self, direction: Array, every: int = 1) -> Array:
+        """A transposed W A times a direction, by one of so many blocks of pixels."""
         vectors = self._refit.coefficients
         x, result = vectors.vector(), vectors.vector()
         vectors.write(x, direction.transpose(1, 2, 0).reshape(-1, len(direction)))
-        self._refit.colour_map.normal(x, result, self._at, Ridge(0.0, 0.0, 0.0), part=part)
+        self._refit.colour_map.normal(x, result, self._at, Ridge(0.0, 0.0, 0.0), every=every)
         return as_rows(vectors, result)
+
+    def error_alone(self, targets: Targets) -> float:
+        """|pictures - targets|^2 by W, without a gradient."""
+        return self._refit.colour_map.error(self._at, targets)
 
     def __enter__(self) -> Linearised:
         return self

@@ -19,6 +19,7 @@ from tests.cases.memory import taken_of
 from tests.cases.scenes import antialiased
 from tests.reference.refit import LENGTHS, selection, to_rgb, to_ycocg
 from tests.reference.refit_cases import Case, Linearised, Pictures
+from tests.reference.rounding import grid_of
 from tests.reference.scenes import ring_of_cameras, tilted_camera, visible_scene
 
 
@@ -68,6 +69,7 @@ def test_the_map_and_its_transpose(device, make, least_cut):
         with Pictures(device, targets) as buffers, Linearised(case, buffers) as linear:
             normals = [linear.normal(direction) for direction in directions]
             assert not linear.normal(0 * directions[0]).any()
+            assert linear.error_alone(buffers) == linear.error
         weighted = zip(reference.views, images, strict=True)
         assert linear.error == pytest.approx(sum(view.weight * np.sum(a * a) for view, a in weighted), rel=1e-5)
         assert relative(linear.gradient, reference.transposed(images)) < 1e-5
@@ -79,27 +81,57 @@ def test_the_map_and_its_transpose(device, make, least_cut):
         assert least_cut <= cut < (0.95 if least_cut else 0.3)
 
 
-@pytest.mark.parametrize("views", [63, 64, 71])
-def test_a_part_of_many_views_stands_for_all(device, views, monkeypatch):
-    """Every second view, however many a launch does; where they are few, all of them."""
-    monkeypatch.setattr("potr_cl.stages.refitting.own_views.ENOUGH", 32)
-    scene = visible_scene(40, 1, seed=views)
-    cameras = ring_of_cameras(views, size=12)
-    direction = np.random.default_rng(views).normal(size=scene.sh.shape)
+@pytest.mark.parametrize(
+    ("scene", "every", "size"),
+    [(visible_scene(60, 1), 2, (37, 21)), (visible_scene(60, 2), 4, (40, 40)), (crowd(), 4, (16, 16))],
+)
+def test_some_blocks_of_pixels_stand_for_all(device, scene, every, size, monkeypatch):
+    """Which ones, moves on from view to view; by number among all, whatever a launch does together."""
+    monkeypatch.setattr("potr_cl.stages.refitting.colour_map.ENOUGH", 5)
+    cameras = [
+        dataclasses.replace(each, width=size[0] - i % 2, height=size[1])
+        for i, each in enumerate(ring_of_cameras(5, size=40))
+    ]
+    direction = np.random.default_rng(every).normal(size=scene.sh.shape)
     with Case(device, scene, scene, cameras) as case, Linearised(case) as linear:
-        whole = linear.normal(direction)
-        halves = [linear.normal(direction, part) for part in (0, 1)]
-        again = linear.normal(direction, 0)
-    assert np.array_equal(halves[0], again)
-    if views < 64:
-        assert np.array_equal(halves, [whole, whole])
-        return
-    number = np.array([len(range(part, views, 2)) for part in (0, 1)])
-    assert relative(np.tensordot(number / views, halves, 1), whole) < 1e-5
-    for part, half in enumerate(halves):
-        assert 1e-3 < relative(half, whole) < 0.5
-        with Case(device, scene, scene, cameras[part::2]) as case, Linearised(case) as linear:
-            assert relative(half * number[part] / views, linear.normal(direction)) < 1e-5
+        whole, some, again = (linear.normal(direction, each) for each in (1, every, every))
+        reference = case.reference()
+        images = reference.forward(direction)
+        for number, (camera, image) in enumerate(zip(cameras, images, strict=True)):
+            rows, columns = np.divmod(np.arange(len(image)), camera.width)
+            image[(columns // 4 + every // 2 * (rows // 4) + number) % every != 0] = 0
+        wanted = every * reference.transposed(images)
+    assert np.array_equal(some, again)
+    assert relative(some, wanted) < 1e-5
+    assert relative(some, whole) > 1e-2
+
+
+@pytest.mark.one_family
+@pytest.mark.parametrize(("splats", "rounds", "wanted"), [(20, True, {2, 4}), (60, True, {1, 4}), (20, False, {1, 4})])
+def test_steps_by_half_of_the_pixels_are_for_many_of_them_and_rounds_that_follow(
+    device, splats, rounds, wanted, monkeypatch
+):
+    """3 views of 40 x 40 pixels are 240 for each of 20 splats. The choice of coefficients always has one in four."""
+    asked, normal = set(), ColourMap.normal
+
+    def noted(self, *args, **how):
+        asked.add(how["every"])
+        normal(self, *args, **how)
+
+    monkeypatch.setattr(ColourMap, "normal", noted)
+    options = RefitOptions(steps=2, gain=0, drop=1e-9)
+    grid = {"colour_grid": lambda effects: grid_of(splats)} if rounds else {"fix_ac": lambda sh, refit: sh.copy()}
+    scene = visible_scene(splats, 1)
+    with Case(device, scene, scene, ring_of_cameras(3, size=40)) as case:
+        refit_colours(device, scene, case.cameras, case.targets, options, **grid)
+    assert asked == wanted
+
+
+def test_few_views_are_looked_at_whole(device):
+    scene = visible_scene(40, 1)
+    direction = np.random.default_rng(1).normal(size=scene.sh.shape)
+    with Case(device, scene, scene, ring_of_cameras(3, size=40)) as case, Linearised(case) as linear:
+        assert np.array_equal(linear.normal(direction, 4), linear.normal(direction))
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.picked_splats import IndexSubset
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages import refit as refit_stage
-from potr_cl.stages.refitting import coefficients, helpers, own_views
+from potr_cl.stages.refitting import coefficients, colour_map, exchange, helpers, own_views
 from potr_cl.stages.refitting.colour_refit import ColourRefit
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
@@ -102,7 +102,7 @@ def coarse(sh, refit):
 
 
 def fitted(device, way: str, slices=None, memory=None, workers=1, elsewhere=False):
-    """By two parts of the views."""
+    """By some of the pixels."""
     case = crowded_case(device)
     grid, other = grid_of(len(case.scene)), dataclasses.replace(case.scene, sh=case.scene.sh[::-1].copy())
     rounding = {"solve": {}, "colour_grid": {"colour_grid": lambda effects: grid}, "fix_ac": {"fix_ac": coarse}}[way]
@@ -123,7 +123,7 @@ def fitted(device, way: str, slices=None, memory=None, workers=1, elsewhere=Fals
 def plain(device):
     """Solutions with everything on one device, and all splats in each view."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(own_views, "ENOUGH", 4)
+        patched.setattr(colour_map, "ENOUGH", 4)
         return {way: fitted(device, way) for way in WAYS}
 
 
@@ -139,7 +139,8 @@ SLOW = [("two devices", "solve"), ("a cluster of three", "fix_ac")]
 def test_the_same_solution(device, plain, picked, plan, way, monkeypatch):
     plan = dict(PLANS[plan])
     on = plan.pop("picked", False)
-    monkeypatch.setattr(own_views, "ENOUGH", 4)
+    monkeypatch.setattr(colour_map, "ENOUGH", 4)
+    monkeypatch.setattr(exchange, "_WORTH_IT", 1.0)
     monkeypatch.setattr(coefficients, "_FEWEST", plan.pop("resident", 1))
     made, rows = picked(on), noted(monkeypatch, helpers, "DrawnRows")
     found = fitted(device, way, **plan)

@@ -81,13 +81,13 @@ def test_the_same_bytes(plush_excerpt, plush_excerpt_cameras, family, options, v
 
 
 @pytest.mark.slow
-def test_steps_by_a_part_of_the_views_give_the_same_bytes(plush_excerpt, plush_excerpt_cameras, monkeypatch):
-    """Every device knows which of its views these are, and whether there are any."""
+def test_steps_by_some_of_the_pixels_give_the_same_bytes(plush_excerpt, plush_excerpt_cameras, monkeypatch):
+    """Every device knows which ones these are: it goes by the views' numbers among all."""
     cameras = few(plush_excerpt_cameras)
     options = OPTIONS.changed(prune={"iterations": 2}, compact=False)
     devices = [Device() for _ in range(4)]
     every = encode(plush_excerpt, cameras, options, device=devices[0]).data
-    monkeypatch.setattr("potr_cl.stages.refitting.own_views.ENOUGH", 2)
+    monkeypatch.setattr("potr_cl.stages.refitting.colour_map.ENOUGH", 2)
     expected = encode(plush_excerpt, cameras, options, device=devices[0]).data
     assert expected != every
     with HostPool(devices) as pool:

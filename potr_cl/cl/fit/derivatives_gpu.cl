@@ -78,7 +78,8 @@ void derivatives(
     const int2 origin = (int2)(tile % columns, tile / columns) * TILE;
     uint first; /* of the intersections of the batch */
     const uint swept = forward(
-        &state, &batch, unfinished, origin, picture, shapes, colours, intersections, subtiles, length, lid, &first);
+        &state, &batch, unfinished, origin, picture, shapes, colours, intersections, subtiles, length,
+        ALL_SUBTILES, lid, &first);
 
     /* From here on r, g, b are the pixels' numbers v. */
     Mine mine = pixels_of(group, origin, lid);
@@ -198,7 +199,7 @@ void derivatives(
         if (first == 0)
             break;
         first -= BATCH;
-        fetch(&batch, shapes, colours, intersections + first, subtiles + first, BATCH, lid);
+        fetch(&batch, shapes, colours, intersections + first, subtiles + first, BATCH, ALL_SUBTILES, lid);
         barrier(CLK_LOCAL_MEM_FENCE);
         make_lists(&batch, lid);
     }

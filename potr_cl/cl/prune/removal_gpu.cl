@@ -81,7 +81,8 @@ void removal(
     const int2 origin = (int2)(tile % columns, tile / columns) * TILE;
     uint first; /* of the intersections of the batch */
     const uint swept = forward(
-        &state, &batch, unfinished, origin, picture, shapes, colours, intersections, subtiles, length, lid, &first);
+        &state, &batch, unfinished, origin, picture, shapes, colours, intersections, subtiles, length,
+        ALL_SUBTILES, lid, &first);
     /* What lies behind the last pixel's end has no effect any more. */
     for (uint e = swept + lid; e < length; e += ITEMS) {
         replace_sums(
@@ -202,7 +203,7 @@ void removal(
         if (first == 0)
             break;
         first -= BATCH;
-        fetch(&batch, shapes, colours, intersections + first, subtiles + first, BATCH, lid);
+        fetch(&batch, shapes, colours, intersections + first, subtiles + first, BATCH, ALL_SUBTILES, lid);
         barrier(CLK_LOCAL_MEM_FENCE);
         make_lists(&batch, lid);
     }

@@ -47,7 +47,8 @@ void composite(
     const uint length = end - begin;
     uint last; /* batch, which nobody needs */
     forward(
-        &state, &batch, unfinished, origin, picture, shapes, colours, intersections, subtiles, length, lid, &last);
+        &state, &batch, unfinished, origin, picture, shapes, colours, intersections, subtiles, length,
+        ALL_SUBTILES, lid, &last);
     const Mine mine = pixels_of(lid / SHARE, origin, lid);
     for (int p = 0; p < PIXELS; ++p)
         if (inside(mine, p, picture)) {

@@ -43,7 +43,8 @@ void mark_reached(
     const int2 origin = (int2)(tile % columns, tile / columns) * TILE;
     uint last; /* batch, which nobody needs */
     const uint swept = forward(
-        &state, &batch, unfinished, origin, picture, shapes, colours, intersections, subtiles, length, lid, &last);
+        &state, &batch, unfinished, origin, picture, shapes, colours, intersections, subtiles, length,
+        ALL_SUBTILES, lid, &last);
     /* Other tiles may write there too, and the same. */
     for (uint i = lid; i < swept; i += ITEMS)
         marks[intersections[i]] = 1;

@@ -20,6 +20,7 @@
 #define REMEMBER(memory, j, alpha, weight) VSTORE(weight, j, memory)
 #include "include/subtile_blend.clh"
 #include "refit/refit.clh"
+#include "refit/samples.clh"
 
 #ifndef SUMS_AHEAD
 #define SUMS_AHEAD 16
@@ -68,6 +69,10 @@ kernel void refit_sweep(
     global const float *target,
     int has_target,
     float scale,
+    global const uint *numbers,
+    uint first_number,
+    uint every,
+    int back,
     global float *errors,
     volatile global uint *totals)
 {
@@ -75,7 +80,9 @@ kernel void refit_sweep(
     const int2 origin = (int2)(tile % view.columns, tile / view.columns) * TILE;
     const uint begin = offsets[tile], end = offsets[tile + 1];
 
+    const uint some = sampled_subtiles(every, numbers[first_number]);
     Splat splats[SEGMENT];
+    uint places[SEGMENT];
     ushort lists[SUBTILES][SEGMENT];
     uint lengths[SUBTILES];
     float weights[(SEGMENT + LANES) * LANES];
@@ -83,21 +90,25 @@ kernel void refit_sweep(
     vfloat t[SUBTILES], rgb[SUBTILES][3];
     float values[SUBTILES][3][LANES];
     float error = 0.0f;
-    const int twice = end - begin > SEGMENT;
-    for (int pass = twice ? 0 : 1; pass < 2; ++pass) {
+    const int first_pass = end - begin > SEGMENT ? 0 : 1, last_pass = back ? 1 : first_pass;
+    for (int pass = first_pass; pass <= last_pass; ++pass) {
         for (int i = 0; i < SUBTILES; ++i) {
             t[i] = subtile_transmittance(i, origin, view.width, view.height);
             rgb[i][0] = rgb[i][1] = rgb[i][2] = (vfloat)(0.0f);
         }
         for (uint from = begin; pass == 1 || from < end; from += SEGMENT) {
+            const int is_last = from >= end || end - from <= SEGMENT;
             const uint count = from < end ?
-                gather_splats(shapes, colours, intersections, subtiles, from, end, splats, lists, lengths) : 0;
+                gather_some(
+                    shapes, colours, intersections, subtiles, from, end, some, splats, places, lists, lengths) : 0;
             for (uint k = 0; k < count; ++k)
                 sums[k] = (float4)(0.0f);
             for (int i = 0; i < SUBTILES; ++i) {
+                if (!(some >> i & 1))
+                    continue;
                 const uint length = count ? lengths[i] : 0;
                 const uint walked = blend(splats, lists[i], length, subtile_centre(origin, i), &t[i], rgb[i], weights);
-                if (from + count >= end && pass == (twice ? 0 : 1)) {
+                if (is_last && pass == first_pass) {
                     /* The pixels' values are known. */
                     const vfloat through = fabs(t[i]);
                     const vfloat colour[3] = {
@@ -108,16 +119,16 @@ kernel void refit_sweep(
                         colour, i, origin, view.width, view.height, target, has_target, 0, 1.0f, LARGEST_VALUE,
                         values[i]);
                 }
-                if (pass == 1)
+                if (pass == 1 && back)
                     sum_pairs(lists[i], walked, weights, values[i], sums);
             }
-            if (pass == 1)
+            if (pass == 1 && back)
                 for (uint k = 0; k < count; ++k) {
                     if (k + SUMS_AHEAD < count)
-                        PREFETCH_TO_WRITE(totals + 2 * TOTALS * intersections[from + k + SUMS_AHEAD]);
-                    add_sums(totals, intersections[from + k], sums[k], scale);
+                        PREFETCH_TO_WRITE(totals + 2 * TOTALS * intersections[places[k + SUMS_AHEAD]]);
+                    add_sums(totals, intersections[places[k]], sums[k], scale);
                 }
-            if (from + count >= end)
+            if (is_last)
                 break;
         }
     }

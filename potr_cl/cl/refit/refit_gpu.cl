@@ -18,6 +18,7 @@
 #include "include/registers.clh"
 #include "include/subtile_batches.clh"
 #include "refit/refit.clh"
+#include "refit/samples.clh"
 
 kernel NARROW __attribute__((reqd_work_group_size(ITEMS, 1, 1)))
 void refit_sweep(
@@ -34,6 +35,10 @@ void refit_sweep(
     global const float *target,
     int has_target,
     float scale,
+    global const uint *numbers,
+    uint first_number,
+    uint every,
+    int back,
     global float *errors,
     volatile global uint *totals)
 {
@@ -58,12 +63,14 @@ void refit_sweep(
     intersections += views->first_intersection + offsets[0];
     subtiles += views->first_intersection + offsets[0];
 
+    const uint some = sampled_subtiles(every, numbers[first_number + number]);
+
     start_walk(&walk, lid);
     const int2 origin = (int2)(tile % columns, tile / columns) * TILE;
     uint last_batch;
     const uint swept = forward(
-        &state, &batch, unfinished, origin, picture, shapes, colours, intersections, subtiles, length, lid,
-        &last_batch);
+        &state, &batch, unfinished, origin, picture, shapes, colours, intersections, subtiles, length, some,
+        lid, &last_batch);
 
     /* From here on r, g, b are the pixels' values to multiply by. */
     Mine mine = pixels_of(lid / SHARE, origin, lid);
@@ -85,7 +92,7 @@ void refit_sweep(
     }
     if (lid == 0)
         errors[views->first_tile + tile] = item_errors[0];
-    if (swept == 0)
+    if (swept == 0 || !back)
         return;
 
     /* The same way again, now with the pixels' values known. A single batch is still there. */
@@ -94,7 +101,7 @@ void refit_sweep(
     for (uint first = 0; first < swept; first += BATCH) {
         const int size = min(swept - first, (uint)BATCH);
         if (last_batch > 0) {
-            fetch(&batch, shapes, colours, intersections + first, subtiles + first, size, lid);
+            fetch(&batch, shapes, colours, intersections + first, subtiles + first, size, some, lid);
             barrier(CLK_LOCAL_MEM_FENCE);
             make_lists(&batch, lid);
         }

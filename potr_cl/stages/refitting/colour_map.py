@@ -23,6 +23,9 @@ from potr_cl.stages.refitting.own_views import Look, OwnViews
 from potr_cl.stages.refitting.sliced_arrays import Ridge
 from potr_cl.views.targets import Targets
 
+#: Views from which on some of their pixels can stand for all: with few, each splat is seen in few pixels as it is.
+ENOUGH = 100
+
 
 class ColourMap:
     """A of one scene and some views, with pixels weighed by W.
@@ -86,6 +89,20 @@ class ColourMap:
                 coefficients.device.finish()
         return math.fsum(errors[number] for number in sorted(errors))
 
+    def error(self, x: Vector, targets: Targets) -> float:
+        """The squared error by W at x, as :meth:`gradient` returns it, which takes nearly twice as long.
+
+        Colours that are cut at 0 at x are settled here too.
+        """
+        own, on_device = self.own, self._coefficients.on_device(x)
+        if self._helpers is not None:
+            own.prepare(targets)
+            self._helpers.begin_gradient(on_device, None, False, back=False)
+        own.add_up(Look(on_device, targets, back=False))
+        errors = {} if self._helpers is None else self._helpers.add(own.sums, None)
+        errors |= own.found_errors()
+        return math.fsum(errors[number] for number in sorted(errors))
+
     def normal(
         self,
         direction: Vector,
@@ -93,7 +110,7 @@ class ColourMap:
         at: Vector,
         ridge: Ridge,
         constant: bool = False,
-        part: int | None = None,
+        every: int = 1,
     ) -> None:
         """result = (Aᵀ W A + ridge) direction, but 0 for the pictures' part if the direction is 0 or not finite.
 
@@ -103,22 +120,22 @@ class ColourMap:
             at: the vector that :meth:`gradient` was given last, with the same content.
             ridge: of the coefficients that may change; the result's others become 0.
             constant: the direction's AC coefficients are all 0, and the pictures' part of the result's is left out.
-            part: number of the part of the views that stands for all of them, modulo their number. None: all.
+            every: of so many blocks of pixels one stands for all (cl/refit/samples.clh): 1, 2 or 4. Where views are
+                few, all are looked at.
         """
         own, coefficients = self.own, self._coefficients
-        part = None if part is None else part % own.parts
+        every = every if own.count >= ENOUGH else 1
         coefficients.zero(result)
         largest = coefficients.largest(direction)
         if 0 < largest < math.inf:
             unit = 1 / largest
             on_device = coefficients.on_device(direction)
             if self._helpers is not None:
-                self._helpers.begin_normal(on_device, coefficients.on_device(at, 1), unit, constant, part)
-            own.add_up(Look(on_device, None, at, unit, constant, part))
+                self._helpers.begin_normal(on_device, coefficients.on_device(at, 1), unit, constant, every)
+            own.add_up(Look(on_device, None, at, unit, constant, every))
             if self._helpers is not None:
                 self._helpers.add(own.sums, None)
-            share = 1.0 if part is None else len(range(part, own.count, own.parts)) / own.count
-            coefficients.add_sums(result, own.sums, 1 / (own.one * unit * share), constant)
+            coefficients.add_sums(result, own.sums, every / (own.one * unit), constant)
         coefficients.add_ridge(result, direction, ridge)
 
     def _block_sums(self, memory: Memory, splats: range) -> cl.Buffer:

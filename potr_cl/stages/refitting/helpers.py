@@ -25,7 +25,7 @@ from potr_cl.raster.resident import ResidentScene, SceneSubset, scene_on
 from potr_cl.raster.scene_buffers import stride_of
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.exchange import DrawnRows, Exchange, SentVector
-from potr_cl.stages.refitting.own_views import Look, OwnViews, parts_of
+from potr_cl.stages.refitting.own_views import Look, OwnViews
 from potr_cl.stages.refitting.refit_options import AnyScene, arrived, colourless
 from potr_cl.stages.refitting.sliced_arrays import Layout
 from potr_cl.stages.refitting.view_kernels import RefitSweep
@@ -43,24 +43,22 @@ class Gradient:
 
     Attributes:
         errors: the squared error by W of each view, by number.
-        sums: (active coefficients,) int64.
+        sums: (active coefficients,) int64; None: they are not wanted.
         blocks: (M (M + 1) / 2, n) int64, the sums of the splats' own blocks, where they are lent.
         drawn: (N / 8, rounded up) uint8, a bit for each splat that the views draw, the lowest first, if that is asked:
             whatever the others' colours are, the sums are the same, and theirs are 0.
     """
 
     errors: dict[int, float]
-    sums: Narrowed | Lent
+    sums: Narrowed | Lent | None
     blocks: Lent | None = None
     drawn: NDArray[np.uint8] | None = None
 
     @property
     def nbytes(self) -> int:
         """Bytes that travel."""
-        return (
-            16 * len(self.errors)
-            + self.sums.nbytes
-            + sum(each.nbytes for each in (self.blocks, self.drawn) if each is not None)
+        return 16 * len(self.errors) + sum(
+            each.nbytes for each in (self.sums, self.blocks, self.drawn) if each is not None
         )
 
 
@@ -126,6 +124,7 @@ class ColourPart(Part):
         blocks: range | None,
         constant: bool,
         tell_drawn: bool = False,
+        back: bool = True,
     ) -> Gradient:
         """What these views add to :meth:`~potr_cl.stages.refitting.colour_map.ColourMap.gradient`.
 
@@ -135,6 +134,7 @@ class ColourPart(Part):
             blocks: the splats whose own blocks are wanted; see :meth:`block_rows`.
             constant: whether only the constant coefficients are active.
             tell_drawn: whether it is asked which splats the views draw.
+            back: whether sums are wanted, and not only errors.
         """
         layout = self._coefficients.layout
         self._exchange.take_flags(flags)
@@ -147,13 +147,19 @@ class ColourPart(Part):
                 marks = memory.allocate(layout.stride, "the splats that views draw")
                 self._device.fill(marks, np.uint8(0))
             look = Look(
-                self._x, self._targets, constant=constant, blocks=self._block_sums, first_block=first_block, drawn=marks
+                self._x,
+                self._targets,
+                constant=constant,
+                blocks=self._block_sums,
+                first_block=first_block,
+                drawn=marks,
+                back=back,
             )
             self._views.add_up(look)
             if tell_drawn:
                 drawn = self._drawn(marks)
         lent = self._lent_blocks() if self._block_sums is not None and self._exchange.lends else None
-        sums = self._exchange.send_sums(self._views.sums)
+        sums = self._exchange.send_sums(self._views.sums) if back else None
         return Gradient(self._views.found_errors(), sums, lent, drawn)
 
     def lend_blocks(self, splats: range) -> Lent:
@@ -208,23 +214,21 @@ class ColourPart(Part):
         self._blocks.close()
         self._block_sums = None
 
-    def normal(
-        self, direction: FloatArray | Lent, unit: float, constant: bool, part: int | None = None
-    ) -> Narrowed | Lent:
+    def normal(self, direction: FloatArray | Lent, unit: float, constant: bool, every: int = 1) -> Narrowed | Lent:
         """What these views add to :meth:`~potr_cl.stages.refitting.colour_map.ColourMap.normal`.
 
         Args:
             direction: (active coefficients,) float32. If it is lent, the sums are lent too.
             unit: it is multiplied by this.
             constant: whether only the constant coefficients are active.
-            part: of the views; None: all of them.
+            every: of so many blocks of the views' pixels one is looked at.
 
         Returns:
             (active coefficients,) int64.
         """
         self._forget_blocks()
         self._exchange.take_floats(self._direction, direction)
-        self._views.add_up(Look(self._direction, None, self._x, unit, constant, part))
+        self._views.add_up(Look(self._direction, None, self._x, unit, constant, every))
         return self._exchange.send_sums(self._views.sums)
 
 
@@ -258,24 +262,24 @@ class ColourHelpers(Owner):
         self._ask_drawn = not in_process and len(others) > 1
         self._drawn: DrawnRows | None = None
 
-    def begin_gradient(self, x: cl.Buffer, blocks: range | None, constant: bool) -> None:
-        """Have them begin with a gradient at x, and with the own blocks of some splats."""
+    def begin_gradient(self, x: cl.Buffer, blocks: range | None, constant: bool, back: bool = True) -> None:
+        """Have them begin with a gradient at x and the own blocks of some splats; or only with the error there."""
         flags: Lent | Each | NDArray[np.uint32]
         flags = (
             self._exchange.send_flags() if self._drawn is None else Each(self._drawn.take_flags(self._exchange.flags()))
         )
         sent = self._exchange.send_vector(x)
         self._x = sent if isinstance(sent, Lent) else None
-        self._pending = self._others.begin("gradient", sent, flags, blocks, constant, self._ask_drawn, anew=True)
+        self._pending = self._others.begin("gradient", sent, flags, blocks, constant, self._ask_drawn, back, anew=True)
         self._exchange.settle()
 
-    def begin_normal(self, direction: cl.Buffer, at: cl.Buffer, unit: float, constant: bool, part: int | None) -> None:
+    def begin_normal(self, direction: cl.Buffer, at: cl.Buffer, unit: float, constant: bool, every: int) -> None:
         """Have them begin with a product of the normal matrix."""
         if self._x is not None:
             self._x.lend(at)  # a part that is made again asks for it; where it was before it may have changed
         packed: Lent | Each | FloatArray
         packed = self._exchange.send_floats(direction) if self._drawn is None else Each(self._drawn.floats(direction))
-        self._pending = self._others.begin("normal", packed, unit, constant, part, logged=False)
+        self._pending = self._others.begin("normal", packed, unit, constant, every, logged=False)
 
     def begin_blocks(self, splats: range) -> None:
         """Have them begin with the own blocks of other splats than in the gradient before; only in this process."""
@@ -298,6 +302,8 @@ class ColourHelpers(Owner):
         for place, result in enumerate(results):
             errors |= result.errors if isinstance(result, Gradient) else {}
             found = result.sums if isinstance(result, Gradient) else result
+            if found is None:
+                continue
             if self._drawn is not None:
                 assert isinstance(found, Narrowed)
                 self._drawn.add_sums(sums, place, found)
@@ -352,7 +358,7 @@ class ColourHelpers(Owner):
 
 def colour_shares(pool: Pool, views: int) -> Shares:
     """Who does which of a re-fit's views; raises what :func:`potr_cl.workers.pool.shares` does."""
-    return shares(pool, views, parts_of(views), _OWN_SPEED)
+    return shares(pool, views, _OWN_SPEED)
 
 
 @contextmanager

@@ -77,9 +77,6 @@ _CHANGE, _TOTALS = 16, 32
 #: Vectors' bytes that are taken later, beside the sums of the splats' own blocks: the sums over views, and what the
 #: solution was before it was rounded; and of packed coefficients that go to other devices and come from them.
 _LATER, _EXCHANGED = 3, 3
-#: Views are divided into so many parts, every second one in each, where each has as many as are enough: with 50 in
-#: each, steps by one part cost 0.06 % of the bytes at equal PSNR on a synthetic scene, with 63 0.4 % on a real one.
-_PARTS, ENOUGH = 2, 50
 
 
 @dataclass(frozen=True)
@@ -91,7 +88,8 @@ class Look:
         targets: what pictures of coefficients should show; None: x is a direction.
         at: the coefficients, where x is a direction. unit: it is multiplied by this.
         constant: only constant coefficients: leave the sums of others alone; a direction's others are all 0.
-        part: of the views; None: all.
+        every: of so many blocks of pixels one is looked at, where x is a direction (:meth:`RefitSweep.run`).
+        back: whether sums are wanted, and not only errors.
         blocks: (M (M + 1) / 2, n) int64, to which n splats' own blocks are added. first_block: the first of these.
         drawn: (stride,) uint8, becomes 1 for each splat that any of the views draws; not where each view has splats of
             its own. None: it is not wanted.
@@ -102,7 +100,8 @@ class Look:
     at: Vector | None = None
     unit: float | None = None
     constant: bool = False
-    part: int | None = None
+    every: int = 1
+    back: bool = True
     blocks: cl.Buffer | None = None
     first_block: int = 0
     drawn: cl.Buffer | None = None
@@ -125,8 +124,6 @@ class OwnViews(Owner):
 
     Attributes:
         count: of all views.
-        parts: into how many parts views are divided, each of which shows about the same as all of them: one part where
-            they are few.
         one: what is 1 in :attr:`sums`, and in those of the splats' own blocks.
         sums: (3 M, stride) int64 in the device's memory, what the views have added to coefficients.
     """
@@ -150,13 +147,11 @@ class OwnViews(Owner):
         self.one = gathered_scale(cameras, weights)
         self._fixed_points = sweep.fixed_point_scales(cameras)
         self.count = len(cameras)
-        self.parts = parts_of(len(cameras))
         own_numbers = range(len(cameras)) if numbers is None else numbers
         source = WholeScene(rasterizer, reused=True) if reach is None else ListedSplats(rasterizer, reach)
         rooms = {number: source.room(number) for number in own_numbers}
-        # Launches, and what is gathered together, are of one part. Views of a launch have about as many splats.
-        order = sorted(own_numbers, key=lambda each: (each % self.parts, -rooms[each], each))
-        parts = [list(some) for _, some in itertools.groupby(order, lambda each: each % self.parts)]
+        # Views of a launch have about as many splats.
+        order = sorted(own_numbers, key=lambda each: (-rooms[each], each))
         # To render a picture takes many times as long as to project a view, and it takes less room.
         pictures = sum(target_bytes(cameras[number]) for number in own_numbers)
         later = layout.stride * (8 * layout.triangle + 4 * layout.columns * (_LATER + _EXCHANGED * shared))
@@ -164,13 +159,13 @@ class OwnViews(Owner):
         with ExitStack() as owned:
             self._cache = owned.enter_context(ViewCache(device, room, pictures))
             self._memory = owned.enter_context(Memory(device))
-            plan = plans.in_launches(parts, rooms, self._cache, sweep.most_views, _CHANGE + _TOTALS)
+            plan = plans.in_launches(order, rooms, self._cache, sweep.most_views, _CHANGE + _TOTALS)
             engine = ViewEngine(source, cameras, plan, _Attached, sweep.most_views)
             self._engine: ViewEngine[_Attached] = owned.enter_context(engine)
             if memory is not None:  # pictures are kept in what streamed views leave
                 self._cache.room = max(self._cache.room - self._engine.passing, 0)
             rasterizer.rest()
-            launches = sorted(self._engine.walk(), key=lambda each: each.numbers[0] % self.parts)
+            launches = list(self._engine.walk())
             ends = [0, *itertools.accumulate(len(each.numbers) for each in launches)]
             self._launches = [
                 _Own(each, range(*views), None if reach is None else self._memory.allocate(each.size, "what is cut"))
@@ -178,12 +173,7 @@ class OwnViews(Owner):
             ]
             most = max((len(each.numbers) for each in launches), default=0)
             together = min(sweep.gathered, max(len(launches), 1)) if most == 1 and reach is None else 1
-            self._gathered: list[list[list[_Own]]] = [[] for _ in range(self.parts)]
-            for own in self._launches:
-                of_part = self._gathered[own.launch.numbers[0] % self.parts]
-                if not of_part or len(of_part[-1]) == together:
-                    of_part.append([])
-                of_part[-1].append(own)
+            self._gathered = [self._launches[n : n + together] for n in range(0, len(self._launches), together)]
             at_once = together * max((each.size for each in launches), default=0)
             self._change = self._memory.allocate(_CHANGE * at_once, "the colours' change")
             self._totals = self._memory.allocate(_TOTALS * at_once, "the re-fit's sums")
@@ -196,6 +186,8 @@ class OwnViews(Owner):
             coefficients.zero(self.sums)
             sets = [each.numbers for each in launches]
             self._errors = owned.enter_context(ViewErrors(device, cameras, weights, sets))
+            numbers_of = np.array([each for some in sets for each in some], np.uint32)
+            self._numbers = self._memory.upload(numbers_of, "the views' numbers")
             ratios = [self.one * weights[each] / self._fixed_points[each] for some in sets for each in some]
             scales = self._memory.upload(np.array(ratios, np.float32), "the views' scales")
             self._kernels = ViewKernels(device, layout, rasterizer.parameters.means, scales)
@@ -217,7 +209,7 @@ class OwnViews(Owner):
         background = (0.0, 0.0, 0.0) if targets is None else self._background
         if look.x is None:
             self._coefficients.zero(self._change)  # black, and no channel is free
-        for gathered in itertools.chain(*(self._gathered if look.part is None else [self._gathered[look.part]])):
+        for gathered in self._gathered:
             every = range(gathered[0].views.start, gathered[-1].views.stop)
             for slot, own in zip(self._slots, gathered, strict=False):
                 with self._engine.ready(own.launch) as ready:
@@ -235,15 +227,20 @@ class OwnViews(Owner):
                         kernels.colour(views, picks, look.x, slot.change, colours, look.unit, look.constant)
                     scale, errors = self._fixed_points[ready.numbers[0]], self._errors.latest
                     weights = look.blocks is not None
-                    self._sweep.run(views, shapes, swept, background, target, scale, errors, slot.totals, weights)
+                    sampled = (self._numbers, own.views.start, look.every, look.back)
+                    self._sweep.run(
+                        views, shapes, swept, background, target, scale, *sampled, errors, slot.totals, weights
+                    )
                     if targets is not None:
                         if look.drawn is not None:
                             kernels.mark_drawn(views, look.drawn)
-                        # Which of them are cut, the gathering asks.
-                        self._device.copy(slot.change, colours, _CHANGE * views.stride * len(own.views))
+                        if look.back:  # which of them are cut, the gathering asks
+                            self._device.copy(slot.change, colours, _CHANGE * views.stride * len(own.views))
                         self._errors.keep(own.views)
                     place = TABLE_ENTRY * (own.views.start - every.start)
                     self._device.copy(self._tables, views.table, TABLE_ENTRY * len(own.views), place)
+            if not look.back:
+                continue
             found = SweptSums(
                 self._totals, self._change, ready.views.stride, ready.subset.numbers, self._tables, every
             )  # fmt: skip
@@ -299,11 +296,6 @@ class _Slot:
 
     change: cl.Buffer
     totals: cl.Buffer
-
-
-def parts_of(views: int) -> int:
-    """Into how many parts so many views are divided; view k is in part k modulo this."""
-    return _PARTS if views >= _PARTS * ENOUGH else 1
 
 
 def _part(buffer: cl.Buffer, number: int, parts: int) -> cl.Buffer:

@@ -28,7 +28,7 @@ from potr_cl.outputs.output import ColourGrid
 from potr_cl.stages.refitting.blocks import ROUNDS, Rounding, Steps
 from potr_cl.stages.refitting.coefficients import Vector
 from potr_cl.stages.refitting.colour_refit import ColourRefit
-from potr_cl.stages.refitting.refit_options import AnyScene, Descent, RefitOptions, Refitted
+from potr_cl.stages.refitting.refit_options import HALF, QUARTER, AnyScene, Descent, RefitOptions, Refitted
 from potr_cl.stages.refitting.solver import Solved
 from potr_cl.views.shares import HelpFrom
 from potr_cl.views.targets import Targets
@@ -41,6 +41,9 @@ _BEGINNING, _ROUNDING, _OF_FIRST_ROUNDS = 5, 7, 4
 #: What a coefficient that becomes 0 as it is rounded is worth, as a part of what one is worth that is given up before.
 #: What the others of the splat are counted on to make up for is more than they can.
 _WORTH = 0.4
+#: Pixels of all views a splat from which on half of them make the normal equations of all steps: with 150 and 200 that
+#: costs 0.3 % of the bytes at equal PSNR at the most, with 43 1.5 %.
+_DENSE = 150
 #: What is nearer to 0 than this was 0 before it was made R, G and B.
 _ZERO = 1e-6
 
@@ -105,16 +108,19 @@ def refit_colours(
             way.begin()
             report(0)
 
-        how = (refit.colour_map, targets, options.descent, options.selection, report)
+        # What steps by half of the pixels leave, the rounds take away; a file that rounds in its own way has none.
+        dense = sum(camera.width * camera.height for camera in cameras) >= _DENSE * len(scene)
+        quick = replace(options.descent, every=HALF) if dense and colour_grid is not None else options.descent
+        how = (options.selection, report)
         refit.start_from(scene.sh, active)
-        solved = refit.solver.solve(*how, check=False, after_start=begin)
+        solved = refit.solver.solve(refit.colour_map, targets, quick, *how, check=False, after_start=begin)
         result, at_start = way.finish(solved)
         # How good the solution was, the next one has measured at its start: that saves a sweep. Only if it looks bad is
         # it measured by itself, because the rounding may be what was bad. Where many colours were cut at 0 on the way,
         # it is the solution.
         if not at_start <= solved.worst and not way.error() <= solved.worst:
             refit.start_from(scene.sh, active)
-            solved = refit.solver.solve(*how, after_start=begin)
+            solved = refit.solver.solve(refit.colour_map, targets, options.descent, *how, after_start=begin)
             result, _ = way.finish(solved)
         return result
 
@@ -167,12 +173,12 @@ class _OnGrid:
             *first, last = ROUNDS
             for each in first:
                 rounding.round(solver.x, solver.blocks, each, worth)
-                gone_on = solver.go_on(colour_map, self.targets, Descent(each.steps, 0.0, ridge, part=0))
+                gone_on = solver.go_on(colour_map, self.targets, Descent(each.steps, 0.0, ridge, QUARTER))
                 steps += gone_on.steps
                 errors.append(gone_on.start)
             self.after_first()
             rounding.round(solver.x, solver.blocks, last, worth)
-            again = solver.solve(colour_map, self.targets, Descent(last.steps, 0.0, ridge, part=1), constant=True)
+            again = solver.solve(colour_map, self.targets, Descent(last.steps, 0.0, ridge, QUARTER), constant=True)
         # But for the last constant coefficients, which are rounded as the file is made.
         return Refitted(self.refit.colours(), (solved.errors[0], again.errors[1]), steps + again.steps), errors[0]
 

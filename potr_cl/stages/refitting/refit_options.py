@@ -14,6 +14,9 @@ from potr_cl.host.threads import in_background
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.stages.refitting.sliced_arrays import Ridge
 
+#: Of so many blocks of pixels one makes the normal equations: of all steps, and of shorter ways that another follows.
+HALF, QUARTER = 2, 4
+
 
 @dataclass(frozen=True)
 class Descent:
@@ -23,14 +26,14 @@ class Descent:
         steps: the most conjugate-gradient steps.
         gain: stop when a step takes less than this part off the objective.
         ridge: what holds the coefficients down or near their start.
-        part: of the views (:attr:`OwnViews.parts`) by which the normal equations are made, for a way that need not be
-            exact because another one follows, or leads less far; None: of all.
+        every: of so many blocks of the views' pixels one makes the normal equations; the gradient that they are solved
+            for is that of all pixels. 1: all do.
     """
 
     steps: int
     gain: float
     ridge: Ridge
-    part: int | None = None
+    every: int = 1
 
 
 @dataclass(frozen=True)
@@ -108,7 +111,7 @@ class RefitOptions:
         if not self.drop:
             return None
         ridge = replace(self.ridge, lam=self.selection_lam)
-        return Selection(Descent(self.selection_steps, self.gain, ridge, part=0), self.drop)
+        return Selection(Descent(self.selection_steps, self.gain, ridge, QUARTER), self.drop)
 
     @property
     def most_steps(self) -> int:

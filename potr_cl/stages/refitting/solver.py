@@ -220,12 +220,12 @@ class ColourSolver:
         if not check:
             return Solved((first.error / whole, math.nan), steps + more, start)
         # Go half the way back to the start, again and again, until x is better than the start.
-        last = self._linearise(problem, ridge)
+        last = self._measured(problem, ridge)
         for _ in range(_HALVINGS):
             if last.objective <= state.objective:
                 break
             vectors.combine(0.5, self.x, 0.5, self._start)
-            last = self._linearise(problem, ridge)
+            last = self._measured(problem, ridge)
         if not last.objective <= state.objective:
             vectors.copy(self.x, self._start)
             last, more = state, 0
@@ -233,8 +233,7 @@ class ColourSolver:
 
     def error(self, colour_map: ColourMap, targets: Targets) -> float:
         """Mean squared error at ``x``."""
-        self._coefficients.zero(self._residual)
-        return colour_map.gradient(self.x, targets, self._residual) / colour_map.total_weight
+        return colour_map.error(self.x, targets) / colour_map.total_weight
 
     def go_on(self, colour_map: ColourMap, targets: Targets, descent: Descent) -> Solved:
         """Go on from where x is, some steps that nobody checks, with the blocks of the solution before.
@@ -260,24 +259,32 @@ class ColourSolver:
     def _linearise(self, problem: _Problem, ridge: Ridge, blocks: SplatBlocks | None = None) -> _State:
         """Settle which colours are cut, and make the residual: minus half the objective's gradient at x."""
         vectors, residual = self._coefficients, self._residual
-        change, pulled = self._gradients.direction, self._gradients.product
-        shrinking = replace(ridge, prior=0.0)
         vectors.zero(residual)
         error = problem.colour_map.gradient(self.x, problem.targets, residual, blocks, problem.constant)
-        vectors.add_ridge(residual, self.x, shrinking)
+        vectors.add_ridge(residual, self.x, replace(ridge, prior=0.0))
+        penalty, change = self._penalty(ridge)
+        vectors.combine(-1.0, residual, -ridge.prior, change)
+        return _State(error, error + penalty)
+
+    def _measured(self, problem: _Problem, ridge: Ridge) -> _State:
+        """What :meth:`_linearise` would return at x."""
+        error = problem.colour_map.error(self.x, problem.targets)
+        return _State(error, error + self._penalty(ridge)[0])
+
+    def _penalty(self, ridge: Ridge) -> tuple[float, Vector]:
+        """What the ridge adds to the objective at x; and how far x is from the start."""
+        vectors, change, pulled = self._coefficients, self._gradients.direction, self._gradients.product
         vectors.zero(pulled)
-        vectors.add_ridge(pulled, self.x, shrinking)
+        vectors.add_ridge(pulled, self.x, replace(ridge, prior=0.0))
         penalty = vectors.dot(self.x, pulled)
         vectors.copy(change, self.x)
         vectors.combine(1.0, change, -1.0, self._start)
-        penalty += ridge.prior * vectors.dot(change, change)
-        vectors.combine(-1.0, residual, -ridge.prior, change)
-        return _State(error, error + penalty)
+        return penalty + ridge.prior * vectors.dot(change, change), change
 
     def _system(self, problem: _Problem, how: Descent) -> System:
         """Aᵀ W A + ridge; colours are cut at 0 as they are at the start."""
         normal = problem.colour_map.normal
-        product = partial(normal, at=self._start, ridge=how.ridge, constant=problem.constant, part=how.part)
+        product = partial(normal, at=self._start, ridge=how.ridge, constant=problem.constant, every=how.every)
         return System(product, partial(self.blocks.precondition, ridge=how.ridge))
 
     def _choose(

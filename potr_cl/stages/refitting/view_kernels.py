@@ -85,6 +85,10 @@ class RefitSweep:
         background: tuple[float, float, float],
         target: cl.Buffer | None,
         scale: float,
+        numbers: cl.Buffer,
+        first: int,
+        every: int,
+        back: bool,
         errors: cl.Buffer,
         totals: cl.Buffer,
         weights: bool,
@@ -95,6 +99,10 @@ class RefitSweep:
             views, shapes, colours, background: as of :meth:`TileSweep.run`.
             target: (pixels, 3) float32, view after view: subtracted from the pixels; None: nothing is.
             scale: the views' fixed point.
+            numbers: uint32, of views among all. first: place there of the first of these.
+            every: of so many blocks of pixels one is looked at (cl/refit/samples.clh), 1, 2 or 4; not with a target or
+                a background, for which other blocks' errors would count.
+            back: whether sums are wanted, and not only errors.
             errors: (tiles,) float32, becomes each tile's sum of squared pixel values.
             totals: (views, stride, 4) int64: weight times value, three channels, and the squared weights are added.
             weights: sum up the squared weights too.
@@ -107,6 +115,10 @@ class RefitSweep:
             target=colours if target is None else target,
             has_target=target is not None,
             scale=scale,
+            numbers=numbers,
+            first_number=first,
+            every=every,
+            back=back,
             errors=errors,
             totals=totals,
         )
