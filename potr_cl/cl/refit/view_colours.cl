@@ -7,6 +7,31 @@
 
 #include "refit/view_colours.clh"
 
+/* R, G, B of what coefficients, or a direction, are in a view. */
+inline void in_view(const vfloat *values, const VREAL *basis, vfloat *red, vfloat *green, vfloat *blue)
+{
+    vfloat sums[3] = {(vfloat)(0.0f), (vfloat)(0.0f), (vfloat)(0.0f)};
+    for (int m = 0; m < SH_COUNT; ++m)
+        for (int c = 0; c < 3; ++c)
+            sums[c] = MAD(basis[m], values[3 * m + c], sums[c]);
+    *red = sums[0] + sums[1] - sums[2];
+    *green = sums[0] + sums[2];
+    *blue = sums[0] - sums[1] - sums[2];
+}
+
+inline void store_colour(
+    vfloat red, vfloat green, vfloat blue, vfloat channels, size_t place, global float4 *colours)
+{
+#if LANES == 1
+    colours[place] = (float4)(red, green, blue, channels);
+#else
+    vfloat four[4];
+    interleave(red, green, blue, channels, four);
+    for (int k = 0; k < 4; ++k)
+        VSTORE(four[k], 4 * place + k, (global float *)colours);
+#endif
+}
+
 /* The splats' colours in each view of a set: of the coefficients themselves (direction == 0), cut at 0, w telling which
    channels are free (1, 2, 4: above 0); or their change along a direction, 0 where `free` says that the channel is cut,
    and the same w. Views that have some splats have `free` in a byte each, `free_picks`, which colours leave there.
@@ -49,11 +74,8 @@ kernel void view_colours(
 #endif
         VREAL basis[SH_COUNT];
         basis_towards(means, stride, splat, &views[number].view, basis);
-        vfloat sums[3] = {(vfloat)(0.0f), (vfloat)(0.0f), (vfloat)(0.0f)};
-        for (int m = 0; m < SH_COUNT; ++m)
-            for (int c = 0; c < 3; ++c)
-                sums[c] = MAD(basis[m], values[3 * m + c], sums[c]);
-        vfloat red = sums[0] + sums[1] - sums[2], green = sums[0] + sums[2], blue = sums[0] - sums[1] - sums[2];
+        vfloat red, green, blue;
+        in_view(values, basis, &red, &green, &blue);
         vfloat channels = (vfloat)(0.0f);
         const size_t place = number * apart / LANES + index;
         if (direction) {
@@ -90,13 +112,43 @@ kernel void view_colours(
             green = fmax(green, (vfloat)(0.0f));
             blue = fmax(blue, (vfloat)(0.0f));
         }
-#if LANES == 1
-        colours[place] = (float4)(red, green, blue, channels);
-#else
-        vfloat four[4];
-        interleave(red, green, blue, channels, four);
-        for (int k = 0; k < 4; ++k)
-            VSTORE(four[k], 4 * place + k, (global float *)colours);
-#endif
+        store_colour(red, green, blue, channels, place, colours);
     }
 }
+
+#if LANES > 1 && !PICKED
+/* What a direction adds to the splats' colours in up to four views on a CPU, whose colours are buffers of their own:
+   the four `…_free`, of which there may be more than views. */
+kernel void colour_changes(
+    global const float *coefficients,
+    global const float *means,
+    ulong stride,
+    ulong apart,
+    global const SetView *views,
+    uint view_count,
+    float unit,
+    global const float4 *first_free,
+    global const float4 *second_free,
+    global const float4 *third_free,
+    global const float4 *fourth_free,
+    global float4 *colours)
+{
+    const size_t splat = get_global_id(0);
+    vfloat values[3 * SH_COUNT];
+    for (int i = 0; i < 3 * SH_COUNT; ++i)
+        values[i] = VLOAD(splat, coefficients + i * stride);
+    for (uint number = 0; number < view_count; ++number) {
+        VREAL basis[SH_COUNT];
+        basis_towards(means, stride, splat, &views[number].view, basis);
+        vfloat red, green, blue;
+        in_view(values, basis, &red, &green, &blue);
+        global const float4 *free =
+            number == 0 ? first_free : number == 1 ? second_free : number == 2 ? third_free : fourth_free;
+        const vint kept = free_channels(free, splat);
+        red = (kept & 1) != 0 ? red * unit : (vfloat)(0.0f);
+        green = (kept & 2) != 0 ? green * unit : (vfloat)(0.0f);
+        blue = (kept & 4) != 0 ? blue * unit : (vfloat)(0.0f);
+        store_colour(red, green, blue, CONVERT_VFLOAT(kept), number * apart / LANES + splat, colours);
+    }
+}
+#endif

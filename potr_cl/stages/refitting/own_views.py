@@ -211,6 +211,7 @@ class OwnViews(Owner):
             self._coefficients.zero(self._change)  # black, and no channel is free
         for gathered in self._gathered:
             every = range(gathered[0].views.start, gathered[-1].views.stop)
+            changed = self._change_together(gathered, look)
             for slot, own in zip(self._slots, gathered, strict=False):
                 with self._engine.ready(own.launch) as ready:
                     views, picks, (shapes, colours) = ready.views, own.picks(ready), ready.geometry
@@ -218,7 +219,7 @@ class OwnViews(Owner):
                     if targets is not None:
                         kernels.colour(views, picks, look.x, colours, colours)
                         swept, target = colours, self._targets.of(own.launch.numbers, targets)
-                    elif look.x is not None:
+                    elif look.x is not None and not changed:
                         assert look.at is not None
                         anew = ready.shares or own.launch.resident is None
                         if anew and picks is None:  # which colours are cut is not known any more
@@ -245,6 +246,19 @@ class OwnViews(Owner):
                 self._totals, self._change, ready.views.stride, ready.subset.numbers, self._tables, every
             )  # fmt: skip
             kernels.gather(found, self.sums, look.constant, look.blocks, look.first_block)
+
+    def _change_together(self, gathered: Sequence[_Own], look: Look) -> bool:
+        """Enqueue what a direction adds to the colours of some launches' views, if all are there with all splats."""
+        there = [own.launch.resident for own in gathered]
+        views = [each.views for each in there if each is not None and not each.shares and each.subset.numbers is None]
+        if look.x is None or look.targets is not None or not 1 < len(views) == len(gathered):
+            return False
+        for place, each in enumerate(views):
+            self._device.copy(self._tables, each.table, TABLE_ENTRY, TABLE_ENTRY * place)
+        assert look.unit is not None
+        free = [each.colours for each in views]
+        self._kernels.changes(self._tables, views[0].stride, look.x, self._change, free, look.unit, look.constant)
+        return True
 
     def found_errors(self) -> dict[int, float]:
         """The squared error by W of each of these views after a look at coefficients, by number."""

@@ -40,9 +40,9 @@ def gathered_scale(cameras: Sequence[Camera], weights: Sequence[float]) -> float
     return float(2.0 ** math.floor(62 - math.log2(bound)))
 
 
-#: On CPUs, launches whose sums are gathered together: the coefficients' sums, which take much more than a view's, go
-#: through the memory once for so many views.
-_GATHERED = 4
+#: On CPUs, launches that are given colours, and whose sums are gathered, together: coefficients, which take much more
+#: than what is a view's, go through the memory once for so many views.
+TOGETHER = 4
 
 
 class RefitSweep:
@@ -63,7 +63,7 @@ class RefitSweep:
             for weights in (0, 1)
         ]
         self.lanes, self.most_views = self._sweeps[0].lanes, self._sweeps[0].most_views
-        self.gathered = _GATHERED if self.most_views == 1 else 1
+        self.gathered = TOGETHER if self.most_views == 1 else 1
 
     def fixed_point_scales(self, cameras: Sequence[Camera]) -> list[float]:
         """What the sums of each view are multiplied by (:func:`potr_cl.raster.sweep.fixed_point_scale`).
@@ -217,6 +217,40 @@ class ViewKernels:
         )
         together = _TOGETHER if picks is None else 1
         kernel.launch(*self._layout.items(views.stride, -(-len(views.views) // together)))
+
+    def changes(
+        self, tables: cl.Buffer, stride: int, x: cl.Buffer, result: cl.Buffer, free: Sequence[cl.Buffer], unit: float,
+        constant: bool,
+    ) -> None:  # fmt: skip
+        """Enqueue what a direction adds to the colours of up to four views that are prepared each for itself.
+
+        To bring the direction from memory takes most of the time, and they have it once.
+
+        Args:
+            tables: of the views. stride: of their splats, which are all.
+            x, unit, constant: as of :meth:`colour`.
+            result: (views, stride, 4) float32.
+            free: the colours of each.
+        """
+        kernel = self._device.shared_kernel(
+            "refit/view_colours.cl", "colour_changes", PICKED=0, **self._layout.some(constant)
+        )
+        first, second, third, fourth = [*free, *[result] * (TOGETHER - len(free))]
+        kernel.bind(
+            coefficients=x,
+            means=self._means,
+            stride=self._layout.stride,
+            apart=stride,
+            views=tables,
+            view_count=len(free),
+            unit=np.float32(unit),
+            first_free=first,
+            second_free=second,
+            third_free=third,
+            fourth_free=fourth,
+            colours=result,
+        )
+        kernel.launch(*self._layout.items(stride, 1))
 
     def mark_drawn(self, views: ViewSet, drawn: cl.Buffer) -> None:
         """Enqueue: (stride,) uint8 become 1 for each splat that any of some views draws, which have all splats."""
