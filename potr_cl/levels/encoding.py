@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -95,7 +95,7 @@ def encode_levels(
     watch("levels", 0.0)
     opened = first.device or device
 
-    @lru_cache(maxsize=2)  # a level and the one before: of a large scene, no more fit the memory
+    @cache  # each has half the splats of the one before: all together take no more than twice the first
     def read(level: int) -> Scene:
         return single.output.read(files[level], trust=True)
 
@@ -104,7 +104,7 @@ def encode_levels(
         between = measuring_views(scene, views)
         scales = scales_shown(opened, read, len(files), between, options.background)
     errors = MeasuredErrors(opened, views, scene, options.background, options.memory, between, scales)
-    pieces = output.levelled(files, errors)
+    pieces = output.levelled(files, errors, read)
     levels = [LevelMade(*each) for each in zip(counts, scales, strict=True)]
     if judge and cameras is not None and opened is not None:
         for k, scale in enumerate(scales):

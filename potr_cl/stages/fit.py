@@ -8,17 +8,20 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from contextlib import ExitStack
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 from potr_cl.errors import UsageError
 from potr_cl.host.process import first_interrupt_asks
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import Scene
 from potr_cl.model.views_between import views_between
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.discovery import Family
 from potr_cl.quality.photographs import GroundTruth
-from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Rates
 from potr_cl.stages.fitting.fit import FitOptions, FitProgress, SupportsBool, fit_scene, held_out_error, kept_pictures
 from potr_cl.stages.fitting.fitted import Fitted, LeftOut
@@ -27,7 +30,7 @@ from potr_cl.stages.fitting.settling import Looking, Settling, settle
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
 from potr_cl.views.shares import HelpFrom
-from potr_cl.views.targets import RenderedTargets, TargetPictures, Targets
+from potr_cl.views.targets import RenderedTargets, TargetPictures, Targets, targets_of
 
 #: Times the threshold of pruning up to which a fit makes up for splats, about (docs/benchmarks/findings.md): for this
 #: threshold, and for others as much more as its root is larger, because a fit brings the more, the fewer splats are
@@ -185,11 +188,14 @@ class Fit(Stage):
         bench.progress("fit", 0.0)
         with ExitStack() as stack:
             stack.callback(bench.progress, "fit", 1.0)
-            source = bench.drawable(state.source)
-            rasterizer = stack.enter_context(Rasterizer(bench.opened, source, background=bench.background))
             asked = stack.enter_context(first_interrupt_asks())
             seen = self._looking_between(state, bench)
-            rendered = RenderedTargets(rasterizer, seen.views)
+
+            def pictures(scene: Scene, views: Sequence[Camera]) -> AbstractContextManager[RenderedTargets]:
+                visibility = bench.visibility_of_source(state, views) if scene is state.source else None
+                return targets_of(bench.opened, bench.drawable(scene), views, bench.background, visibility)
+
+            rendered = stack.enter_context(pictures(state.source, seen.views))
             targets: Targets | TargetPictures = rendered
             if bench.memory is None:  # else pruning needs all that is allowed, between two fits
                 targets = stack.enter_context(kept_pictures(bench.opened, seen.views, rendered))
@@ -202,12 +208,12 @@ class Fit(Stage):
             # Others do not round as finely then as is known here.
             if asked or not (isinstance(told, Fitted) and told.spared):
                 return found
+            shown = partial(pictures, found.goal)
             if found.truth is not None:
-                rasterizer = stack.enter_context(Rasterizer(bench.opened, found.truth, background=bench.background))
-                targets = RenderedTargets(rasterizer, seen.views)
+                targets = stack.enter_context(shown(seen.views))
             if found.goal is not state.goal:
                 help_from = _help_from(bench, found)
-            looking = Looking(seen.views, seen.added, targets, rasterizer, help_from)
+            looking = Looking(seen.views, seen.added, targets, shown, help_from)
             return self._settled(found, bench, looking, asked)
 
     def _looking_between(self, state: State, bench: Workbench) -> State:

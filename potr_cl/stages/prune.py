@@ -213,7 +213,9 @@ class Prune(Stage):
         if state.scene is state.source:
             state = replace(state, visibility=visibility)
             if visibility is not None and bench.kept is not None and bench.kept.is_of(state.source):
-                bench.kept.groups = visibility.groups  # for who judges by pictures later
+                bench.kept.groups = visibility.groups  # for who judges by pictures later, and for coarser levels
+        else:
+            state = replace(state, visibility=bench.visibility_of_source(state, state.views))
         if self.keep is None and self.count is None:
             state = state.with_results(price=bench.parameters.delta_mse_max)
         return state

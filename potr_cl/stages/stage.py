@@ -30,7 +30,7 @@ from potr_cl.outputs.potr import Potr
 from potr_cl.raster.resident import ResidentScene, ResidentSubset
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.views.shares import ViewShares
-from potr_cl.views.visibility import Visibility
+from potr_cl.views.visibility import Visibility, visibility_of_large
 from potr_cl.workers.pool import Pool, Shared
 
 if TYPE_CHECKING:
@@ -228,6 +228,11 @@ class Workbench:
         if dealt is not None and dealt.views is state.views and not in_process:
             return dealt
         return self.kept if self.kept is not None and in_process and self.kept.is_of(state.source) else state.source
+
+    def visibility_of_source(self, state: State, views: Sequence[Camera]) -> Visibility | None:
+        """What views may draw of a state's source, where others were found to see little of it; else None."""
+        groups = self.kept.groups if self.kept is not None and self.kept.is_of(state.source) else None
+        return None if groups is None else visibility_of_large(state.source, views, groups)
 
     def request(self, state: State, metadata: bytes = b"", entropy: EntropyCoder | None = None) -> Request:
         """What the output is told besides the scene."""

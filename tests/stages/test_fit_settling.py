@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -30,7 +31,9 @@ def settled(device, scene, views, settling, **changes):
     bench = dataclasses.replace(Workbench(PARAMETERS, device=device), **changes)
     before = State.of(scene, views)
     with Rasterizer(device, scene) as rasterizer:
-        looking = Looking(views, 0, RenderedTargets(rasterizer, views), rasterizer)
+        looking = Looking(
+            views, 0, RenderedTargets(rasterizer, views), lambda some: nullcontext(RenderedTargets(rasterizer, some))
+        )
         then, errors = settle(before, bench, looking, settling, OPTIONS)
     return before, then, errors, bench
 

@@ -9,6 +9,7 @@ finite.
 from __future__ import annotations
 
 import dataclasses
+from contextlib import nullcontext
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,7 +76,9 @@ def _settled(device: Device, scene: Scene, view: Camera) -> float:
     bench = Workbench(_PARAMETERS, device=device)
     settling = Settling(choosing=0.5, rounding=0.5, gentle=1.0, through=1.0)
     with Rasterizer(device, scene) as rasterizer:
-        looking = Looking(views, 0, RenderedTargets(rasterizer, views), rasterizer)
+        looking = Looking(
+            views, 0, RenderedTargets(rasterizer, views), lambda some: nullcontext(RenderedTargets(rasterizer, some))
+        )
         try:
             state, _ = settle(State.of(scene, views), bench, looking, settling, _STEPS)
         except DataError:  # no file holds such a scene, and the encode says so

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 from potr_cl.codec.geometry import Geometry
@@ -23,7 +24,6 @@ from potr_cl.codec.quantisers import QUANTISERS, Balanced
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
-from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import UNROUNDED, Factors, Rates, in_form_of_files
 from potr_cl.stages.fitting.fit import FitOptions, SupportsBool, fit_scene
 from potr_cl.stages.held_out import share_out
@@ -31,7 +31,7 @@ from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.views.shares import HelpFrom
-from potr_cl.views.targets import RenderedTargets, TargetPictures, Targets
+from potr_cl.views.targets import TargetPictures, Targets
 
 #: Steps of the solution that coefficients are chosen by; the last solution, of the re-fit, takes more.
 _CHOICE_STEPS = 4
@@ -63,14 +63,14 @@ class Looking:
     Attributes:
         views: of the fit; the last ``added`` of them are not given ones. added: see there.
         targets: what these should show.
-        rasterizer: of the scene that they show.
+        pictures: of the same scene in other views.
         help_from: do some of the views of fits.
     """
 
     views: Sequence[Camera]
     added: int
     targets: Targets | TargetPictures
-    rasterizer: Rasterizer
+    pictures: Callable[[Sequence[Camera]], AbstractContextManager[Targets]]
     help_from: HelpFrom | None = None
 
 
@@ -139,6 +139,6 @@ def _with_chosen(state: State, bench: Workbench, looking: Looking) -> Scene:
     _, held_out = share_out(len(looking.views) - looking.added, looking.added)
     views = [view for number, view in enumerate(state.views) if number not in held_out]  # given ones come first in both
     options = RefitOptions(steps=_CHOICE_STEPS, drop=bench.parameters.drop, memory=bench.memory)
-    targets = RenderedTargets(looking.rasterizer, views)
-    refitted = refit_colours(bench.opened, state.scene, views, targets, options, background=bench.background)
+    with looking.pictures(views) as targets:
+        refitted = refit_colours(bench.opened, state.scene, views, targets, options, background=bench.background)
     return dataclasses.replace(state.scene, sh=refitted.sh)

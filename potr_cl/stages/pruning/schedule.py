@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
-from potr_cl.model.order import ascending
+from potr_cl.model.order import ascending, least
 
 #: The effect of what must stay.
 _BEYOND = 1e30
@@ -175,10 +175,8 @@ def choose(delta_mse: F64, importance: F64, alive: Indices, remaining: int, opti
         wanted = effect < options.delta_mse_max
         limit = options.delta_mse_max
     else:
-        cheapest = ascending(effect)[: max(len(alive) - options.count, 0)]
-        wanted = np.zeros(len(alive), bool)
-        wanted[cheapest] = True
-        limit = float(effect[cheapest[-1]]) if len(cheapest) else 0.0
+        wanted = least(effect, max(len(alive) - options.count, 0))
+        limit = float(effect[wanted].max()) if wanted.any() else 0.0
     idle = np.flatnonzero(weight == 0)
     unseen = idle[wanted[idle] & (effect[idle] == 0)]
     wanted[unseen] = False
