@@ -247,7 +247,7 @@ class Prune(Stage):
         bench.progress("prepare views", 0.0)
         with measurement(state, bench, self._sweep_options(bench.memory), visibility, spared, dealt, seen) as removal:
             course = _Course(state, removal, seen)
-            ready = removal.resident_views >= (1 - _MADE_AGAIN) * len(state.views)
+            ready = removal.ready_views >= (1 - _MADE_AGAIN) * len(state.views)
 
             def after_iteration(iteration: int) -> None:
                 while waiting and iteration + 1 >= waiting[0].after:

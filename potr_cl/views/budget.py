@@ -1,4 +1,8 @@
-"""Who decides what stays on the device: the memory that views may fill, and which groups of a plan get it.
+"""Who decides which views stay on the device: the memory that they may fill, and which groups of a plan get it.
+
+Other things than views have their own places: the uncompressed scene :mod:`potr_cl.raster.resident`, pictures
+:mod:`potr_cl.views.targets` (but what pruning compares streamed views with is :meth:`Budget.of_pictures`' matter).
+How much of what a user allows is the views' at all, :func:`potr_cl.pipeline.fallback.for_views` says.
 
 A :class:`Budget` is asked for each group, in the plan's order, how many bytes it may take (:meth:`Budget.room`), and is
 told what it has taken (:meth:`Budget.took`). A group with less room than it takes is streamed: made again whenever it

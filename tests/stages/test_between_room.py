@@ -74,7 +74,7 @@ def test_elsewhere_as_many_as_fit_with_what_each_may_draw(monkeypatch):
     views = [*own, *more[: found[some]]]
     options = SweepOptions(memory=memories[some])
     with planned_sweep(device, scene, views, options, visibility=Visibility.of(scene, views)) as removal:
-        assert removal.resident_views == len(views)
+        assert removal.ready_views == len(views)
     # More than if each view needed room for the whole scene.
     monkeypatch.setattr(visibility, "LEAST_SPLATS", 1 << 30)
     assert sum(found) > sum(rooms(device, memories)) + 3

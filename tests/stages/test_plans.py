@@ -121,8 +121,8 @@ def test_the_same_bits(kernels, grouping, residency, workers):
     """While splats go and colours change. Which views are resident is another matter: so no tile may be skipped."""
     with sweep(kernels, grouping, 0.0, residency, workers) as got:
         if workers == "one device":
-            assert residency != "nothing" or got.resident_views == 0
-            assert residency != "some" or 0 < got.resident_views < len(CAMERAS)
+            assert residency != "nothing" or got.ready_views == 0
+            assert residency != "some" or 0 < got.ready_views < len(CAMERAS)
         course(kernels).check(got)
 
 
@@ -130,7 +130,7 @@ def test_the_same_bits(kernels, grouping, residency, workers):
 def test_the_same_tiles_are_skipped(kernels, grouping):
     """By a tolerance, where all views are resident."""
     with sweep(kernels, grouping, 0.05) as got:
-        assert got.resident_views == len(CAMERAS)
+        assert got.ready_views == len(CAMERAS)
         course(kernels, 0.05).check(got)
 
 
@@ -224,7 +224,7 @@ def test_resident_views_keep_to_the_memory(device, grouping, memory):
     seen = Visibility.of(SCENE, CAMERAS)
     with planned_sweep(device, SCENE, CAMERAS, SweepOptions(0.0, memory=memory), visibility=seen) as drawn:
         totals = 16 * len(SCENE) + len(SCENE)
-        assert 0 < drawn.resident_views < len(CAMERAS)
+        assert 0 < drawn.ready_views < len(CAMERAS)
         assert device.allocated <= memory + totals
 
 
@@ -270,7 +270,7 @@ def test_copies_of_clusters_wake_one_at_a_time(kernels, grouping, monkeypatch):
     monkeypatch.setattr(SceneBuffers, "wake", woken)
     monkeypatch.setattr(SceneBuffers, "close", closed)
     with sweep(kernels, grouping, residency="some") as got:
-        assert got.resident_views > 0
+        assert got.ready_views > 0
         most.clear()
         got.measure()
     copies, together = zip(*most, strict=True)

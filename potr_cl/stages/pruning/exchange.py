@@ -1,5 +1,6 @@
-"""Totals of splats as they travel from one device to another: :class:`AlivePacking` of those that are left, where
-devices share a process; :class:`ChangedTotals` and :class:`AddedChanges` by how much they have changed, where not.
+"""Totals of splats as they are added up (:func:`add_totals`), and as they travel from one device to another:
+:class:`AlivePacking` of those that are left, where devices share a process; :class:`ChangedTotals` and
+:class:`AddedChanges` by how much they have changed, where not.
 
 A bit for each splat says whether its totals have changed, and a row has the changes of those whose bit is set. Of large
 scenes the host would take longer to compare than a device takes to measure.
@@ -29,6 +30,13 @@ _RUN, _GROUP = 64, 64
 #: Bytes of a splat's totals.
 _TOTALS = 16
 _WHAT = "the removal effects"
+
+
+def add_totals(device: Device, totals: cl.Buffer, more: cl.Buffer, splats: int, how: str = "add_totals") -> None:
+    """Enqueue: totals of so many splats += others, or -= with "subtract_totals"."""
+    kernel = device.shared_kernel("prune/add_totals.cl", how)
+    kernel.bind(totals=totals, more=more, count=2 * splats)
+    kernel.launch((-(-2 * splats // _GROUP) * _GROUP,), (_GROUP,))
 
 
 class AlivePacking(Owner):

@@ -27,8 +27,8 @@ from potr_cl.opencl.relay import Lent, Relay
 from potr_cl.raster.resident import DeviceScene, SceneHandle, scene_on, whole_on_device
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
 from potr_cl.stages.pruning.buffers import Bits
-from potr_cl.stages.pruning.exchange import AddedChanges, AlivePacking, ChangedTotals, Changes
-from potr_cl.stages.pruning.removal import F64, Indices, RemovalSweep, add_totals, planned_sweep
+from potr_cl.stages.pruning.exchange import AddedChanges, AlivePacking, ChangedTotals, Changes, add_totals
+from potr_cl.stages.pruning.removal import F64, Indices, RemovalSweep, planned_sweep
 from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.views.plan import none

@@ -32,6 +32,7 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
 from potr_cl.raster.view_set import ViewSet
 from potr_cl.stages.pruning.buffers import Bits, Ledger, PreparedSet, Survivors
+from potr_cl.stages.pruning.exchange import add_totals
 from potr_cl.stages.pruning.resident import Queues, ResidentSweep
 from potr_cl.stages.pruning.streamed import StreamedSweep
 from potr_cl.stages.pruning.sweep import FixedPoint, SweepOptions, family_of
@@ -50,7 +51,6 @@ Indices = NDArray[np.int64]
 
 #: The total that spares a splat: a ΔMSE of about 1, by the bounds of :class:`FixedPoint`; and what limits it is beyond.
 _SPARED, LARGEST_LIMIT = 1 << 58, 0.1
-_GROUP = 64
 
 
 class RemovalSweep(Owner):
@@ -75,7 +75,7 @@ class RemovalSweep(Owner):
             the device marks splats as JUST_REMOVED and calls :meth:`remove_marked`; when it marks the next ones, it
             changes the earlier marks to REMOVED.
         fixed_point: the totals' units, those of all views.
-        resident_views: how many views stay on the device, or draw nothing, or are measured by others.
+        ready_views: how many views need not be made again here: they stay, draw nothing, or others measure them.
 
     Raises:
         UsageError: no camera.
@@ -144,7 +144,7 @@ class RemovalSweep(Owner):
             self._owned = owned.pop_all()
         self._measured = self._streamed_added = False
         elsewhere = len(cameras) - len(plan.numbers) if helpers else 0
-        self.resident_views = elsewhere + len(self._engine.idle) + sum(len(ready.numbers) for ready in resident)
+        self.ready_views = elsewhere + len(self._engine.idle) + sum(len(ready.numbers) for ready in resident)
 
     def _attach(
         self, numbers: Sequence[int], subset: Subset, views: ViewSet, memory: Memory | None, target: cl.Buffer | None
@@ -345,13 +345,6 @@ class RemovalSweep(Owner):
             splats = named[seen].astype(np.int64)
         left = alive[splats]
         return splats[left], total[seen[left]] / view.pixels
-
-
-def add_totals(device: Device, totals: cl.Buffer, more: cl.Buffer, splats: int, how: str = "add_totals") -> None:
-    """Enqueue: totals of so many splats += others, or -= with "subtract_totals"."""
-    kernel = device.shared_kernel("prune/add_totals.cl", how)
-    kernel.bind(totals=totals, more=more, count=2 * splats)
-    kernel.launch((-(-2 * splats // _GROUP) * _GROUP,), (_GROUP,))
 
 
 @contextmanager
