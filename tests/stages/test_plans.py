@@ -23,7 +23,7 @@ from potr_cl.stages import prune
 from potr_cl.stages.pruning import removal
 from potr_cl.stages.pruning.controller import prune_scene
 from potr_cl.stages.pruning.helpers import measurement
-from potr_cl.stages.pruning.removal import RemovalSweep, planned_sweep
+from potr_cl.stages.pruning.removal import RemovalSweep, Wanted, planned_sweep
 from potr_cl.stages.pruning.schedule import PruningOptions
 from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.stages.stage import State, Workbench
@@ -222,7 +222,7 @@ def test_streamed_views_wait_until_they_have_lost_enough(kernels, grouping):
 def test_resident_views_keep_to_the_memory(device, grouping, memory):
     """Where it is the host's."""
     seen = Visibility.of(SCENE, CAMERAS)
-    with planned_sweep(device, SCENE, CAMERAS, SweepOptions(0.0, memory=memory), visibility=seen) as drawn:
+    with planned_sweep(device, SCENE, Wanted(CAMERAS, SweepOptions(0.0, memory=memory), visibility=seen)) as drawn:
         totals = 16 * len(SCENE) + len(SCENE)
         assert 0 < drawn.ready_views < len(CAMERAS)
         assert device.allocated <= memory + totals
@@ -232,8 +232,8 @@ def test_from_a_scene_on_the_device(device, kernels):
     """Copies are gathered there."""
     visibility = Visibility.of(SCENE, CAMERAS)
     with uploaded(device, SCENE) as whole:
-        given = (device, whole, CAMERAS, SweepOptions(0.0, turns=2), (0.0, 0.0, 0.0), visibility, None, None, SCENE)
-        with planned_sweep(*given) as got:
+        wanted = Wanted(CAMERAS, SweepOptions(0.0, turns=2), visibility=visibility)
+        with planned_sweep(device, whole, wanted, SCENE) as got:
             found = got.measure()
     with Rasterizer(device, SCENE) as rasterizer, RemovalSweep(rasterizer, CAMERAS, SweepOptions(0.0)) as wanted:
         assert np.array_equal(wanted.measure()[0], found[0])

@@ -57,7 +57,7 @@ from potr_cl.raster.scene_buffers import Drawable, uploaded
 from potr_cl.stages.pruning.buffers import Survivors
 from potr_cl.stages.pruning.controller import prune_scene
 from potr_cl.stages.pruning.exchange import AddedChanges, AlivePacking, ChangedTotals
-from potr_cl.stages.pruning.removal import planned_sweep
+from potr_cl.stages.pruning.removal import Wanted, planned_sweep
 from potr_cl.stages.pruning.schedule import PruningOptions
 from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.stages.refitting import coefficients, sliced_arrays
@@ -137,7 +137,7 @@ def view_by_view(device: Device) -> None:
         given += [(whole, None, 0.0), (whole, 0, 0.05)] if device.family == "gpu" else []
         for source, memory, tolerance in given:
             options = SweepOptions(tolerance, memory=memory)
-            with planned_sweep(device, source, views, options, visibility=visibility) as removal:
+            with planned_sweep(device, source, Wanted(views, options, visibility=visibility)) as removal:
                 removal.measure()
                 removal.remove(np.arange(0, len(scene), 5))
                 removal.measure()

@@ -206,27 +206,29 @@ class Ledger(Owner):
 
     Args:
         survivors: the scene's marks.
-        totals: (N, 2) int64 that the kernels add to, by the splats' numbers.
-        subset: the splats of the views.
+        totals: (N, 2) int64 that the kernels add to, by the splats' numbers; None: nobody asks for what they add.
+        subset: the splats of the views, n of N.
 
     Attributes:
-        marks, totals, numbers: for the kernels; no numbers: they know places only.
+        marks, totals: for the kernels: (N,) :class:`SplatState`, (N, 2) int64.
+        numbers: for GPU kernels, (n,) uint32, the splats' numbers among those N; None: they are numbered as these.
         is_local: whether :meth:`add_to` has anything to do.
     """
 
-    def __init__(self, survivors: Survivors, totals: cl.Buffer, subset: Subset) -> None:
+    def __init__(self, survivors: Survivors, totals: cl.Buffer | None, subset: Subset) -> None:
         self._survivors, self._device, self._count = survivors, survivors.device, subset.count
         self._own_numbers = subset.numbers
         self._memory = Memory(self._device)
-        self.is_local = subset.numbers is not None and self._device.family == "cpu"
+        self.is_local = subset.numbers is not None and (self._device.family == "cpu" or totals is None)
         self.marks, self.totals, self.numbers = survivors.buffer, totals, subset.numbers
-        if self.is_local:
-            stride = subset.rasterizer.stride
-            with self._device.all_or_nothing():
+        stride = subset.rasterizer.stride
+        with self._device.all_or_nothing():
+            if self.is_local:
                 alive = np.full(stride, SplatState.ALIVE, np.uint8)
-                self.marks = self._memory.upload(alive, "the splats that are left")
-                self.totals = self._memory.upload(np.zeros((stride, 4), np.uint32), "the removal effects")
-            self.numbers = None
+                self.marks, self.numbers = self._memory.upload(alive, "the splats that are left"), None
+            if self.is_local or totals is None:
+                self.totals = self._memory.allocate(16 * stride, "the removal effects")
+                self._device.fill(self.totals, np.int64(0))
 
     def take_marks(self) -> None:
         """Enqueue that the marks are those of the scene."""

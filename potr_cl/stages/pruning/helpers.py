@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -19,7 +20,6 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner, Scratch
@@ -28,7 +28,7 @@ from potr_cl.raster.resident import DeviceScene, SceneHandle, scene_on, whole_on
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
 from potr_cl.stages.pruning.buffers import Bits
 from potr_cl.stages.pruning.exchange import AddedChanges, AlivePacking, ChangedTotals, Changes, add_totals
-from potr_cl.stages.pruning.removal import F64, Indices, RemovalSweep, planned_sweep
+from potr_cl.stages.pruning.removal import F64, Indices, RemovalSweep, Wanted, planned_sweep
 from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.views.plan import none
@@ -47,31 +47,16 @@ class RemovalPart(Part):
         memory: bytes of its memory that the views may take; None: the default.
         scene: the uncompressed scene, perhaps on devices; or of it what these views may draw
             (:mod:`potr_cl.views.shares`).
-        cameras: all views.
-        options: speed/accuracy trade-offs.
-        background: R, G, B behind the scene.
-        numbers: of the views of this part, ascending.
-        visibility: of all views, where each had better be looked at with what it sees; None: with all splats.
+        wanted: what is measured, with the numbers of this part's views.
     """
 
-    def __init__(
-        self,
-        device: Device,
-        memory: int | None,
-        scene: Scene | SceneHandle,
-        cameras: Sequence[Camera],
-        options: SweepOptions,
-        background: tuple[float, float, float],
-        numbers: Sequence[int],
-        visibility: Visibility | None = None,
-    ) -> None:
-        options = SweepOptions(**{**vars(options), "memory": memory})
+    def __init__(self, device: Device, memory: int | None, scene: Scene | SceneHandle, wanted: Wanted) -> None:
+        wanted = replace(wanted, options=replace(wanted.options, memory=memory))
         with ExitStack() as owned:
             drawable = owned.enter_context(scene_on(device, scene))
-            if visibility is not None:
+            if wanted.visibility is not None:
                 drawable = owned.enter_context(whole_on_device(device, drawable))
-            sweep = planned_sweep(device, drawable, cameras, options, background, visibility, numbers)
-            self._sweep = owned.enter_context(sweep)
+            self._sweep = owned.enter_context(planned_sweep(device, drawable, wanted))
             self._alive = owned.enter_context(AlivePacking(device, self._sweep.splats, self._sweep.marks))
             self._changed: ChangedTotals | None = None
             self._owned = owned.pop_all()
@@ -272,6 +257,7 @@ def measurement(
         bench.progress("prepare views", done / count)
 
     device, pool, views = bench.opened, bench.pool, state.views
+    wanted = Wanted(views, options, bench.background, visibility, spared=spared)
     splats = len(state.scene) if seen is None else len(seen)
     share = None if pool is None else shares(pool, len(views))
     with ExitStack() as stack:
@@ -282,16 +268,16 @@ def measurement(
                 whole = stack.enter_context(whole_on_device(device, bench.drawable(scene)))
             else:
                 whole = stack.enter_context(scene_on(device, bench.scene_of(state, seen)))
-            given_all = (device, whole, views, options, bench.background, visibility, None, progress, scene, spared)
-            yield stack.enter_context(planned_sweep(*given_all))
+            yield stack.enter_context(planned_sweep(device, whole, wanted, scene, progress))
             return
-        given: list[tuple[Any, ...]] = []
+        given: list[tuple[Any, Wanted]] = []
         drawable: Drawable | None = None
+        theirs = replace(wanted, spared=None)
         if dealt is not None:
             share = dealt.dealt
             for part in dealt.shares:
                 subset = stack.enter_context(pool.shared(part.subset))
-                given.append((subset, views, options, bench.background, part.numbers, part.visibility))
+                given.append((subset, replace(theirs, numbers=part.numbers, visibility=part.visibility)))
         else:
             if pool.in_process:
                 placed: Scene | SceneHandle = bench.scene_of(state, seen)
@@ -303,15 +289,15 @@ def measurement(
                     placed = DeviceScene(drawable)
                 sent = stack.enter_context(pool.shared(placed))
             else:
-                sent, visibility = stack.enter_context(bench.shared(pool, state, seen)), None
-            given = [(sent, views, options, bench.background, numbers, visibility) for numbers in share.others]
+                sent = stack.enter_context(bench.shared(pool, state, seen))
+                theirs = replace(theirs, visibility=None)
+            given = [(sent, replace(theirs, numbers=numbers)) for numbers in share.others]
         parts = stack.enter_context(Parts(pool, RemovalPart, given, options.memory, share.names))
         numbers = None if dealt is None else [each.splats for each in dealt.shares]
         helpers = stack.enter_context(RemovalHelpers(device, splats, parts, pool, numbers))
         if drawable is not None and share.own:
-            scene = drawable if isinstance(drawable, Scene) else None
-            own = (device, drawable, views, options, bench.background, visibility, share.own, progress, scene, spared)
-            sweep = stack.enter_context(planned_sweep(*own, helpers=helpers))
+            own = replace(wanted, numbers=share.own)
+            sweep = stack.enter_context(planned_sweep(device, drawable, own, progress=progress, helpers=helpers))
         else:
             source = NoSplats(device, splats)
             sweep = stack.enter_context(RemovalSweep(source, views, options, plan=none(), helpers=helpers))

@@ -17,6 +17,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -347,18 +348,33 @@ class RemovalSweep(Owner):
         return splats[left], total[seen[left]] / view.pixels
 
 
+@dataclass(frozen=True)
+class Wanted:
+    """What is measured of a scene, of which views.
+
+    Attributes:
+        cameras: all views; the totals' units follow from them.
+        options: speed/accuracy trade-offs.
+        background: R, G, B behind the scene.
+        visibility: what the views may draw, where each had better be looked at with that; None: with all splats.
+        numbers, spared: as of :class:`RemovalSweep`.
+    """
+
+    cameras: Sequence[Camera]
+    options: SweepOptions
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    visibility: Visibility | None = None
+    numbers: Sequence[int] | None = None
+    spared: NDArray[np.bool_] | None = None
+
+
 @contextmanager
 def planned_sweep(
     device: Device,
     drawable: Drawable,
-    cameras: Sequence[Camera],
-    options: SweepOptions,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    visibility: Visibility | None = None,
-    numbers: Sequence[int] | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    wanted: Wanted,
     scene: Scene | None = None,
-    spared: NDArray[np.bool_] | None = None,
+    progress: Callable[[int, int], None] | None = None,
     helpers: RemovalHelpers | None = None,
 ) -> Iterator[RemovalSweep]:
     """A removal sweep over some views, as long as the context lasts.
@@ -366,11 +382,11 @@ def planned_sweep(
     Args:
         device: that computes.
         drawable: the uncompressed scene, perhaps on the device.
-        cameras, options, numbers, progress, spared, helpers: as of :class:`RemovalSweep`.
-        background: R, G, B behind the scene.
-        visibility: what the views may draw, where each had better be looked at with that; None: with all splats.
+        wanted: what is measured.
         scene: the uncompressed scene on the host; None: it is there only if ``drawable`` is.
+        progress, helpers: as of :class:`RemovalSweep`.
     """
+    cameras, options, visibility, numbers = wanted.cameras, wanted.options, wanted.visibility, wanted.numbers
     scene = drawable if isinstance(drawable, Scene) else scene
     memory = default_memory(device) if options.memory is None else options.memory
     meant = range(len(cameras)) if numbers is None else numbers
@@ -378,19 +394,20 @@ def planned_sweep(
         source: Rasterizer | SplatSource
         plan = None
         if visibility is not None and isinstance(drawable, SceneBuffers) and _can_name(device, options):
-            source = owned.enter_context(NamedSplats(drawable, visibility.groups.group_of, background))
+            source = owned.enter_context(NamedSplats(drawable, visibility.groups.group_of, wanted.background))
             plan = plans.by_view(visibility, cameras, meant, memory, 16 * drawable.stride)
         elif visibility is not None and scene is not None:
             clusters = visibility.clusters(numbers)
-            source = owned.enter_context(CopiedSplats(device, scene, drawable, background))
+            source = owned.enter_context(CopiedSplats(device, scene, drawable, wanted.background))
             if device.family == "cpu":
                 plan = plans.as_drawn(source, cameras, clusters, memory, progress)
                 progress = None  # that was most of it
             else:
                 plan = plans.by_cluster(clusters, memory, scene.nbytes // max(len(scene), 1))
         else:
-            source = owned.enter_context(Rasterizer(device, drawable, background=background))
-        yield owned.enter_context(RemovalSweep(source, cameras, options, progress, numbers, plan, spared, helpers))
+            source = owned.enter_context(Rasterizer(device, drawable, background=wanted.background))
+        sweep = RemovalSweep(source, cameras, options, progress, numbers, plan, wanted.spared, helpers)
+        yield owned.enter_context(sweep)
 
 
 def _can_name(device: Device, options: SweepOptions) -> bool:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.stages.pruning.buffers import Ledger, PreparedSet, Survivors
-from potr_cl.stages.pruning.sweep import FixedPoint, SetKernels, SweepBuffers, SweepLauncher, SweepOptions, family_of
+from potr_cl.stages.pruning.sweep import FixedPoint, SetKernels, SweepOptions, TileLists, family_of
 from potr_cl.views.engine import ViewEngine
 
 T = TypeVar("T")
@@ -159,16 +159,10 @@ class ResidentSweep(Owner):
                 self._tiles = memory.allocate(4 * self._firsts[-1], "the tiles to sweep")
                 self._stale = memory.allocate(4 * self._firsts[-1], "the tiles' staleness")
                 self._listed = memory.allocate(4 * len(sets), "the numbers of tiles to sweep")
-                launcher: SweepLauncher | None = None
+                lists = TileLists(self._tiles, self._stale, self._listed)
                 for place, (ready, ledger) in enumerate(zip(sets, ledgers, strict=True)):
-                    if launcher is None or ready.subset is not sets[place - 1].subset:
-                        launcher = SweepLauncher(ready.subset.rasterizer, options, fixed_point)
                     ready.work.first_tile = self._firsts[place]
-                    buffers = SweepBuffers(
-                        ledger.marks, self._tiles, self._stale, self._listed, ledger.totals, ledger.numbers
-                    )
-                    bound = launcher.bind(ready.work, ready.geometry, buffers, first_time=True, place=place)
-                    self._kernels.append(bound)
+                    self._kernels.append(SetKernels(ready, ledger, lists, options, fixed_point, True, place))
             self.list_everything()
 
     def list_stale(self) -> None:
