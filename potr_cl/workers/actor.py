@@ -212,16 +212,11 @@ class WorkerActor:
 
     def make(self, number: int, kind: type[Part], memory: int | None, given: Sequence[Any]) -> None:
         """Make a part."""
-        device = _device(self._place)
-        things = [each.of(self._known[each.handle.number]) if isinstance(each, Shared) else each for each in given]
-        # A failure may leave buffers behind that nobody owns any more.
-        with device.all_or_nothing(), device.errors("failed while encoding"):
-            self._parts[number] = kind(device, memory, *things)
+        self._parts[number] = kind.made(_device(self._place), memory, given, lambda known: self._known[known.number])
 
     def run(self, number: int, command: str, args: Sequence[Any]) -> Any:
         """Give a part a command."""
-        with _device(self._place).errors("failed while encoding"):
-            return getattr(self._parts[number], command)(*args)
+        return self._parts[number].told(_device(self._place), command, args)
 
     def drop(self, number: int) -> None:
         """Give a part's memory back."""

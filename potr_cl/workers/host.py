@@ -11,12 +11,12 @@ from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from potr_cl.errors import UsageError
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import DeviceInfo, choose_devices
+from potr_cl.opencl.memory import Owner
 from potr_cl.workers.pool import Held, Part, Pool, Shared, Traffic, Worker, tell_of_kinds
 
 if TYPE_CHECKING:
@@ -86,11 +86,8 @@ class DeviceThread(Worker):
 
     def make(self, kind: type[Part], memory: int | None, given: Sequence[Any]) -> Future[Held]:
         def made() -> Held:
-            # A failure may leave buffers behind that nobody owns any more.
-            with self._device.all_or_nothing(), self._device.errors("failed while encoding"):
-                things = [each.of(each.handle) if isinstance(each, Shared) else each for each in given]
-                part = kind(self._device, memory, *things)
-                return _HeldHere(self._thread, threading.get_ident(), self._device, part)
+            part = kind.made(self._device, memory, given)
+            return _HeldHere(self._thread, threading.get_ident(), self._device, part)
 
         return self._thread.submit(made)
 
@@ -105,11 +102,7 @@ class _HeldHere(Held):
         self._thread, self._ident, self._device, self._part = thread, ident, device, part
 
     def begin(self, command: str, args: Sequence[Any]) -> Future[Any]:
-        def done() -> Any:
-            with self._device.errors("failed while encoding"):
-                return getattr(self._part, command)(*args)
-
-        return self._thread.submit(done)
+        return self._thread.submit(self._part.told, self._device, command, args)
 
     def close(self) -> None:
         if threading.get_ident() == self._ident:  # it has just been made there, and nobody wants it any more
@@ -125,7 +118,7 @@ ClusterSource: TypeAlias = "str | Client | None"
 
 
 @dataclass(frozen=True)
-class Workers(AbstractContextManager["Workers"]):
+class Workers(Owner):
     """What computes.
 
     Attributes:
@@ -145,11 +138,6 @@ class Workers(AbstractContextManager["Workers"]):
         """Leave the workers."""
         if self.pool is not None:
             self.pool.close()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def open_workers(devices: DevicesSource = None, cluster: ClusterSource = None) -> Workers:

@@ -9,15 +9,21 @@ from __future__ import annotations
 import logging
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from potr_cl.errors import DeviceError
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+
+_FAILED = "failed while encoding"
 
 
 class WorkerLost(DeviceError):
@@ -49,6 +55,22 @@ class Part(Owner, ABC):
 
     @abstractmethod
     def __init__(self, device: Device, memory: int | None, *given: Any) -> None: ...
+
+    @classmethod
+    def made(
+        cls, device: Device, memory: int | None, given: Sequence[Any], known: Callable[[Any], Any] = lambda thing: thing
+    ) -> Self:
+        """A part on this device, of what was given; ``known`` finds what was shared by its handle."""
+        # A failure may leave buffers behind that nobody owns any more.
+        with device.all_or_nothing(), device.errors(_FAILED):
+            return cls(
+                device, memory, *(each.of(known(each.handle)) if isinstance(each, Shared) else each for each in given)
+            )
+
+    def told(self, device: Device, command: str, args: Sequence[Any]) -> Any:
+        """What a command returns, on the device that the part is on."""
+        with device.errors(_FAILED):
+            return getattr(self, command)(*args)
 
 
 class Held(ABC):
@@ -145,7 +167,7 @@ class Traffic:
                 self.of[what] = Went(before.answers + answers, before.sent + sent, before.received + received)
 
 
-class Pool(ABC):
+class Pool(Owner, ABC):
     """Workers that share a work.
 
     Attributes:
@@ -194,12 +216,6 @@ class Pool(ABC):
     @abstractmethod
     def close(self) -> None:
         """Leave the workers; none of them goes on working for this pool."""
-
-    def __enter__(self) -> Pool:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     @property
     @abstractmethod

@@ -22,7 +22,6 @@ from potr_cl.raster.sweep import totals_limits
 from potr_cl.raster.view_set import View, ViewSet
 from potr_cl.views.subsets import Subset
 
-Indices = NDArray[np.int64]
 Bits = NDArray[np.uint8]
 
 #: Work-items of a work-group of the kernels that turn marks to bits and back; each has eight splats.
@@ -40,13 +39,10 @@ class SplatState(IntEnum):
 
 
 class Survivors(Owner):
-    """The state of each splat. Host and device have one copy each, and :meth:`settle` makes them agree.
-
-    The host is ahead after :meth:`remove`, until the kernels that look for JUST_REMOVED are done. The device is ahead
-    after it has marked splats itself (:meth:`marked_by_device`).
+    """The state of each splat, on the device; the host has a copy, which :meth:`settle` brings up to date.
 
     Args:
-        device: that has the copy.
+        device: that has them.
         splats: N.
         stride: N padded; the buffer holds so many, and all are alive at first.
         wait: returns once the device has finished what was enqueued.
@@ -57,10 +53,8 @@ class Survivors(Owner):
 
     def __init__(self, device: Device, splats: int, stride: int, wait: Callable[[], None]) -> None:
         self.device = device
-        self._splats = splats
-        self._wait = wait
+        self._splats, self._wait, self._are_marked = splats, wait, False
         self._states = np.full(stride, SplatState.ALIVE, np.uint8)
-        self._host_is_ahead = self.device_is_ahead = False
         self._memory = Memory(device)
         self.buffer = self._memory.upload(self._states, "the splats that are left")
 
@@ -71,22 +65,12 @@ class Survivors(Owner):
         alive: NDArray[np.bool_] = self._states[: self._splats] == SplatState.ALIVE
         return alive
 
-    def remove(self, splats: Indices) -> None:
-        """Remove splats. On the device they are JUST_REMOVED until the next :meth:`settle`."""
-        self.settle()
-        self._states[splats] = SplatState.JUST_REMOVED
-        self.device.copy(self.buffer, self._states)
-        self._states[splats] = SplatState.REMOVED
-        self._host_is_ahead = True
-
     def mark(self, splats: Bits) -> None:
-        """Mark splats on the device as JUST_REMOVED, as a controller there does; :meth:`marked_by_device` follows.
+        """Mark splats as JUST_REMOVED, as a controller on the device does; :meth:`are_marked` follows.
 
         Args:
             splats: as :meth:`just_marked` gives them.
         """
-        if self._host_is_ahead:
-            self.settle()
         with Memory(self.device) as memory:
             bits = memory.upload(splats, "the splats that go")
             self._launch("mark_bits", bits)
@@ -105,21 +89,18 @@ class Survivors(Owner):
         kernel.bind(states=self.buffer, splats=self._splats, bits=bits)
         kernel.launch((-(-self._splats // (8 * _GROUP)) * _GROUP,), (_GROUP,))
 
-    def marked_by_device(self) -> None:
-        """Note that the device has changed states from ALIVE to JUST_REMOVED, and that the host does not know which."""
-        self.device_is_ahead = True
+    def are_marked(self) -> None:
+        """Note that splats have been marked, and that the host does not know which."""
+        self._are_marked = True
 
     def settle(self) -> None:
         """Make host and device agree on the splats that are left; none is JUST_REMOVED afterwards."""
-        if self._host_is_ahead:
-            self._host_is_ahead = False
-            self._wait()
-        elif self.device_is_ahead:
-            self.device_is_ahead = False
-            self._states = self.device.download(self.buffer, self._states.shape, np.uint8)
-            self._states[self._states == SplatState.JUST_REMOVED] = SplatState.REMOVED
-        else:
+        if not self._are_marked:
             return
+        self._are_marked = False
+        self._wait()
+        self._states = self.device.download(self.buffer, self._states.shape, np.uint8)
+        self._states[self._states == SplatState.JUST_REMOVED] = SplatState.REMOVED
         self.device.copy(self.buffer, self._states)
 
 

@@ -94,12 +94,7 @@ class RemovalPart(Part):
 
     def remove_marked(self, splats: Bits) -> None:
         """Take splats out for good, a bit each (:meth:`Survivors.just_marked`)."""
-        if self._sweep.steering is None:
-            marked = np.unpackbits(splats, count=self._sweep.splats, bitorder="little")
-            self._sweep.remove(np.flatnonzero(marked))
-        else:
-            self._sweep.mark(splats)
-            self._sweep.remove_marked()
+        self._sweep.remove_bits(splats)
         self._alive.note()
 
     def replace_sh(self, sh: FloatArray) -> None:

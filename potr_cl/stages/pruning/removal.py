@@ -218,21 +218,21 @@ class RemovalSweep(Owner):
                 add_totals(self.device, self.totals, self._own, self.splats)
 
     def remove_marked(self) -> None:
-        """Take the splats out that are marked JUST_REMOVED."""
+        """Take the splats out that are marked JUST_REMOVED; note how much each tile loses."""
         if self._helpers is not None:
             # They go on with it while this device does its own, and whoever tells them more waits for them.
             self._helpers.remove(self._survivors.just_marked())
         self._resident.note_removal()
-        self._survivors.marked_by_device()
+        self._survivors.are_marked()
         if self._helpers is not None:
             self._helpers.are_left(self.marks)
 
-    def mark(self, splats: Bits) -> None:
-        """Mark splats that a controller elsewhere has chosen, as its :meth:`just_marked` gives them.
-
-        :meth:`remove_marked` follows.
-        """
+    def remove_bits(self, splats: Bits) -> None:
+        """Take splats out that a controller elsewhere has chosen, (N / 8, rounded up) uint8, the lowest first."""
+        self._see_targets()
+        self._resident.prepare_removal()
         self._survivors.mark(splats)
+        self.remove_marked()
 
     # ----------------------------------------------------------------------------------- for a controller on the host
 
@@ -251,17 +251,10 @@ class RemovalSweep(Owner):
         return self.device.download(self.totals, (self.splats, 2), np.int64)
 
     def remove(self, splats: Indices) -> None:
-        """Take splats, (n,) by number, out of all lists; note how much each tile loses."""
-        if self._helpers is not None:
-            gone = np.zeros(self.splats, bool)
-            gone[splats] = True
-            self._helpers.remove(np.packbits(gone, bitorder="little"))
-        self._see_targets()
-        self._resident.prepare_removal()
-        self._survivors.remove(splats)
-        self._resident.note_removal()
-        if self._helpers is not None:
-            self._helpers.are_left(self.marks)
+        """Take splats, (n,) by number, out of all lists."""
+        gone = np.zeros(self.splats, bool)
+        gone[splats] = True
+        self.remove_bits(np.packbits(gone, bitorder="little"))
 
     def replace_sh(self, sh: FloatArray) -> None:
         """Continue with other colours, (N, M, 3) float32 of the same degree. The target pictures stay as they are."""
