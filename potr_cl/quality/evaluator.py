@@ -90,15 +90,8 @@ class Evaluator(Judging):
     """Compares candidates with one uncompressed scene.
 
     Args:
-        device: to render on.
-        scene: the uncompressed one.
-        views: to judge by.
-        background: behind both.
         pool: workers that the views are shared out to, of which ``device`` is the first; None: the device does all.
         remember: whether the scene's pictures are kept for the next candidate.
-
-    Attributes:
-        device, views: as given.
 
     Raises:
         DeviceError: the kernels cannot be built.
@@ -166,11 +159,8 @@ def judge_by_photographs(
     """Judge a scene and its file by photographs of test views; where no test view has one, of training views.
 
     Args:
-        ground_truth: the photographs.
         cameras: all of the scene's.
         scenes: uncompressed, and as a decoder sees the file.
-        device: to render on.
-        background: behind both.
         pool: workers that views are shared out to, if they are devices of this computer, which has the photographs.
 
     Raises:

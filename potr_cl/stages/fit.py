@@ -329,10 +329,7 @@ class Fit(Stage):
 
 def _help_from(bench: Workbench, state: State) -> HelpFrom | None:
     """Who helps to fit to the pictures of a state's goal."""
-    pool, kept = bench.pool, bench.kept
-    if pool is None:
+    pool, goal = bench.pool, state.goal
+    if pool is None or not (pool.in_process or pool.has(goal) or goal.nbytes <= _SENT_ANYWAY):
         return None
-    if not pool.in_process and not pool.has(state.goal) and state.goal.nbytes > _SENT_ANYWAY:
-        return None
-    there = kept is not None and pool.in_process and kept.is_of(state.goal)
-    return HelpFrom(pool, kept if kept is not None and there else state.goal)
+    return HelpFrom(pool, bench.as_shared(goal))

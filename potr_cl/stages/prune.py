@@ -160,7 +160,7 @@ class Prune(Stage):
             hidden, area = unseen or find_unseen(state, groups, pool.map)
             visibility = visibility_of_large(state.scene, state.views, groups, pool.map) if likely else None
             groups = None
-            if visibility is not None and (bench.pool is None or bench.pool.in_process):
+            if visibility is not None and bench.all_here:
                 visibility = visibility.lasting()
         splats = int(np.count_nonzero(hidden))
         kept = self.unseen == "keep" and self.keep is None and self.count is None
@@ -169,12 +169,8 @@ class Prune(Stage):
         if not (kept and splats):
             return self._pruned(told, bench, visibility)
         # A copy of a large scene without them would take as much memory as the scene.
-        if (
-            visibility is not None
-            and (bench.pool is None or bench.pool.in_process)
-            and not bench.interludes
-            and bench.parameters.delta_mse_max < LARGEST_LIMIT
-        ):
+        little = not bench.interludes and bench.parameters.delta_mse_max < LARGEST_LIMIT
+        if visibility is not None and bench.all_here and little:
             return self._pruned(told, bench, visibility, hidden=hidden)
         seen = np.flatnonzero(~hidden)
         if not len(seen):
@@ -203,7 +199,7 @@ class Prune(Stage):
             likely = seen_part(state.scene, state.views) <= MOST_SEEN
             groups = groups_of_large(state.scene, pool.map) if likely else None
             visibility = visibility_of_large(state.scene, state.views, groups, pool.map)
-            if visibility is not None and (bench.pool is None or bench.pool.in_process):
+            if visibility is not None and bench.all_here:
                 visibility = visibility.lasting()
         told = self._told(state, bench, visibility).with_results(unseen=unresolved)
         return self._pruned(told, bench, visibility)
@@ -229,7 +225,6 @@ class Prune(Stage):
         """The state after pruning.
 
         Args:
-            state, bench: of the stage.
             visibility: what the views see of the splats that are pruned.
             seen: (n,) numbers of these, ascending; None: all of the state's scene, where the measurement spares hidden
                 ones.
@@ -237,7 +232,7 @@ class Prune(Stage):
         """
         spared = hidden if seen is None else None
         dealt = None
-        if visibility is not None and bench.pool is not None and not bench.pool.in_process:
+        if visibility is not None and bench.pool is not None and not bench.all_here:
             dealt = _dealt(state, seen, bench.pool, visibility)
             state = state.with_results(shares=dealt)
         unresolved = state.results.unresolved

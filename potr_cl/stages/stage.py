@@ -221,13 +221,21 @@ class Workbench:
         with pool.shared(state.source if state.is_cut else state.scene) as whole:
             yield whole if numbers is None else Shared(whole.handle, numbers.astype(np.uint32))
 
+    @property
+    def all_here(self) -> bool:
+        """Whether nobody of another process works on it."""
+        return self.pool is None or self.pool.in_process
+
     def shared_source(self, state: State) -> Scene | ResidentScene | ViewShares:
         """A state's source for the pool's workers; where they have what their views see already, that."""
-        in_process = self.pool is not None and self.pool.in_process
         dealt = state.results.shares
-        if dealt is not None and dealt.views is state.views and not in_process:
+        if dealt is not None and dealt.views is state.views and not self.all_here:
             return dealt
-        return self.kept if self.kept is not None and in_process and self.kept.is_of(state.source) else state.source
+        return self.as_shared(state.source)
+
+    def as_shared(self, scene: Scene) -> Scene | ResidentScene:
+        """A scene for the pool's workers, or where they have it already."""
+        return self.kept if self.kept is not None and self.all_here and self.kept.is_of(scene) else scene
 
     def request(self, state: State, metadata: bytes = b"", entropy: EntropyCoder | None = None) -> Request:
         """What the output is told besides the scene."""

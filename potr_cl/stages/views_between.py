@@ -53,7 +53,6 @@ def needed(shown_by: float, views: int, slow: bool) -> float:
 
     Args:
         shown_by: how many training views show the scene where few do, as :func:`views_where_few` finds it.
-        views: the number of training views.
         slow: whether a CPU has to look at them.
     """
     few = shown_by < _FEW and not slow
@@ -125,8 +124,8 @@ def room_for(added: Sequence[Camera], state: State, bench: Workbench) -> int:
 
 def _by_view(state: State, bench: Workbench) -> bool:
     """Whether views that do not fit are made again in batches."""
-    shared = bench.pool is None or bench.pool.in_process
-    return shared and bench.opened.family == "gpu" and fits_whole(bench.opened, bench.drawable(state.source))
+    device = bench.opened
+    return bench.all_here and device.family == "gpu" and fits_whole(device, bench.drawable(state.source))
 
 
 def _nbytes_by_view(state: State, views: Sequence[Camera]) -> float:
@@ -206,7 +205,6 @@ class Added:
     """What the stage has added.
 
     Attributes:
-        given: the number of training views that were given.
         added: of views between them.
         shown_by: how many given views at most show the quarter of the scene that the fewest show; None if nobody asked,
             or they show nothing.

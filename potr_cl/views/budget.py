@@ -41,7 +41,6 @@ class ViewCache(Owner):
     one projection, which is made again whenever it is needed.
 
     Args:
-        device: that they are prepared on.
         budget: bytes that they may take.
         others: bytes of the budget for which others have more use than views have for geometry of their own.
 
@@ -147,7 +146,6 @@ def free_memory(device: Device, later: int = 0) -> float:
     """Bytes that the views may take beside what is there: two fifths of what is free, or a quarter of the host's.
 
     Args:
-        device: that they are prepared on.
         later: bytes that others will take, which the views leave free.
     """
     free = device.info.memory - device.allocated
@@ -243,7 +241,6 @@ class NamedBudget(Budget):
     Args:
         memory: in all.
         groups: the views, in their order.
-        cameras: all views.
         totals: bytes of what they measure together.
 
     Attributes:

@@ -53,8 +53,6 @@ class Ready(Generic[W]):
 
     Attributes:
         numbers: of the views among all.
-        subset: the splats.
-        views: projection and lists.
         work: what the use has made of it.
         geometry: shapes and colours, its own or, where it has none, those that it shares with other sets.
     """
@@ -103,7 +101,6 @@ class ViewEngine(Owner, Generic[W]):
 
     Args:
         source: of the groups' splats; the engine's from now on.
-        cameras: all views.
         plan: of those that are looked at here.
         attach: makes the use's work of numbers, subset and prepared views, which are the work's to close from then on.
         most_views: how many views one launch can do.

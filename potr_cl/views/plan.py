@@ -124,7 +124,6 @@ def by_view(
 
     Args:
         visibility: of all views.
-        cameras: all views.
         numbers: of those that are meant.
         memory: bytes of the device's that they may take.
         totals: bytes of what is summed up beside that.
@@ -151,7 +150,6 @@ def neighbours(
     Args:
         others: single views, in an order in which neighbours see much of the same.
         counts: (G,) splats of each cell.
-        cameras: all views.
         passing: bytes that a group may take while it is there.
     """
     found: list[ViewGroup] = []
@@ -191,7 +189,6 @@ def as_drawn(
 
     Args:
         source: fills what is projected to find these.
-        cameras: all views.
         clusters: of those that are meant.
         memory: bytes of the device's that they may take.
         progress: called with the views whose splats are found, and their number.

@@ -50,12 +50,9 @@ class Subset:
     """The splats of a group, on the device.
 
     Attributes:
-        rasterizer: of these.
-        count: how many they are.
         numbers: (count,) uint32 in the device's memory, their numbers in the scene, ascending; None: they are all. With
             splats of each view's own, (views, count).
         splats: the same on the host, where they are copied.
-        scene: the copy.
     """
 
     rasterizer: Rasterizer
@@ -69,7 +66,6 @@ class SplatSource(Owner, ABC):
     """Gives groups their splats, in the colours that they have by now.
 
     Attributes:
-        device: where.
         splats: N, of the scene. stride: N padded.
         selects: whether a group that is opened for those that are left has no others.
         copies: whether it wants to know on the host which splats are left.
@@ -97,7 +93,6 @@ class SplatSource(Owner, ABC):
 
         Args:
             stack, memory: own what is taken.
-            group: the group.
             left: take only these; None: all.
         """
 
@@ -137,12 +132,7 @@ class SplatSource(Owner, ABC):
 
 
 class NoSplats(SplatSource):
-    """Of a device that looks at no view itself.
-
-    Args:
-        device: the device.
-        splats: N.
-    """
+    """Of a device that looks at no view itself."""
 
     def __init__(self, device: Device, splats: int) -> None:
         self.device, self.splats, self.stride = device, splats, stride_of(splats)
@@ -203,9 +193,7 @@ class NamedSplats(_Parted):
     """Splats of a scene that lies whole on a GPU, by their numbers.
 
     Args:
-        whole: the scene.
         group_of: (N,) the cell of each splat.
-        background: R, G, B behind the scene.
     """
 
     def __init__(
@@ -302,10 +290,8 @@ class CopiedSplats(_Parted):
     """Copies of splats, from the host or from a scene on the device.
 
     Args:
-        device: where they go.
         scene: the scene on the host.
         whole: the same to be drawn, perhaps on the device already.
-        background: R, G, B behind the scene.
     """
 
     copies = True

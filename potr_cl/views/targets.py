@@ -53,7 +53,6 @@ class Targets(Protocol):
         """Write the pictures of several views to device memory.
 
         Args:
-            numbers: of the views.
             buffer: takes (H, W, 3) float32 of each, one behind the other.
             start: byte where they begin.
         """
@@ -65,8 +64,6 @@ class RenderedTargets:
     """The pictures that another scene gives: the uncompressed one's.
 
     Attributes:
-        rasterizer: of that scene.
-        cameras: the views.
         picks: what each of them may draw, where the rasterizer goes by that.
     """
 
@@ -118,9 +115,7 @@ class PhotographTargets:
     """Photographs, read anew whenever they are asked for.
 
     Attributes:
-        device: that they go to.
         photographs: of all the cameras.
-        cameras: the views.
     """
 
     device: Device
@@ -145,11 +140,6 @@ class HostTargets(Owner):
     """The pictures of others, asked for once and kept on the host: what made them can go.
 
     Where memory is bounded, many of them lie in a temporary file (:mod:`potr_cl.host.mapped`).
-
-    Args:
-        device: that computes.
-        targets: give the pictures.
-        cameras: the views.
 
     Raises:
         PotrError: there is no room for them.
@@ -198,14 +188,8 @@ class PicturesAhead(Owner):
     A CPU renders none: it has other things to do.
 
     Args:
-        source: the scene.
-        background: R, G, B behind it.
-        cameras: all views.
         numbers: of the views whose pictures each device will be asked for.
         visibility: what each view may draw, where no view sees much of the scene.
-
-    Attributes:
-        source: as given.
     """
 
     def __init__(
@@ -315,8 +299,6 @@ class TargetPictures(Owner):
     """Pictures that are asked for again and again. They are kept on the device after their first use.
 
     Args:
-        device: whose memory it is.
-        cameras: the views.
         budget: that the pictures which are kept are taken from.
         targets: give them, until others are named (:meth:`fill`, :meth:`of`).
         sets: of views that will be asked for, always together: there is room for the largest in any case. None: views
@@ -355,7 +337,6 @@ class TargetPictures(Owner):
         """(pixels, 3) float32, what some views should show, one behind the other; valid until the next call.
 
         Args:
-            numbers: of the views.
             targets: as of :meth:`fill`. Others than before take the place of what was kept.
         """
         self._show(targets)

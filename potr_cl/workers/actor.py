@@ -31,12 +31,9 @@ class ClusterWorker(Worker):
     """One of Dask's workers, with a actor for this pool.
 
     Args:
-        pool: that it is of.
-        name: its address.
         place: its number among the workers of its computer.
 
     Attributes:
-        host: the computer.
         device, digits: the name of its device and how it rounds, once it has been met.
     """
 
@@ -132,11 +129,7 @@ class ClusterWorker(Worker):
 
 
 class WorkerFailed(DeviceError):
-    """Something else than this package failed on a worker.
-
-    Attributes:
-        said: what it says.
-    """
+    """Something else than this package failed on a worker."""
 
     def __init__(self, address: str, said: str) -> None:
         super().__init__(f"worker {address} failed ({said})")

@@ -51,7 +51,6 @@ class ClusterPool(Pool):
     Args:
         cluster: the scheduler's address, or a client of it, which stays the caller's.
         first: the master's device.
-        patience: see :class:`potr_cl.workers.pool.Pool`.
 
     Raises:
         UsageError: Dask is not installed, no scheduler answers there, no worker comes, or one cannot do the work.
@@ -153,8 +152,6 @@ class ClusterPool(Pool):
         """What a worker answers.
 
         Args:
-            answer: a future of Dask's.
-            address: of the worker.
             most: seconds to wait.
 
         Raises:

@@ -22,7 +22,6 @@ class Helping(Owner):
     """The parts, as long as there are any.
 
     Args:
-        device: the master's.
         verb: what they help to do, for a message.
 
     Attributes:

@@ -122,7 +122,6 @@ class Workers(Owner):
     """What computes.
 
     Attributes:
-        device: the first device.
         pool: where there is more than one device; else None.
     """
 

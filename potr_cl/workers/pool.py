@@ -176,7 +176,6 @@ class Pool(Owner, ABC):
         sparse: whether workers send what has changed, and not all of it: worth its time where bytes travel slowly.
         in_process: whether workers are threads of this process: what lies on a device can then be lent
             (:mod:`potr_cl.opencl.relay`), and goes to another device without a stay on the host.
-        traffic: so far.
         patience: seconds, or ten times as long as the others took if that is longer, after which a worker that alone
             has not answered counts as lost; None: workers are waited for.
     """
@@ -241,8 +240,6 @@ def shares(pool: Pool, views: int, parts: int = 1, own_speed: float = 1.0) -> Sh
     """Share so many views out to a pool.
 
     Args:
-        pool: the workers.
-        views: how many there are.
         parts: view k belongs to part k modulo this: each part alone is shared out in the same way.
         own_speed: of the master against a worker, if it takes part.
 
@@ -268,7 +265,6 @@ def deal(views: int, speeds: Sequence[float], first: int = 0) -> list[list[int]]
     where there are fewer views than workers.
 
     Args:
-        views: how many there are.
         speeds: of the workers, above 0.
         first: number of the worker, modulo how many they are, who is asked first: it gets what is left over.
     """

@@ -120,10 +120,8 @@ class Sight:
     """What a fit looks at.
 
     Attributes:
-        cameras: the views.
         targets: the picture that each of them should show; pictures that are kept already stay so.
         added: how many of the views, the last ones, lie between those that were given: they are never held out.
-        background: R, G, B behind the scene.
         help_from: do some of the views; the result is the same.
         judges: numbers of the views to judge by; None: some of the given ones are held out.
         fit_to: numbers of the views to look at; None: those that do not judge.
@@ -160,9 +158,7 @@ def fit_scene(
     """Fit all parameters of a scene to pictures of some views.
 
     Args:
-        device: to compute on.
         scene: where the fit begins.
-        sight, options, following: of the fit.
         factors: what a file will round shapes and opacities with. All is looked at as it is rounded, but what comes of
             it is not. The scene as :class:`potr_cl.stages.fitting.adam.Adam` takes it then.
 
@@ -203,7 +199,6 @@ def kept_pictures(
     """Target pictures for several fits to the same views, as many as there is room for; the caller closes them.
 
     Args:
-        device: whose memory it is.
         cameras, targets: as of :class:`Sight`.
         memory: bytes of device memory that they may take; None: a quarter of what is free.
     """
@@ -271,9 +266,7 @@ class Judges(Owner):
     """Views that are held out of a fit.
 
     Args:
-        device: to compute on.
         rasterizer: of the scene, which may change between two calls.
-        cameras: all views.
         pictures: what they should show.
         held_out: the numbers of those that judge.
     """

@@ -42,12 +42,10 @@ def fit_to_photographs(
     """Fit all parameters of a scene to photographs, if some that are held out agree.
 
     Args:
-        device: to compute on.
         scene: where the fit begins.
         views: that have photographs.
         photographs: of these.
         options: of the fit; their rounds and patience mean nothing here.
-        background: R, G, B behind the scene.
         following: of the fit, not of the trial before it.
 
     Raises:

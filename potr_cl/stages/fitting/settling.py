@@ -67,11 +67,7 @@ def settle(
 
     Args:
         state: that was fitted; its views are those that the file is made for.
-        bench: of the stage.
-        sight: what the fits look at.
         source: of the scene that the targets show.
-        settling: how far they go.
-        options: of the fit before.
         asked: whether to end early: nothing more is fitted then.
         progress: called with the number of steps that a fit has taken.
 

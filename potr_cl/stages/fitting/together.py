@@ -46,8 +46,6 @@ class Ground:
 
     Attributes:
         scene: whose parameters move.
-        cameras: all views.
-        background: R, G, B behind the scene.
         rates, limits, factors: as of :class:`potr_cl.stages.fitting.adam.Adam`.
     """
 
@@ -64,7 +62,6 @@ class Batch:
     """What a step looks at.
 
     Attributes:
-        numbers: of the views.
         unit: as of :meth:`potr_cl.stages.fitting.derivatives.PictureDerivatives.add`.
         part: of the rates that the step is long.
     """
@@ -83,8 +80,6 @@ class DeviceFit(Owner):
     """A fit on one device.
 
     Args:
-        device: to compute on.
-        ground: where it begins.
         pictures: the targets; the caller's.
 
     Attributes:
@@ -136,9 +131,7 @@ class FitPart(Part):
     """A :class:`DeviceFit` that follows another one.
 
     Args:
-        device: to compute on.
         memory: bytes of its memory that target pictures may take; None: a quarter of what is free.
-        ground: where it begins.
         source: the scene whose pictures are the targets.
     """
 
@@ -246,7 +239,6 @@ def together(
 
     Args:
         descent: the first device's.
-        ground: where it begins.
         help_from: who does views besides; None: nobody.
         memory: bytes of a device's memory that target pictures may take; None: a quarter of what is free.
         batch: views of a step: there is no use for more workers.

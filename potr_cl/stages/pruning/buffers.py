@@ -42,7 +42,6 @@ class Survivors(Owner):
     """The state of each splat, on the device; the host has a copy, which :meth:`settle` brings up to date.
 
     Args:
-        device: that has them.
         splats: N.
         stride: N padded; the buffer holds so many, and all are alive at first.
         wait: returns once the device has finished what was enqueued.
@@ -116,7 +115,6 @@ class PreparedSet(Owner):
         pending: as of :meth:`potr_cl.opencl.device.Device.upload`.
 
     Attributes:
-        numbers, views: as given.
         lengths: (tiles,) uint32, intersections that a tile has left.
         sums: (intersections, 2) float32, ΔMSE and I of an intersection, summed over its tile's pixels.
         target: (pixels, 3) float32, the pictures before any removal.

@@ -46,7 +46,6 @@ class AlivePacking(Owner):
     """Packs and unpacks; devices that have removed the same splats agree on where each of the others is.
 
     Args:
-        device: that has the totals.
         splats: N.
         states: (N,) uint8 in its memory, :class:`potr_cl.stages.pruning.buffers.SplatState`.
     """
@@ -93,7 +92,6 @@ class ChangedTotals(Owner):
     """What has changed on a device since it was asked last; at first all totals are 0.
 
     Args:
-        device: that has the totals.
         splats: N.
         states: (N,) uint8 in its memory, :class:`potr_cl.stages.pruning.buffers.SplatState`. Nobody asks for the
             totals of splats that are not alive.
@@ -130,11 +128,7 @@ class ChangedTotals(Owner):
 
 
 class AddedChanges(Owner):
-    """Adds to the totals on a device what has changed elsewhere.
-
-    Args:
-        device: that has the totals.
-    """
+    """Adds to the totals on a device what has changed elsewhere."""
 
     def __init__(self, device: Device) -> None:
         self._device = device

@@ -43,7 +43,6 @@ class RemovalPart(Part):
     """Some of the views; see :class:`potr_cl.stages.pruning.removal.RemovalSweep`.
 
     Args:
-        device: to compute on.
         memory: bytes of its memory that the views may take; None: the default.
         scene: the uncompressed scene, perhaps on devices; or of it what these views may draw
             (:mod:`potr_cl.views.shares`).
@@ -131,10 +130,8 @@ class RemovalHelpers(Owner):
     """What others measure, for the :class:`potr_cl.stages.pruning.removal.RemovalSweep` of the master's device.
 
     Args:
-        device: the master's.
         splats: N.
         others: parts, each a :class:`RemovalPart`.
-        pool: of their workers.
         numbers: of each part's splats, (n,) int64, ascending, where it has no others and knows them by their places;
             None: all parts have all.
     """
@@ -241,7 +238,6 @@ def measurement(
     """A removal sweep over the views of a state, its splats numbered as in the state's scene.
 
     Args:
-        state, bench, options: of the stage.
         visibility: what the views see, where each had better be looked at with what it sees.
         spared: as of :class:`~potr_cl.stages.pruning.removal.RemovalSweep`; only with ``visibility``.
         dealt: the views, for a pool whose workers get what these see and no more of the scene.

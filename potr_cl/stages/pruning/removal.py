@@ -348,7 +348,6 @@ class Wanted:
     Attributes:
         cameras: all views; the totals' units follow from them.
         options: speed/accuracy trade-offs.
-        background: R, G, B behind the scene.
         visibility: what the views may draw, where each had better be looked at with that; None: with all splats.
         numbers, spared: as of :class:`RemovalSweep`.
     """
@@ -373,9 +372,7 @@ def planned_sweep(
     """A removal sweep over some views, as long as the context lasts.
 
     Args:
-        device: that computes.
         drawable: the uncompressed scene, perhaps on the device.
-        wanted: what is measured.
         scene: the uncompressed scene on the host; None: it is there only if ``drawable`` is.
         progress, helpers: as of :class:`RemovalSweep`.
     """

@@ -31,7 +31,6 @@ class Queues:
     """The device's own queue, or several others.
 
     Args:
-        device: that the work is for.
         most: queues to open, where the device takes more than its own.
     """
 
@@ -118,15 +117,12 @@ class ResidentSweep(Owner):
     """Keeps the resident views' part of all totals up to date.
 
     Args:
-        engine: of the views.
         ledgers: of each resident set.
-        survivors: the splats that are left.
         queues: on which sets are swept beside each other.
         options: which tiles are swept again. fixed_point: the totals' units.
 
     Attributes:
         device_lists: whether kernels list the tiles.
-        tiles_swept: so far.
     """
 
     def __init__(

@@ -230,7 +230,6 @@ def prune(
         splats: N.
         options: thresholds and iterations.
         progress: called with the iterations done and the number of splats left.
-        after_iteration: called with the iteration.
         spared: (N,) splats that stay, whatever their effect, unless there are too many of them; None: none.
     """
     alive = np.arange(splats, dtype=np.int64)

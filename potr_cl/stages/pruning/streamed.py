@@ -31,14 +31,8 @@ _Set: TypeAlias = "tuple[int, ...]"
 class StreamedSweep(Owner):
     """Measures the views of which nothing stays but the pictures that they are compared with.
 
-    Args:
-        engine: of the views.
-        survivors: the splats that are left.
-        options, fixed_point: of the sweeps.
-
     Attributes:
         totals: (N, 2) int64, their part of the totals.
-        tiles_swept: so far.
         known: whether the totals are right but for what was removed since.
     """
 

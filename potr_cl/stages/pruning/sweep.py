@@ -87,7 +87,6 @@ class FixedPoint:
             cut off.
         bound: a tile's sums in the largest view are cut at this, so that absurd colours do not overflow the totals.
         pixels: of the largest view.
-        views: number of views.
     """
 
     scale: float
@@ -167,8 +166,6 @@ class SetKernels:
     launch.
 
     Args:
-        ready: the set.
-        ledger: of its splats.
         lists: of its tiles, perhaps among those of other sets.
         options: where pixels end. fixed_point: the totals' units.
         first_time: whether a sweep stores the target instead of comparing with it.
