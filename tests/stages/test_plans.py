@@ -67,9 +67,7 @@ def _small_groups(request, kernels, monkeypatch):
 
 
 @contextmanager
-def sweep(
-    kernels, grouping="whole", tolerance=0.0, residency="all", workers="one device", spared=None, of=(SCENE, CAMERAS)
-):
+def sweep(kernels, grouping="whole", tolerance=0.0, residency="all", workers="one device", of=(SCENE, CAMERAS)):
     """A measurement of the street as a plan says, and that it gave all memory back."""
     (scene, cameras), (count, elsewhere) = of, WORKERS[workers]
     devices = [shared_device(kernels, number) for number in range(count)]
@@ -86,7 +84,7 @@ def sweep(
             names = [worker.name for worker in pool.workers()]
             dealt = ViewShares.of(cameras, visibility, [1.0] * len(names), scene, np.arange(len(scene)), names)
         bench = Workbench(HyperParameters.from_quality(0.5), device=devices[0], memory=options.memory, pool=pool)
-        yield stack.enter_context(measurement(State.of(scene, cameras), bench, options, visibility, spared, dealt))
+        yield stack.enter_context(measurement(State.of(scene, cameras), bench, options, visibility, dealt))
     assert not any(helper.allocated for helper in devices[1:]), "not all memory was given back"
 
 
@@ -190,8 +188,8 @@ def test_views_that_draw_nothing_are_views_too(kernels, grouping, residency):
 )
 def test_spared_splats_stay(kernels, grouping, residency):
     spared = np.random.default_rng(2).random(len(SCENE)) < 0.3
-    with sweep(kernels, grouping, residency=residency, spared=spared) as removal:
-        kept = prune_scene(removal, PruningOptions(1e-2, 4)).survivors
+    with sweep(kernels, grouping, residency=residency) as removal:
+        kept = prune_scene(removal, PruningOptions(1e-2, 4), spared=spared).survivors
     assert not np.isin(np.flatnonzero(spared), choice(kernels, 1e-2, 4, 0.0)[0].survivors).all()
     assert np.isin(np.flatnonzero(spared), kept).all()
     assert len(kept) < len(SCENE) - 100

@@ -18,7 +18,7 @@ from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.opencl.structs import bytes_before, struct_dtype
 from potr_cl.raster.sweep import totals_limits
 from potr_cl.stages.pruning.removal import RemovalSweep
-from potr_cl.stages.pruning.schedule import Course, Indices, Iteration, Pruned, PruningOptions, prune
+from potr_cl.stages.pruning.schedule import BEYOND, Course, Indices, Iteration, Pruned, PruningOptions, prune
 
 _SOURCE = "prune/choose_gpu.cl"
 #: A score has so many digits, each of so many values; a work-group has a work-item for each value.
@@ -127,6 +127,7 @@ class _Controller(Owner):
         device, n = self._device, self._splats
         alive = self._removal.alive.copy()
         smoothed = device.download(self._smoothed, (n,), np.float32)
+        smoothed[device.download(self._spared, (n,), np.bool_)] = BEYOND
         removed = device.download(self._removed, (n,), _REMOVED)
         iteration = removed["iteration"].astype(np.int32)
         iteration[alive] = -1

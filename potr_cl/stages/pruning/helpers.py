@@ -231,7 +231,6 @@ def measurement(
     bench: Workbench,
     options: SweepOptions,
     visibility: Visibility | None = None,
-    spared: NDArray[np.bool_] | None = None,
     dealt: ViewShares | None = None,
     seen: NDArray[np.int64] | None = None,
 ) -> Iterator[RemovalSweep]:
@@ -239,7 +238,6 @@ def measurement(
 
     Args:
         visibility: what the views see, where each had better be looked at with what it sees.
-        spared: as of :class:`~potr_cl.stages.pruning.removal.RemovalSweep`; only with ``visibility``.
         dealt: the views, for a pool whose workers get what these see and no more of the scene.
         seen: (n,) numbers of the splats that the sweep is to have, ascending, which it numbers from 0 on; None: all.
     """
@@ -248,7 +246,7 @@ def measurement(
         bench.progress("prepare views", done / count)
 
     device, pool, views = bench.opened, bench.pool, state.views
-    wanted = Wanted(views, options, bench.background, visibility, spared=spared)
+    wanted = Wanted(views, options, bench.background, visibility)
     splats = len(state.scene) if seen is None else len(seen)
     share = None if pool is None else shares(pool, len(views))
     with ExitStack() as stack:
@@ -263,12 +261,11 @@ def measurement(
             return
         given: list[tuple[Any, Wanted]] = []
         drawable: Drawable | None = None
-        theirs = replace(wanted, spared=None)
         if dealt is not None:
             share = dealt.dealt
             for part in dealt.shares:
                 subset = stack.enter_context(pool.shared(part.subset))
-                given.append((subset, replace(theirs, numbers=part.numbers, visibility=part.visibility)))
+                given.append((subset, replace(wanted, numbers=part.numbers, visibility=part.visibility)))
         else:
             if pool.in_process:
                 placed: Scene | SceneHandle = bench.scene_of(state, seen)
@@ -280,9 +277,8 @@ def measurement(
                     placed = DeviceScene(drawable)
                 sent = stack.enter_context(pool.shared(placed))
             else:
-                sent = stack.enter_context(bench.shared(pool, state, seen))
-                theirs = replace(theirs, visibility=None)
-            given = [(sent, replace(theirs, numbers=numbers)) for numbers in share.others]
+                sent, visibility = stack.enter_context(bench.shared(pool, state, seen)), None
+            given = [(sent, replace(wanted, numbers=numbers, visibility=visibility)) for numbers in share.others]
         parts = stack.enter_context(Parts(pool, RemovalPart, given, options.memory, share.names))
         numbers = None if dealt is None else [each.splats for each in dealt.shares]
         helpers = stack.enter_context(RemovalHelpers(device, splats, parts, pool, numbers))

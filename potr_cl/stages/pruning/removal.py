@@ -50,9 +50,6 @@ if TYPE_CHECKING:
 F64 = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-#: The total that spares a splat: a ΔMSE of about 1, by the bounds of :class:`FixedPoint`; and what limits it is beyond.
-_SPARED, LARGEST_LIMIT = 1 << 58, 0.1
-
 
 class RemovalSweep(Owner):
     """Measures removal effects and importances while splats are taken out, on one device; others may help.
@@ -65,7 +62,6 @@ class RemovalSweep(Owner):
         progress: called with the views prepared and their number.
         numbers: of the views that are measured here, ascending, where others are measured elsewhere; None: all.
         plan: of these views; None: all of them with all splats.
-        spared: (N,) splats whose effects are to be beyond :data:`LARGEST_LIMIT`, so that they are never removed.
         helpers: measure the other views. All totals are integers in units that follow from all views, so it makes no
             difference to any bit who measures which.
 
@@ -91,14 +87,13 @@ class RemovalSweep(Owner):
         progress: Callable[[int, int], None] | None = None,
         numbers: Sequence[int] | None = None,
         plan: ViewPlan | None = None,
-        spared: NDArray[np.bool_] | None = None,
         helpers: RemovalHelpers | None = None,
     ) -> None:
         source = scene if isinstance(scene, SplatSource) else WholeScene(scene)
         if not cameras:
             raise UsageError("removal effects need at least one view")
         self._options = options = options or SweepOptions()
-        self.device, self.splats, self._spared = source.device, source.splats, spared
+        self.device, self.splats = source.device, source.splats
         self.fixed_point = FixedPoint.of_views(cameras)
         self.units = self.fixed_point.units
         if plan is None:
@@ -112,9 +107,9 @@ class RemovalSweep(Owner):
             self._own = self.totals
             if helpers is not None:
                 self.device.fill(self.totals, np.int64(0))
-                if plan.groups or spared is not None:
+                if plan.groups:
                     self._own = self._memory.allocate(16 * source.stride, "the removal effects")
-            self._begin_totals()
+            self.device.fill(self._own, np.int64(0))
             self._survivors = owned.enter_context(
                 Survivors(self.device, self.splats, source.stride, lambda: self._queues.wait())
             )
@@ -153,13 +148,6 @@ class RemovalSweep(Owner):
         # The device sorts the lists while the next view is made ready.
         return PreparedSet(subset.rasterizer, numbers, views, memory, target, None if memory else self._pending)
 
-    def _begin_totals(self) -> None:
-        self.device.fill(self._own, np.int64(0))
-        if self._spared is not None:
-            first = np.zeros((self.splats, 2), np.int64)
-            first[self._spared, 0] = _SPARED
-            self.device.copy(self._own, first)
-
     @property
     def sweeps(self) -> float:
         """Work done so far, as a multiple of sweeping every tile of every view once."""
@@ -197,13 +185,11 @@ class RemovalSweep(Owner):
             resident.list_stale()
             resident.sweep()
             if self._local:
-                if self._engine.streamed and again:
-                    streamed.measure()
-                self._begin_totals()
+                self.device.fill(self._own, np.int64(0))
                 for ledger in self._local:
                     ledger.add_to(self._own)
                 self._streamed_added = False
-            elif self._engine.streamed and again:
+            if self._engine.streamed and again:
                 if self._streamed_added:
                     add_totals(self.device, self._own, streamed.totals, self.splats, "subtract_totals")
                 self._streamed_added = False
@@ -349,7 +335,7 @@ class Wanted:
         cameras: all views; the totals' units follow from them.
         options: speed/accuracy trade-offs.
         visibility: what the views may draw, where each had better be looked at with that; None: with all splats.
-        numbers, spared: as of :class:`RemovalSweep`.
+        numbers: of the views that are measured here, ascending, where others are measured elsewhere; None: all.
     """
 
     cameras: Sequence[Camera]
@@ -357,7 +343,6 @@ class Wanted:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     visibility: Visibility | None = None
     numbers: Sequence[int] | None = None
-    spared: NDArray[np.bool_] | None = None
 
 
 @contextmanager
@@ -396,7 +381,7 @@ def planned_sweep(
                 plan = plans.by_cluster(clusters, memory, scene.nbytes // max(len(scene), 1))
         else:
             source = owned.enter_context(Rasterizer(device, drawable, background=wanted.background))
-        sweep = RemovalSweep(source, cameras, options, progress, numbers, plan, wanted.spared, helpers)
+        sweep = RemovalSweep(source, cameras, options, progress, numbers, plan, helpers)
         yield owned.enter_context(sweep)
 
 

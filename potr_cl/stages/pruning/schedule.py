@@ -16,7 +16,7 @@ from potr_cl.errors import UsageError
 from potr_cl.model.order import ascending
 
 #: The effect of what must stay.
-_BEYOND = 1e30
+BEYOND = 1e30
 #: Candidates that are looked at to guess how far an iteration's budget reaches.
 _SAMPLE = 2048
 
@@ -243,7 +243,7 @@ def prune(
         newest, importance = effects.measure()
         delta_mse = smoothed.with_(newest)
         if spared is not None:
-            delta_mse = np.where(spared, _BEYOND, delta_mse)
+            delta_mse = np.where(spared, BEYOND, delta_mse)
         gone = choose(delta_mse, importance, alive, options.iterations - iteration, options)
         if len(gone) >= len(alive) and options.count is None:
             gone = gone[: len(alive) - 1]  # an empty scene is no scene
