@@ -32,9 +32,9 @@ from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
 from potr_cl.raster.view_set import ViewSet
-from potr_cl.stages.pruning.buffers import Bits, Ledger, PreparedSet, Survivors
+from potr_cl.stages.pruning.buffers import Bits, PreparedSet, Survivors
 from potr_cl.stages.pruning.exchange import add_totals
-from potr_cl.stages.pruning.resident import Queues, ResidentSweep
+from potr_cl.stages.pruning.resident import ResidentSweep
 from potr_cl.stages.pruning.streamed import StreamedSweep
 from potr_cl.stages.pruning.sweep import FixedPoint, SweepOptions, family_of
 from potr_cl.views import plan as plans
@@ -92,7 +92,7 @@ class RemovalSweep(Owner):
         source = scene if isinstance(scene, SplatSource) else WholeScene(scene)
         if not cameras:
             raise UsageError("removal effects need at least one view")
-        self._options = options = options or SweepOptions()
+        options = options or SweepOptions()
         self.device, self.splats = source.device, source.splats
         self.fixed_point = FixedPoint.of_views(cameras)
         self.units = self.fixed_point.units
@@ -111,27 +111,13 @@ class RemovalSweep(Owner):
                     self._own = self._memory.allocate(16 * source.stride, "the removal effects")
             self.device.fill(self._own, np.int64(0))
             self._survivors = owned.enter_context(
-                Survivors(self.device, self.splats, source.stride, lambda: self._queues.wait())
+                Survivors(self.device, self.splats, source.stride, lambda: self._resident.queues.wait())
             )
             self.marks: cl.Buffer = self._survivors.buffer
-            family = family_of(self.device)
-            self._queues = Queues(self.device, 1)
-            self._engine = ViewEngine(source, cameras, plan, self._attach, family.most_views, progress)
+            self._engine = ViewEngine(source, cameras, plan, self._attach, family_of(self.device).most_views, progress)
             owned.enter_context(self._engine)
             self._pending.clear()
-            resident = self._engine.resident
-            ledgers = {
-                id(each): owned.enter_context(Ledger(self._survivors, self._own, each))
-                for each in {id(ready.subset): ready.subset for ready in resident}.values()
-            }
-            self._local = [ledger for ledger in ledgers.values() if ledger.is_local]
-            # Sets that share the memory of their projections have to be swept one after the other.
-            if not any(ready.shares for ready in resident):
-                self._queues = Queues(self.device, min(plan.queues or family.most_queues, len(resident)))
-            of_sets = [ledgers[id(ready.subset)] for ready in resident]
-            self._resident = ResidentSweep(
-                self._engine, of_sets, self._survivors, self._queues, options, self.fixed_point
-            )
+            self._resident = ResidentSweep(self._engine, self._survivors, self._own, options, self.fixed_point)
             owned.enter_context(self._resident)
             self._streamed = StreamedSweep(self._engine, self._survivors, options, self.fixed_point)
             owned.enter_context(self._streamed)
@@ -139,8 +125,8 @@ class RemovalSweep(Owner):
                 helpers.are_left(self.marks, first=True)
             self._owned = owned.pop_all()
         self._measured = self._streamed_added = False
-        elsewhere = len(cameras) - len(plan.numbers) if helpers else 0
-        self.ready_views = elsewhere + len(self._engine.idle) + sum(len(ready.numbers) for ready in resident)
+        resident = sum(len(ready.numbers) for ready in self._engine.resident)
+        self.ready_views = resident + len(self._engine.idle) + (len(cameras) - len(plan.numbers) if helpers else 0)
 
     def _attach(
         self, numbers: Sequence[int], subset: Subset, views: ViewSet, memory: Memory | None, target: cl.Buffer | None
@@ -184,10 +170,7 @@ class RemovalSweep(Owner):
         if self._engine.plan.groups:
             resident.list_stale()
             resident.sweep()
-            if self._local:
-                self.device.fill(self._own, np.int64(0))
-                for ledger in self._local:
-                    ledger.add_to(self._own)
+            if resident.gather():
                 self._streamed_added = False
             if self._engine.streamed and again:
                 if self._streamed_added:
@@ -228,8 +211,7 @@ class RemovalSweep(Owner):
         ΔMSE is the change of the mean squared error over all views, pixels and channels against the uncompressed
         scene's renders if that splat alone went; I the mean over views and pixels of T α.
         """
-        self.measure_on_device()
-        return self.fixed_point.values(self.device.download(self.totals, (self.splats, 2), np.int64))
+        return self.fixed_point.values(self.measure_totals())
 
     def measure_totals(self) -> NDArray[np.int64]:
         """The same as (N, 2) int64 in units of the fixed point: the sums over the views that are measured here."""
@@ -247,7 +229,8 @@ class RemovalSweep(Owner):
         pending = None if self._helpers is None else self._helpers.replace_sh(sh)
         self._see_targets()
         self._engine.source.replace_sh(sh)
-        self.project_again()
+        self._resident.project_again()
+        self.sweep_everything()
         if pending is not None:
             pending.results()
 
@@ -255,11 +238,6 @@ class RemovalSweep(Owner):
         """The target pictures are stored by the first measurement, before anything changes."""
         if not self._measured:
             self.measure_on_device(alone=True)
-
-    def project_again(self) -> None:
-        """Continue with the colours that the rasterizer's scene has by now; so with others, if it has got others."""
-        self._resident.project_again()
-        self.sweep_everything()
 
     def sweep_everything(self) -> None:
         """Have the next measurement sweep every tile, whatever has changed."""
