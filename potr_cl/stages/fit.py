@@ -20,18 +20,11 @@ from potr_cl.opencl.discovery import Family
 from potr_cl.quality.photographs import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Rates
-from potr_cl.stages.fitting.fit import (
-    FitOptions,
-    Following,
-    Sight,
-    SupportsBool,
-    fit_scene,
-    held_out_error,
-    kept_pictures,
-)
+from potr_cl.stages.fitting.fit import FitOptions, Following, Sight, SupportsBool, fit_scene, held_out_error
 from potr_cl.stages.fitting.fitted import Fitted, LeftOut
 from potr_cl.stages.fitting.photographs import fit_to_photographs, longer
 from potr_cl.stages.fitting.settling import Settling, settle
+from potr_cl.stages.fitting.together import kept_pictures
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
 from potr_cl.views.shares import HelpFrom

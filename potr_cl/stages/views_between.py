@@ -156,9 +156,8 @@ def _nbytes(bench: Workbench, scene: Drawable, views: Sequence[Camera]) -> float
     """Bytes that is kept of a view while splats are removed: the mean of some."""
     with Rasterizer(bench.opened, scene, background=bench.background) as rasterizer:
         with ExitStack() as prepared, rasterizer.preparing_many():
-            for number, view in enumerate(views):
-                own = PreparedSet(rasterizer, [number], rasterizer.prepare_set([view]))
-                prepared.enter_context(own)
+            for view in views:
+                prepared.enter_context(PreparedSet(rasterizer, rasterizer.prepare_set([view])))
             held = rasterizer.device.allocated
         # What the rasterizer works with is there before and after.
         return (held - rasterizer.device.allocated) / len(views)

@@ -248,13 +248,13 @@ class NamedBudget(Budget):
     """
 
     def __init__(self, memory: int, groups: Sequence[ViewGroup], cameras: Sequence[Camera], totals: int) -> None:
-        self._left, self.streamed = memory, int(STREAMED_NAMED * memory)
-        self._targets = {number: target_bytes(cameras[number]) for each in groups for number in each.numbers}
+        self._left, self.streamed, self._cameras = memory, int(STREAMED_NAMED * memory), cameras
+        targets = sum(map(self._target, groups))
         # For the targets of all views that do not stay room is left, unless all will stay.
         self._reserved = 0
-        if _NAMED * sum(each.count for each in groups) + sum(self._targets.values()) > memory:
+        if _NAMED * sum(each.count for each in groups) + targets > memory:
             self._left -= self.streamed + totals
-            self._reserved = sum(self._targets.values())
+            self._reserved = targets
 
     def room(self, group: ViewGroup) -> float:
         target = self._target(group)
@@ -269,7 +269,7 @@ class NamedBudget(Budget):
         return self._left + sum(map(self._target, groups))
 
     def _target(self, group: ViewGroup) -> int:
-        return sum(self._targets[number] for number in group.numbers)
+        return sum(target_bytes(self._cameras[number]) for number in group.numbers)
 
 
 class KnownBudget(Budget):

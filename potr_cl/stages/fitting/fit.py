@@ -29,7 +29,7 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.stages.fitting.adam import UNROUNDED, Adam, Factors, Limits, Rates
 from potr_cl.stages.fitting.fitted import Fitted, decibels
-from potr_cl.stages.fitting.together import Batch, DeviceFit, Ground, SharedFit, room_for_pictures, together
+from potr_cl.stages.fitting.together import Batch, DeviceFit, Ground, SharedFit, kept_pictures, together
 from potr_cl.stages.held_out import share_out
 from potr_cl.views.shares import HelpFrom
 from potr_cl.views.targets import TargetPictures, Targets
@@ -191,18 +191,6 @@ def held_out_error(device: Device, scene: Drawable, sight: Sight) -> float:
         Judges(device, rasterizer, sight.cameras, pictures, sight.held_out) as judges,
     ):
         return judges.error()
-
-
-def kept_pictures(
-    device: Device, cameras: Sequence[Camera], targets: Targets, memory: int | None = None
-) -> TargetPictures:
-    """Target pictures for several fits to the same views, as many as there is room for; the caller closes them.
-
-    Args:
-        cameras, targets: as of :class:`Sight`.
-        memory: bytes of device memory that they may take; None: a quarter of what is free.
-    """
-    return TargetPictures(device, cameras, room_for_pictures(device, memory), targets)
 
 
 def _run(

@@ -17,8 +17,9 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.stages.fitting.adam import Rates
-from potr_cl.stages.fitting.fit import FitOptions, Following, Sight, fit_scene, kept_pictures
+from potr_cl.stages.fitting.fit import FitOptions, Following, Sight, fit_scene
 from potr_cl.stages.fitting.fitted import FittedToPhotographs
+from potr_cl.stages.fitting.together import kept_pictures
 from potr_cl.stages.held_out import hold_out
 from potr_cl.views.targets import Photographs, PhotographTargets
 

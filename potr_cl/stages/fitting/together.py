@@ -26,7 +26,7 @@ from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.stages.fitting.adam import UNROUNDED, Adam, Factors, Limits, Rates
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from potr_cl.views.shares import HelpFrom
-from potr_cl.views.targets import Room, TargetPictures, targets_of
+from potr_cl.views.targets import Room, TargetPictures, Targets, targets_of
 from potr_cl.workers.helping import Helping
 from potr_cl.workers.parts import Each, Parts
 from potr_cl.workers.pool import Part
@@ -71,9 +71,15 @@ class Batch:
     part: float
 
 
-def room_for_pictures(device: Device, memory: int | None) -> Room:
-    """Bytes that target pictures may take; None: a quarter of what is free."""
-    return Room((device.info.memory - device.allocated) * _SHARE if memory is None else memory)
+def kept_pictures(
+    device: Device, cameras: Sequence[Camera], targets: Targets, memory: int | None = None
+) -> TargetPictures:
+    """Target pictures for fits, kept in so many bytes of device memory (None: a quarter of what is free).
+
+    The caller closes them.
+    """
+    room = Room((device.info.memory - device.allocated) * _SHARE if memory is None else memory)
+    return TargetPictures(device, cameras, room, targets)
 
 
 class DeviceFit(Owner):
@@ -139,8 +145,7 @@ class FitPart(Part):
         with ExitStack() as owned:
             scene = owned.enter_context(scene_on(device, source))
             targets = owned.enter_context(targets_of(device, scene, ground.cameras, ground.background))
-            room = room_for_pictures(device, memory)
-            pictures = owned.enter_context(TargetPictures(device, ground.cameras, room, targets))
+            pictures = owned.enter_context(kept_pictures(device, ground.cameras, targets, memory))
             self._descent = owned.enter_context(DeviceFit(device, ground, pictures))
             self._owned = owned.pop_all()
 

@@ -7,7 +7,7 @@ out.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from enum import IntEnum
 
 import numpy as np
@@ -108,7 +108,6 @@ class PreparedSet(Owner):
 
     Args:
         rasterizer: that prepared them.
-        numbers: of the views among the cameras.
         views: projection and lists, as they were prepared for the first time; this object's from now on.
         memory: to take the rest from, which is closed with this object; None: memory of its own.
         target: the pictures before any removal, which stay the caller's; None: memory for them.
@@ -124,7 +123,6 @@ class PreparedSet(Owner):
     def __init__(
         self,
         rasterizer: Rasterizer,
-        numbers: Sequence[int],
         views: ViewSet,
         memory: Memory | None = None,
         target: cl.Buffer | None = None,
@@ -132,7 +130,7 @@ class PreparedSet(Owner):
     ) -> None:
         self._device = device = rasterizer.device
         self._memory = memory or Memory(device)
-        self.numbers, self.views = numbers, views
+        self.views = views
         self.first_tile = 0
         try:
             lengths = np.concatenate([np.diff(offsets) for offsets in views.found_offsets])

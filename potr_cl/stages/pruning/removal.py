@@ -132,7 +132,7 @@ class RemovalSweep(Owner):
         self, numbers: Sequence[int], subset: Subset, views: ViewSet, memory: Memory | None, target: cl.Buffer | None
     ) -> PreparedSet:
         # The device sorts the lists while the next view is made ready.
-        return PreparedSet(subset.rasterizer, numbers, views, memory, target, None if memory else self._pending)
+        return PreparedSet(subset.rasterizer, views, memory, target, None if memory else self._pending)
 
     @property
     def sweeps(self) -> float:
