@@ -46,6 +46,9 @@ class Helping(Owner):
             self.parts = opened(self._left)
         except DeviceError as error:
             self._lose(error)
+        except BaseException as error:
+            self.__exit__(type(error), error, None)
+            raise
         return self.parts
 
     def asked(self, call: Callable[[Parts], T]) -> T | None:

@@ -29,7 +29,7 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.stages.fitting.adam import UNROUNDED, Adam, Factors, Limits, Rates
 from potr_cl.stages.fitting.fitted import Fitted, decibels
-from potr_cl.stages.fitting.together import Batch, DeviceFit, Ground, SharedFit, kept_pictures, together
+from potr_cl.stages.fitting.together import Batch, DeviceFit, Ground, SharedFit, kept_pictures
 from potr_cl.stages.held_out import share_out
 from potr_cl.views.shares import HelpFrom
 from potr_cl.views.targets import TargetPictures, Targets
@@ -178,7 +178,7 @@ def fit_scene(
         batch, helping = min(options.batch, len(fit_to)), sight.help_from if options.steps else None
         with (
             Judges(device, descent.derivatives.rasterizer, cameras, pictures, held_out) as judges,
-            together(descent, ground, helping, options.memory, batch) as steps,
+            SharedFit(descent, ground, helping, options.memory, batch) as steps,
         ):
             return _run(options, steps, descent.adam, judges, fit_to, following or Following())
 

@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import cached_property
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -116,9 +117,7 @@ class RemovalPart(Part):
             pixels; None behind the last view.
         """
         if self._told is None or self._told[0] != place:
-            known = self._sweep.known_importances()
-            for _ in range(place):
-                next(known, None)
+            known: Iterator[tuple[int, Indices, F64]] = islice(self._sweep.known_importances(), place, None)
         else:
             known = self._told[1]
         found = next(known, None)

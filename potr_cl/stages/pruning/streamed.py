@@ -20,7 +20,6 @@ from potr_cl.stages.pruning.sweep import FixedPoint, SetKernels, SweepOptions, T
 from potr_cl.views.budget import target_bytes
 from potr_cl.views.engine import Ready, ViewEngine
 from potr_cl.views.subsets import Left, Subset
-from potr_cl.views.visibility import ViewGroup
 
 #: Splats that a work-group of the kernel `lost` looks at, and its work-items.
 _LOST_CHUNK, _GROUP = 4096, 64
@@ -68,18 +67,13 @@ class StreamedSweep(Owner):
                         self._on_device[numbers] = self._memory.allocate(nbytes, "the target images")
                         room -= nbytes
 
-    @property
-    def numbers(self) -> dict[int, ViewGroup]:
-        """The group of each view."""
-        return {number: group for group in self._engine.streamed for number in group.numbers}
-
     def forget(self) -> None:
         """Have the next measurement measure all of them."""
         self.known = False
 
     def are_stale(self) -> bool:
         """Whether they have lost more than they may since they were measured: a part of their area, on average."""
-        views = len(self.numbers)
+        views = sum(len(group.numbers) for group in self._engine.streamed)
         limit = self._engine.plan.patience * self._options.tolerance
         if not self.known or limit <= 0:
             return bool(views)
