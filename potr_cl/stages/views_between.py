@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import UsageError
 from potr_cl.host.threads import thread_pool
-from potr_cl.model.camera import Camera
+from potr_cl.model.camera import Camera, spread_evenly
 from potr_cl.model.given_views import GivenViews
 from potr_cl.model.scene import Scene
 from potr_cl.model.views_between import SPREAD, views_between
@@ -106,7 +106,7 @@ def room_for(added: Sequence[Camera], state: State, bench: Workbench) -> int:
     pixels = sum(view.width * view.height for view in (*state.views, *added))
     if budget > _SPLAT * len(state.source) * (len(state.views) + len(added)) + _PIXEL * pixels:
         return len(added)
-    sampled = _some_of(state.views, _SAMPLE), _some_of(added, _SAMPLE)
+    sampled = spread_evenly(state.views, _SAMPLE), spread_evenly(added, _SAMPLE)
     if seen_part(state.source, state.views) <= MOST_SEEN:
         if _by_view(state, bench):
             own, more = (_nbytes_by_view(state, views) for views in (state.views, added))
@@ -132,11 +132,6 @@ def _nbytes_by_view(state: State, views: Sequence[Camera]) -> float:
     """Bytes that is kept of a view where each is looked at by itself: about the mean."""
     pixels = sum(view.width * view.height for view in views) / len(views)
     return _DRAWN * seen_part(state.source, views) * len(state.source) + _TARGET * pixels
-
-
-def _some_of(views: Sequence[Camera], count: int) -> list[Camera]:
-    """So many of some views at most, from the first to the last."""
-    return [views[round(place)] for place in np.linspace(0, len(views) - 1, min(count, len(views)))]
 
 
 def _nbytes_of_parts(state: State, bench: Workbench, views: Sequence[Camera]) -> float:

@@ -200,12 +200,26 @@ class PicturesAhead(Owner):
         numbers: Mapping[Device, Sequence[int]],
         visibility: Visibility | None = None,
     ) -> None:
-        self.source = source
-        self._begun: dict[Device, Future[_Rendered | None]] = {
-            device: in_background(_rendered, device, source, background, cameras, some, visibility)
+        self.source, self._background, self._cameras, self._visibility = source, background, cameras, visibility
+        self._begun = {
+            device: in_background(self._rendered, device, some)
             for device, some in numbers.items()
             if device.family == "gpu" and some
         }
+
+    def _rendered(self, device: Device, numbers: Sequence[int]) -> _Rendered | None:
+        """Some views' pictures on a device; None: it has not much room, or the scene does not lie there."""
+        if sum(target_bytes(self._cameras[number]) for number in numbers) > AHEAD * device.info.memory:
+            return None
+        scene = self.source.found_on(device)
+        if not isinstance(scene, SceneBuffers):
+            return None
+        with suppress(DeviceMemoryError), device.all_or_nothing():
+            rendered = _Rendered(device, self._cameras, numbers)
+            with targets_of(device, scene, self._cameras, self._background, self._visibility) as targets:
+                targets.into(numbers, rendered.buffer)
+            return rendered
+        return None
 
     def before(self, device: Device, targets: Targets) -> Targets:
         """The pictures that ``targets`` gives, on a device: it is asked for those that were not rendered ahead.
@@ -264,28 +278,6 @@ class _Rendered(Owner):
     def close(self) -> None:
         self._places = {}
         self._memory.close()
-
-
-def _rendered(
-    device: Device,
-    source: ResidentScene,
-    background: tuple[float, float, float],
-    cameras: Sequence[Camera],
-    numbers: Sequence[int],
-    visibility: Visibility | None,
-) -> _Rendered | None:
-    """Some views' pictures on a device; None: it has not much room, or the scene does not lie there."""
-    if sum(target_bytes(cameras[number]) for number in numbers) > AHEAD * device.info.memory:
-        return None
-    scene = source.found_on(device)
-    if not isinstance(scene, SceneBuffers):
-        return None
-    with suppress(DeviceMemoryError), device.all_or_nothing():
-        rendered = _Rendered(device, cameras, numbers)
-        with targets_of(device, scene, cameras, background, visibility) as targets:
-            targets.into(numbers, rendered.buffer)
-        return rendered
-    return None
 
 
 @dataclass
