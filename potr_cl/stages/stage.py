@@ -206,15 +206,10 @@ class Workbench:
 
     @contextmanager
     def shared(self, pool: Pool, state: State, some: NDArray[np.int64] | None = None) -> Iterator[Shared]:
-        """The same for a pool's workers, as long as the context lasts.
+        """The same for workers of other processes, as long as the context lasts.
 
-        Threads of this process have it from what is kept on their devices. Others are sent the source, which later
-        stages need too, and numbers.
+        They are sent the source, which later stages need too, and numbers.
         """
-        if pool.in_process:
-            with pool.shared(self.scene_of(state, some)) as placed:
-                yield placed
-            return
         numbers = some
         if state.is_cut and state.scene is not state.source:
             numbers = state.survivors if some is None else state.survivors[some]

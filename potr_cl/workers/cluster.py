@@ -11,9 +11,9 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Any
 
 from potr_cl.errors import DeviceError, PotrError, UsageError
@@ -21,7 +21,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.workers.actor import ClusterWorker, WorkerFailed, host_of
 from potr_cl.workers.client import Pulse, client_of, first_line
 from potr_cl.workers.host import DeviceThread
-from potr_cl.workers.pool import Pool, Shared, Traffic, Worker, WorkerLost, tell_of_kinds
+from potr_cl.workers.pool import Pool, Traffic, Worker, WorkerLost, tell_of_kinds
 
 if TYPE_CHECKING:
     from dask.distributed import Client
@@ -101,11 +101,6 @@ class ClusterPool(Pool):
     @property
     def names(self) -> tuple[str, ...]:
         return tuple(worker.name for worker in [*self._workers, *([] if self._here is None else [self._here])])
-
-    @contextmanager
-    def shared(self, thing: Any) -> Iterator[Shared]:
-        """A worker is sent it when it first makes a part of it, and keeps it for the parts that follow."""
-        yield Shared(thing)
 
     def has(self, thing: Any) -> bool:
         return all(worker.has(thing) for worker in self._workers if not worker.lost)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -17,7 +16,7 @@ from potr_cl.errors import UsageError
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import DeviceInfo, choose_devices
 from potr_cl.opencl.memory import Owner
-from potr_cl.workers.pool import Held, Part, Pool, Shared, Traffic, Worker, tell_of_kinds
+from potr_cl.workers.pool import Held, Part, Pool, Traffic, Worker, tell_of_kinds
 
 if TYPE_CHECKING:
     from dask.distributed import Client
@@ -63,9 +62,6 @@ class HostPool(Pool):
 
     def reserve(self) -> list[Worker]:
         return [self._reserve]
-
-    def shared(self, thing: Any) -> AbstractContextManager[Shared]:
-        return nullcontext(Shared(thing))  # threads see what the master sees
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -9,9 +9,9 @@ from __future__ import annotations
 import logging
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future
-from contextlib import AbstractContextManager
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -204,9 +204,14 @@ class Pool(Owner, ABC):
         """Who does the work of lost workers when none is left."""
         return []
 
-    @abstractmethod
-    def shared(self, thing: Any) -> AbstractContextManager[Shared]:
-        """Give something to all workers once, for parts that are made as long as the context lasts."""
+    @contextmanager
+    def shared(self, thing: Any) -> Iterator[Shared]:
+        """Give something to all workers once, for parts that are made as long as the context lasts.
+
+        Threads see what the master sees. Others are sent it when they first make a part of it, and keep it for the
+        parts that follow.
+        """
+        yield Shared(thing)
 
     def has(self, thing: Any) -> bool:
         """Whether all workers have something that was shared with them, so that it is not sent again."""
