@@ -173,7 +173,7 @@ class ViewEngine(Owner, Generic[W]):
         device, plan = self.device, self.plan
         before, some, most = device.allocated, list[Ready[W]](), 0
         subset: Subset | None = None
-        with ExitStack() as stack, nullcontext() if plan.in_sets else suppress(DeviceMemoryError):
+        with ExitStack() as stack, suppress(DeviceMemoryError) if plan.singly else nullcontext():
             memory = stack.enter_context(Memory(device))
             subset = self.source.open(stack, memory, group)
             if subset is None:
@@ -181,7 +181,7 @@ class ViewEngine(Owner, Generic[W]):
                 plan.budget.took(group, 0)
                 return []
             cache = plan.budget.cache
-            if cache is None and plan.in_sets:
+            if cache is None and not plan.singly:
                 cache = stack.enter_context(ViewCache(device, room))
             some, most = self._prepare_all(group, subset, cache, room, before, said)
             if some:

@@ -185,6 +185,9 @@ class _Parted(SplatSource):
             Rasterizer, device, rules=rules, background=background, preparing=self._preparing
         )  # fmt: skip
 
+    def streams_in(self) -> Memory:
+        return Reused(self.device)
+
     def close(self) -> None:
         self._preparing.close()
 
@@ -203,9 +206,6 @@ class NamedSplats(_Parted):
         self._whole, self._memory = whole, Memory(whole.device)
         self._picker = Picker(whole.device, group_of)
         self._foreseen: tuple[IndexSubsets, dict[ViewGroup, int]] | None = None
-
-    def streams_in(self) -> Memory:
-        return Reused(self.device)
 
     def open(self, stack: ExitStack, memory: Memory, group: ViewGroup, left: Left | None = None) -> Subset | None:
         assert group.cells is not None
@@ -260,9 +260,6 @@ class ListedSplats(_Parted):
         super().__init__(rasterizer.device, self._whole, rasterizer.stride, rasterizer.background, rasterizer.rules)
         self._listed = dict(reach.of)
 
-    def streams_in(self) -> Memory:
-        return Reused(self.device)
-
     def room(self, number: int) -> int:
         return max(-(-len(self._listed[number]) // SPLAT_GROUP), 1) * SPLAT_GROUP
 
@@ -300,9 +297,6 @@ class CopiedSplats(_Parted):
         super().__init__(device, scene, stride_of(len(scene)), background)
         self._scene, self._whole = scene, whole
         self._other: FloatArray | None = None
-
-    def streams_in(self) -> Memory:
-        return Reused(self.device)
 
     def empty(self, count: int, memory: Memory | None = None) -> SceneBuffers:
         """Room for so many splats."""

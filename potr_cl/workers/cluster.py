@@ -56,9 +56,6 @@ class ClusterPool(Pool):
         UsageError: Dask is not installed, no scheduler answers there, no worker comes, or one cannot do the work.
     """
 
-    takes_part = False
-    sparse = True
-
     def __init__(self, cluster: str | Client, first: Device, patience: float = 60.0) -> None:
         self.first, self.traffic, self.patience = first, Traffic(), patience
         self._closing = threading.Event()

@@ -32,8 +32,6 @@ class HostPool(Pool):
         UsageError: there is no device, or they run different kernels, which round differently.
     """
 
-    takes_part = True
-    sparse = False
     in_process = True
 
     def __init__(self, devices: Sequence[Device]) -> None:

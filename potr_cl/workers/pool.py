@@ -1,7 +1,8 @@
 """A pool of workers, each with a device of its own: :class:`Pool`. What they compute is in :mod:`.parts`.
 
-Whoever asks a pool for work (the *master*) has a device too, the pool's ``first``. It may do a share of the work itself
-(``takes_part``), as with several devices of one computer, or only add up what the workers find, as with a cluster.
+Whoever asks a pool for work (the *master*) has a device too, the pool's ``first``. Where workers are threads of its
+process, as with several devices of one computer, it does a share of the work; with a cluster it only adds up what they
+find.
 """
 
 from __future__ import annotations
@@ -172,17 +173,14 @@ class Pool(Owner, ABC):
 
     Attributes:
         first: the master's own device.
-        takes_part: whether the master does a share of the work on it.
-        sparse: whether workers send what has changed, and not all of it: worth its time where bytes travel slowly.
-        in_process: whether workers are threads of this process: what lies on a device can then be lent
-            (:mod:`potr_cl.opencl.relay`), and goes to another device without a stay on the host.
+        in_process: whether workers are threads of this process. Then the master does a share of the work on its device,
+            and what lies on a device can be lent (:mod:`potr_cl.opencl.relay`): it goes to another one without a stay
+            on the host. Others send what has changed, and not all of it.
         patience: seconds, or ten times as long as the others took if that is longer, after which a worker that alone
             has not answered counts as lost; None: workers are waited for.
     """
 
     first: Device
-    takes_part: bool
-    sparse: bool
     in_process: bool = False
     traffic: Traffic
     patience: float | None = None
@@ -252,13 +250,13 @@ def shares(pool: Pool, views: int, parts: int = 1, own_speed: float = 1.0) -> Sh
         WorkerLost: no worker is left.
     """
     workers = pool.workers()
-    speeds = [*([own_speed] if pool.takes_part else []), *[1.0] * len(workers)]
+    speeds = [*([own_speed] if pool.in_process else []), *[1.0] * len(workers)]
     dealt: list[list[int]] = [[] for _ in speeds]
     for part in range(parts):
         numbers = range(part, views, parts)
         for share, places in zip(dealt, deal(len(numbers), speeds, part), strict=True):
             share += [numbers[place] for place in places]
-    own, others = (dealt[0], dealt[1:]) if pool.takes_part else ([], dealt)
+    own, others = (dealt[0], dealt[1:]) if pool.in_process else ([], dealt)
     busy = [(worker, sorted(each)) for worker, each in zip(workers, others, strict=True) if each]
     return Shares(sorted(own), [each for _, each in busy], tuple(worker.name for worker, _ in busy))
 

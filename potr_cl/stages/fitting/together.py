@@ -190,7 +190,7 @@ class SharedFit(Helping):
         self._steps = 0
         self._since, self._seconds = 0.0, list[float]()
         if help_from is not None and not help_from.slower and help_from.pool.first is descent.device:
-            self._takes_part = help_from.pool.takes_part
+            self._takes_part = help_from.pool.in_process
             self.open(partial(_parts, help_from, ground, memory, batch))
 
     def step(self, batch: Batch) -> None:
@@ -244,7 +244,7 @@ class SharedFit(Helping):
 
 def _parts(help_from: HelpFrom, ground: Ground, memory: int | None, batch: int, stack: ExitStack) -> Parts | None:
     pool = help_from.pool
-    count = min(len(pool.workers()), batch - pool.takes_part)
+    count = min(len(pool.workers()), batch - pool.in_process)
     given = [stack.enter_context(pool.shared(each)) for each in (ground, help_from.source)]
     if count <= 0:
         return None

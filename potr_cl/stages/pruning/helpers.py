@@ -138,7 +138,7 @@ class RemovalHelpers(Owner):
     def __init__(
         self, device: Device, splats: int, others: Parts, pool: Pool, numbers: Sequence[Indices] | None = None
     ) -> None:
-        assert numbers is None or pool.sparse
+        assert numbers is None or not pool.in_process
         self._device, self._splats, self._others, self._numbers = device, splats, others, numbers
         self._relay: Relay | None = None
         self._added: AddedChanges | None = None
@@ -147,7 +147,7 @@ class RemovalHelpers(Owner):
         with ExitStack() as owned:
             memory = owned.enter_context(Memory(device))
             self._more = owned.enter_context(Scratch(device, "the removal effects"))
-            if pool.sparse:
+            if not pool.in_process:
                 self._added = owned.enter_context(AddedChanges(device))
                 for place, theirs in enumerate(numbers or ()):
                     buffer = memory.upload(theirs.astype(np.uint32), "the splats of workers")

@@ -27,6 +27,9 @@ T = TypeVar("T")
 
 Indices = NDArray[np.int64]
 
+#: Queues on which sets of single views are swept beside each other.
+_SINGLY = 8
+
 
 class Queues:
     """The device's own queue, or several others.
@@ -140,7 +143,7 @@ class ResidentSweep(Owner):
         family = family_of(self._device)
         # Sets that share the memory of their projections have to be swept one after the other.
         shares = any(ready.shares for ready in sets)
-        most = 1 if shares else min(engine.plan.queues or family.most_queues, len(sets))
+        most = 1 if shares else min(_SINGLY if engine.plan.singly else family.most_queues, len(sets))
         self.queues = Queues(self._device, most)
         self.device_lists = family.lists_tiles and options.only_by_tolerance
         self.tiles_swept = self._measurements = 0
