@@ -99,7 +99,7 @@ def course(kernels, tolerance=0.0):
 def choice(kernels, limit, iterations, tolerance):
     """What pruning makes of that, and whether the device steers it."""
     with sweep(kernels, tolerance=tolerance) as wanted:
-        return prune_scene(wanted, PruningOptions(limit, iterations)), wanted.steering is not None
+        return prune_scene(wanted, PruningOptions(limit, iterations)), wanted.can_steer
 
 
 @pytest.mark.parametrize(
@@ -137,7 +137,7 @@ def test_the_same_choice(kernels, grouping):
     """By the host, or by the device's own controller where there is one."""
     wanted, steered = choice(kernels, 1e-5, 12, 0.01)
     with sweep(kernels, grouping, 0.01) as got:
-        assert (got.steering is not None) == steered
+        assert got.can_steer == steered
         found = prune_scene(got, PruningOptions(1e-5, 12))
     assert np.array_equal(found.order, wanted.order)
     assert found.kept == wanted.kept < len(SCENE)

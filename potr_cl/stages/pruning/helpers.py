@@ -65,7 +65,7 @@ class RemovalPart(Part):
 
     def can_steer(self) -> bool:
         """Whether the device can list stale tiles itself."""
-        return self._sweep.steering is not None
+        return self._sweep.can_steer
 
     def changes(self, again: bool | None = None) -> Changes:
         """By how much the totals of the splats that are left have changed since the last call; all, at the first.
@@ -157,7 +157,7 @@ class RemovalHelpers(Owner):
             self._owned = owned.pop_all()
 
     @cached_property
-    def steers(self) -> bool:
+    def can_steer(self) -> bool:
         """Whether all of them can list stale tiles themselves."""
         return all(self._others.ask(place, "can_steer") for place in range(len(self._others)))
 

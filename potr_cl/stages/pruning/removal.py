@@ -67,7 +67,7 @@ class RemovalSweep(Owner):
 
     Attributes:
         device: where the totals and the marks are. splats: N.
-        totals: (N, 2) int64 in the device's memory, and units: ΔMSE and I of 1 there.
+        totals: (N, 2) int64 in the device's memory.
         marks: (N,) uint8 in the device's memory, :class:`~potr_cl.stages.pruning.buffers.SplatState`. A controller on
             the device marks splats as JUST_REMOVED and calls :meth:`remove_marked`; when it marks the next ones, it
             changes the earlier marks to REMOVED.
@@ -95,7 +95,6 @@ class RemovalSweep(Owner):
         options = options or SweepOptions()
         self.device, self.splats = source.device, source.splats
         self.fixed_point = FixedPoint.of_views(cameras)
-        self.units = self.fixed_point.units
         if plan is None:
             room = default_memory(self.device) if options.memory is None else options.memory
             plan = plans.whole(range(len(cameras)) if numbers is None else numbers, self.splats, room)
@@ -141,12 +140,12 @@ class RemovalSweep(Owner):
         return (self._resident.tiles_swept + self._streamed.tiles_swept) / tiles
 
     @property
-    def steering(self) -> RemovalSweep | None:
-        """Itself, for a controller on the device; None if the host has to decide: where it is asked which tiles are
-        swept, or where streamed views are measured so often that nothing is gained."""
+    def can_steer(self) -> bool:
+        """Whether a controller on the device can decide: not where the host is asked which tiles are swept, nor where
+        streamed views are measured so often that nothing is gained."""
         often = self._engine.streamed and not self._engine.plan.patience
-        helpers = self._helpers is None or self._helpers.steers
-        return self if self._resident.device_lists and not often and helpers else None
+        helpers = self._helpers is None or self._helpers.can_steer
+        return self._resident.device_lists and not often and helpers
 
     @property
     def alive(self) -> NDArray[np.bool_]:
