@@ -210,7 +210,8 @@ class RemovalSweep(Owner):
         ΔMSE is the change of the mean squared error over all views, pixels and channels against the uncompressed
         scene's renders if that splat alone went; I the mean over views and pixels of T α.
         """
-        return self.fixed_point.values(self.measure_totals())
+        self.measure_on_device()
+        return self.fixed_point.values(self.device.download(self.totals, (self.splats, 2), np.int64))
 
     def measure_totals(self) -> NDArray[np.int64]:
         """The same as (N, 2) int64 in units of the fixed point: the sums over the views that are measured here."""
