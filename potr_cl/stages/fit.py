@@ -100,7 +100,7 @@ class Fit(Stage):
         choosing, rounding: how far what is left is fitted once more after the choice of coefficients and the rounding
             of geometry (:class:`potr_cl.stages.fitting.settling.Settling`).
         compared: whether two files say if it pays, where its gain is small (potr_cl/pipeline/run.py).
-        rounds: see :class:`potr_cl.stages.fitting.fit.FitOptions`.
+        rounds, batch: see :class:`potr_cl.stages.fitting.fit.FitOptions`.
 
     Raises:
         UsageError: a value is out of range.
@@ -127,6 +127,7 @@ class Fit(Stage):
     between: float | Literal["auto"] = option("auto")
     photograph_steps: int | Literal["auto"] = option("auto")
     rounds: int = option(FitOptions.rounds)
+    batch: int = option(FitOptions.batch)
     choosing: float = option(0.3)
     rounding: float = option(0.15)
     compared: bool = option(True)
@@ -171,7 +172,7 @@ class Fit(Stage):
         return BETWEEN[family] if self.between == "auto" else self.between
 
     def _options(self, family: Family, memory: int | None) -> FitOptions:
-        return FitOptions(steps=self.steps_on(family), rounds=self.rounds, memory=memory)
+        return FitOptions(steps=self.steps_on(family), batch=self.batch, rounds=self.rounds, memory=memory)
 
     def limit(self, price: float) -> float:
         """The threshold up to which splats are removed for a fit to make up for, where pruning had this one."""
