@@ -53,7 +53,7 @@ from potr_cl.quality.photographs import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.compact import Compact as Compact
 from potr_cl.stages.fitting.fit import FitOptions as FitOptions
-from potr_cl.stages.fitting.fit import fit_scene
+from potr_cl.stages.fitting.fit import Following, Sight, fit_scene
 from potr_cl.stages.fitting.fitted import Fitted
 from potr_cl.stages.prune import Prune as Prune
 from potr_cl.stages.pruning.schedule import Pruned
@@ -531,11 +531,9 @@ def fit(
             first_interrupt_asks() as asked,
             Rasterizer(device, work.original, background=work.colour) as rasterizer,
         ):
-            return fit_scene(
-                device, work.scene, views, RenderedTargets(rasterizer, views),
-                dataclasses.replace(options, memory=memory), len(added), work.colour,
-                lambda done, most: work.progress("fit", 0.99 * done / most), _log.info, asked,
-            )  # fmt: skip
+            sight = Sight(views, RenderedTargets(rasterizer, views), len(added), work.colour)
+            following = Following(lambda done, most: work.progress("fit", 0.99 * done / most), _log.info, asked)
+            return fit_scene(device, work.scene, sight, dataclasses.replace(options, memory=memory), following)
 
     fitted, used = work.done("fit", fitted_to)
     work.write(fitted.scene)

@@ -9,6 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.host.threads import thread_pool
+from potr_cl.model.order import ascending
 from potr_cl.model.scene import FloatArray
 
 _F64 = NDArray[np.float64]
@@ -36,10 +38,11 @@ def codebook(values: FloatArray, weights: _F64 | None, entries: int) -> FloatArr
         (at most ``entries``,) float32, ascending, of few decimal digits; the values themselves where there are no more
         different ones.
     """
-    order = np.argsort(values, kind="stable")
-    ascending = values[order]
-    first = np.flatnonzero(np.concatenate([[True], ascending[1:] != ascending[:-1]]))
-    distinct = ascending[first].astype(np.float64)
+    with thread_pool() as pool:
+        order = ascending(values, pool.map)
+    in_order = values[order]
+    first = np.flatnonzero(np.concatenate([[True], in_order[1:] != in_order[:-1]]))
+    distinct = in_order[first].astype(np.float64)
     if len(distinct) <= entries:
         return distinct.astype(np.float32)
     each = np.ones(len(values)) if weights is None else weights[order].astype(np.float64)

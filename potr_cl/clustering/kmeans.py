@@ -251,13 +251,14 @@ def _neighbours(cells: FloatArray, homes: U32, popular: int) -> Lists:
     lived_in = np.flatnonzero(counts)
     many = min(_NEIGHBOURS, len(lived_in))
     places = cells.reshape(len(cells), -1).astype(np.float64)
+    others = places[lived_in]
     runs = np.empty((len(cells), many + (popular > 0), 2), np.uint32)
 
     def find(start: int) -> None:
-        for number in range(start, min(start + _CELLS_AT_ONCE, len(places))):
-            away = np.square(places[lived_in] - places[number]).sum(axis=1)
-            near = lived_in[np.argsort(away, kind="stable")[:many]]
-            runs[number, :many, 0], runs[number, :many, 1] = firsts[near], counts[near]
+        some = slice(start, start + _CELLS_AT_ONCE)
+        away = np.square(others - places[some, None]).sum(axis=2)
+        near = lived_in[np.argsort(away, axis=1, kind="stable")[:, :many]]
+        runs[some, :many, 0], runs[some, :many, 1] = firsts[near], counts[near]
 
     with thread_pool() as pool:
         list(pool.map(find, range(0, len(places), _CELLS_AT_ONCE)))

@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,7 @@ from potr_cl.pipeline.run import Stopwatch, added_up
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.raster.resident import ResidentScene
 from potr_cl.stages.fit import STEPS, Fit
+from potr_cl.stages.fitting.fit import FitOptions
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.stage import Progress
 from potr_cl.workers.pool import Pool
@@ -39,6 +40,12 @@ _log = logging.getLogger("potr_cl")
 
 #: The part of a usual fit's steps that a level is fitted for where no fit is asked for.
 _FITTED = 0.25
+#: Views that a step of its fit looks at, for each at full size: as many pixels; and the most. Where a view shows a part
+#: of a scene, that many more splats are looked at.
+_BATCH, _MOST_BATCH = FitOptions.batch, 32
+#: How much holds colours to their start: from 0.1 on views that nobody has given look better. Little is left of a scene
+#: whose splats have grown.
+_PRIOR = 3.0
 #: The most iterations of the pruning before it, which makes up for what fewer of them do worse.
 _ITERATIONS = 16
 
@@ -88,14 +95,14 @@ def encode_levels(
         assert cameras is not None
         _log.info("level %d of %d: %s splats", level, len(counts) - 1, f"{count:,}")
         family = None if made.device is None else made.device.family
-        made = one(views_of_level(cameras, level), coarser(single, count, family), made)
+        made = one(views_of_level(cameras, level), coarser(single, level, count, family), made)
         files.append(made.data)
         seconds = added_up(seconds, made.seconds)
     watch = Stopwatch(progress)
     watch("levels", 0.0)
     opened = first.device or device
 
-    @lru_cache(maxsize=2)  # a level and the one before: of a large scene, no more fit the memory
+    @cache  # each has half the splats of the one before: all together take no more than twice the first
     def read(level: int) -> Scene:
         return single.output.read(files[level], trust=True)
 
@@ -104,7 +111,7 @@ def encode_levels(
         between = measuring_views(scene, views)
         scales = scales_shown(opened, read, len(files), between, options.background)
     errors = MeasuredErrors(opened, views, scene, options.background, options.memory, between, scales)
-    pieces = output.levelled(files, errors)
+    pieces = output.levelled(files, errors, read)
     levels = [LevelMade(*each) for each in zip(counts, scales, strict=True)]
     if judge and cameras is not None and opened is not None:
         for k, scale in enumerate(scales):
@@ -120,7 +127,7 @@ def encode_levels(
     )  # fmt: skip
 
 
-def coarser(options: EncodeOptions, count: int, family: Family | None) -> EncodeOptions:
+def coarser(options: EncodeOptions, level: int, count: int, family: Family | None) -> EncodeOptions:
     """The options of a level of so many splats: those of photographs' size are not looked at.
 
     It is fitted in any case, if only for a while: few splats in small pictures have to be wider and more opaque than
@@ -128,6 +135,7 @@ def coarser(options: EncodeOptions, count: int, family: Family | None) -> Encode
 
     Args:
         options: of the finest level.
+        level: from 1 on.
         count: of the splats.
         family: of the device; None: there is none.
     """
@@ -137,5 +145,6 @@ def coarser(options: EncodeOptions, count: int, family: Family | None) -> Encode
     fit: dict[str, Any] = {}
     if family is not None and options.preset != "paper" and not options.stage(Fit).asked_for:
         prune["iterations"] = min(options.stage(Prune).iterations, _ITERATIONS)
-        fit = {"steps": round(_FITTED * STEPS[family]), "compared": False}
-    return options.changed(prune=prune, fit=fit, refit={"ground_truth": None})
+        fit = {"steps": round(_FITTED * STEPS[family]), "compared": False, "batch": min(_BATCH << level, _MOST_BATCH)}
+    merge = {"on": options.preset != "paper"}
+    return options.changed(prune=prune, merge=merge, fit=fit, refit={"ground_truth": None, "prior": _PRIOR})

@@ -20,7 +20,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from potr_cl.host.threads import Ahead
+from potr_cl.host.threads import Ahead, thread_pool
 from potr_cl.levels.budgets import coverage
 from potr_cl.levels.environment import Surroundings
 from potr_cl.levels.plan import scale_of_level
@@ -208,21 +208,42 @@ class SharedOut:
         left = iter(scenes)
         while some := list(islice(left, _CHANNELS)):
             differences = [np.zeros((*picture.shape[:2], _CHANNELS), np.float32) for picture in self._pictures]
-            for channel, scene in enumerate(some):
-                for own, difference, (picture, _) in zip(
-                    self._pictures, differences, self._rendered(scene), strict=True
-                ):
-                    difference[:, :, channel] = np.square(picture.clip(0, 1) - own).mean(axis=2)
-            views = ((difference, self._of_splats(number, difference)) for number, difference in enumerate(differences))
-            with Ahead(self._of_leaves, views) as parts:
-                found.append(np.array([each for _, each in parts])[:, :, : len(some)])
+
+            def compare(channel: int, own: FloatArray, difference: FloatArray, picture: FloatArray) -> None:
+                difference[:, :, channel] = np.square(picture.clip(0, 1) - own).mean(axis=2)
+
+            def targets_of(covered: FloatArray, difference: FloatArray) -> FloatArray:
+                # Of a grey scene in front of black; what the picture should show is darker where the error is larger.
+                dark: FloatArray = covered - difference / np.maximum(difference.max(axis=(0, 1)), np.float32(1e-30))
+                return dark
+
+            with thread_pool() as pool:
+                compared = [
+                    pool.submit(compare, channel, own, difference, picture)
+                    for channel, scene in enumerate(some)
+                    for own, difference, (picture, _) in zip(
+                        self._pictures, differences, self._rendered(scene), strict=True
+                    )
+                ]
+                for each in compared:
+                    each.result()
+                targets = pool.map(targets_of, self._covered, differences)
+                views = (
+                    (difference, self._of_splats(number, target))
+                    for number, (difference, target) in enumerate(zip(differences, targets, strict=True))
+                )
+                with Ahead(self._of_leaves, views) as parts:
+                    found.append(np.array([each for _, each in parts])[:, :, : len(some)])
         return np.concatenate(found, axis=2)
 
-    def _of_splats(self, number: int, difference: FloatArray) -> FloatArray:
-        """(N, 3) what splats of the finest level have in three pictures' squared differences (H, W, 3)."""
-        # Of a grey scene in front of black; what the picture should show is darker where the error is larger.
-        largest = np.maximum(difference.max(axis=(0, 1)), np.float32(1e-30))
-        target = _Picture(self._device, self._covered[number] - difference / largest)
+    def _of_splats(self, number: int, picture: FloatArray) -> FloatArray:
+        """(N, 3) what splats of the finest level have in three pictures' squared differences.
+
+        Args:
+            number: of the view.
+            picture: (H, W, 3) that a grey scene should show in it, darker where the differences are larger.
+        """
+        target = _Picture(self._device, picture)
         coefficients, view = self._coefficients, self._views[number]
         coefficients.zero(self._sums)
         with OwnViews(self._sweep, self._rasterizer, coefficients, [view], memory=self._memory) as own:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from potr_cl.errors import DataError, UsageError
 from potr_cl.model.lens import Lens, Pinhole
 
 Split = str  # "train" or "test"
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +120,11 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
         cy=camera.cy * down,
         image_path=None,
     )
+
+
+def spread_evenly(views: Sequence[T], most: int) -> list[T]:
+    """So many of some views at most, from the first to the last."""
+    return [views[k] for k in np.linspace(0, len(views) - 1, min(len(views), most)).round().astype(int)]
 
 
 def train_views(cameras: Sequence[Camera]) -> list[Camera]:

@@ -34,6 +34,21 @@ def ascending(score: NDArray[Any], run: Run = map) -> NDArray[np.int64]:
     return _sorted(score) if len(score) < _LARGE else over_ranges(score, finish, run)
 
 
+def least(score: NDArray[Any], count: int) -> NDArray[np.bool_]:
+    """(N,) which are the ``count`` least scores, of equal ones the first: those that :func:`ascending` begins with.
+
+    Args:
+        score: (N,), no NaN.
+        count: from 0 to N.
+    """
+    if count == 0:
+        return np.zeros(len(score), bool)
+    last = np.partition(score, count - 1)[count - 1]
+    found: NDArray[np.bool_] = score < last
+    found[np.flatnonzero(score == last)[: count - np.count_nonzero(found)]] = True
+    return found
+
+
 def _sorted(score: NDArray[Any]) -> NDArray[np.int64]:
     """The unstable sort is ten times as fast, and ties are few."""
     order = np.argsort(score)

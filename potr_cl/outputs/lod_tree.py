@@ -9,12 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.host.threads import thread_pool
+from potr_cl.host.threads import in_background, thread_pool
+from potr_cl.model.order import least
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.model.spherical_harmonics import rotation_matrices
 
 #: Splats whose ellipsoids are bounded at a time.
 _BLOCK = 1 << 16
+#: A node of more splats has a thread for each half.
+_MANY = 1 << 19
 #: Digits of a bound.
 _DIGITS = 7
 
@@ -81,8 +84,10 @@ def lod_tree(scenes: Sequence[Scene], limits: Limits, near: Sequence[NDArray[np.
         sides = centres.max(axis=0).astype(np.float64) - centres.min(axis=0)
         wide = sides.max() > limits.extent and len(numbers) > limits.fewest
         if len(numbers) > 1 and (len(numbers) > limits.splats or wide):
-            lower = _lower_half(centres[:, int(sides.argmax())])
-            children = node(numbers[lower]), node(numbers[~lower])
+            lower = least(centres[:, int(sides.argmax())], len(numbers) // 2)
+            first = in_background(node, numbers[lower]) if len(numbers) > _MANY else None
+            second = node(numbers[~lower])
+            children = node(numbers[lower]) if first is None else first.result(), second
             low = np.minimum(children[0].low, children[1].low)
             return Node(low, np.maximum(children[0].high, children[1].high), children)
         cuts = np.searchsorted(numbers, ends)
@@ -91,15 +96,6 @@ def lod_tree(scenes: Sequence[Scene], limits: Limits, near: Sequence[NDArray[np.
         return Node((exact - extents[numbers]).min(axis=0), (exact + extents[numbers]).max(axis=0), (), rows)
 
     return node(np.arange(len(means)) if near is None else np.flatnonzero(np.concatenate(near)))
-
-
-def _lower_half(values: FloatArray) -> NDArray[np.bool_]:
-    """(n,) which are the n // 2 lowest; of equal ones the first."""
-    half = len(values) // 2
-    middle = np.partition(values, half)[half]
-    lower: NDArray[np.bool_] = values < middle
-    lower[np.flatnonzero(values == middle)[: half - np.count_nonzero(lower)]] = True
-    return lower
 
 
 def extents_of(scene: Scene) -> FloatArray:

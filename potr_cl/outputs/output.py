@@ -250,12 +250,13 @@ class Output(ABC):
         """The kind of file that each level of detail is encoded to, before :meth:`levelled`."""
         return self
 
-    def levelled(self, files: Sequence[bytes], errors: LevelErrors) -> list[bytes]:
+    def levelled(self, files: Sequence[bytes], errors: LevelErrors, read: Callable[[int], Scene]) -> list[bytes]:
         """The pieces of one file of several levels of detail.
 
         Args:
             files: of :meth:`of_level`'s kind, the finest level first.
             errors: what the coarser ones lose.
+            read: what readers see of a level.
         """
         raise NotImplementedError
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar
@@ -84,7 +84,7 @@ class Potr(Output):
             rounded,
         )
 
-    def levelled(self, files: Sequence[bytes], errors: LevelErrors) -> list[bytes]:
+    def levelled(self, files: Sequence[bytes], errors: LevelErrors, read: Callable[[int], Scene]) -> list[bytes]:
         """See :func:`potr_cl.codec.levels.joined_levels`."""
         opened = [open_file(data, trust=True) for data in files]
         return joined_levels(opened, [errors.of_level(level) for level in range(len(files))])

@@ -82,7 +82,7 @@ class Sog(Output):
         """See :func:`potr_cl.outputs.sog_geometry.rounded_geometry`."""
         with thread_pool(request.threads) as pool:
             distances = distances_to_views(scene.means, request.views, pool.map)
-        geometry = rounded_geometry(scene, request.parameters, distances)
+            geometry = rounded_geometry(scene, request.parameters, distances, pool.map)
         return SogRounded(request.parameters, geometry.order, geometry.seen(scene), geometry=geometry)
 
     def fix_ac(
@@ -98,8 +98,16 @@ class Sog(Output):
             return replace(rounded, worth=bits), sh
         device = request.device or Device()
         order = rounded.order
-        points = np.ascontiguousarray(sh.take(order, axis=0)[:, 1:])
-        weights = np.ascontiguousarray(bits.take(order, axis=0)[:, 1:])
+        points = np.empty((len(sh), sh.shape[1] - 1, 3), np.float32)
+        weights = np.empty(points.shape[:2], np.float32)
+
+        def arrange(start: int) -> None:
+            some = slice(start, start + _BLOCK)
+            points[some] = sh.take(order[some], axis=0)[:, 1:]
+            weights[some] = bits.take(order[some], axis=0)[:, 1:]
+
+        with thread_pool(request.threads) as pool:
+            list(pool.map(arrange, range(0, len(sh), _BLOCK)))
         most = min(max(int(len(points) * _MOST_A_SPLAT), 1), PALETTE)
         found = cluster(device, points, weights, most, Rate(_BITS_AN_ENTRY))
         palette = _coded(device, points, weights, found.centres, found.labels)
@@ -204,7 +212,8 @@ def _coded(
 ) -> Palette:
     """A palette of some sets, whose coefficients are rounded; then each splat takes the best one once more."""
     count = len(centres)
-    mass = np.stack([np.bincount(labels, column, count) for column in weights.T], axis=1)
+    with thread_pool() as pool:
+        mass = np.stack(list(pool.map(lambda column: np.bincount(labels, column, count), weights.T)), axis=1)
     levels = graded(centres, mass.astype(np.float32))
     having = np.bincount(labels, minlength=count)
     with np.errstate(divide="ignore"):

@@ -7,9 +7,10 @@ in the order of the leaves of a k-d tree, and cut into chunks.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
+from itertools import chain
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -30,6 +31,8 @@ from potr_cl.outputs.sog_chunks import SogChunks
 
 #: The folder of what viewers always show.
 _ENVIRONMENT = "env"
+#: Threads that pack chunks.
+_PACKING = 16
 #: Digits of an error.
 _DIGITS = 7
 
@@ -49,11 +52,10 @@ class StreamedSog(LevelFolder, Sog):
         """A .sog file."""
         return Sog()
 
-    def levelled(self, files: Sequence[bytes], errors: LevelErrors) -> list[bytes]:
+    def levelled(self, files: Sequence[bytes], errors: LevelErrors, read: Callable[[int], Scene]) -> list[bytes]:
         """An archive of the folder."""
-        read = cache(lambda level: self.of_level().read(files[level], trust=True))
         limits, count = self.limits, self.limits.splats
-        scenes: list[Scene] = [read(level) for level in range(len(files))]
+        scenes = [read(level) for level in range(len(files))]
         far = [errors.far(scene) for scene in scenes]
         near = [~each if far[0].any() else np.ones(len(each), bool) for each in far]
         sky = np.flatnonzero(~near[0])
@@ -66,25 +68,30 @@ class StreamedSog(LevelFolder, Sog):
             return joined([scenes[level].subset(np.flatnonzero(near[level])), scenes[0].subset(sky)])
 
         lost = errors.of_leaves(shown, len(files), _numbers(leaves, len(scenes[0])), _boxes(leaves))
-        folder: dict[str, bytes] = {}
         filenames: list[str] = []
         places: list[dict[str, dict[str, int]]] = [{} for _ in leaves]
-        for level, data in enumerate(files):
-            chunks = SogChunks(data)
-            parts: dict[str, NDArray[np.int64]] = {}
-            for number, chunk in enumerate(_in_chunks([leaf.rows[level] for leaf in leaves], count)):
-                name, offset = f"{level}_{number}", 0
-                for leaf in chunk:
-                    rows = leaves[leaf].rows[level]
-                    places[leaf][str(level)] = {"file": len(filenames), "offset": offset, "count": len(rows)}
-                    offset += len(rows)
-                parts[name] = np.concatenate([leaves[leaf].rows[level] for leaf in chunk])
-                filenames.append(f"{name}/{SOG_DESCRIPTION}")
-            if len(sky) and not level:
-                parts[_ENVIRONMENT] = sky
-            with Ahead(chunks.folder, parts.values()) as made:
-                for name, (_, own) in zip(parts, made, strict=True):
-                    folder |= {f"{name}/{file}": content for file, content in own.items()}
+
+        def parts() -> Iterator[tuple[str, SogChunks, NDArray[np.int64]]]:
+            """The name, the level and the splats of each folder in the folder."""
+            for level, data in enumerate(files):
+                chunks = SogChunks(data)
+                for number, chunk in enumerate(_in_chunks([leaf.rows[level] for leaf in leaves], count)):
+                    name, offset = f"{level}_{number}", 0
+                    for leaf in chunk:
+                        rows = leaves[leaf].rows[level]
+                        places[leaf][str(level)] = {"file": len(filenames), "offset": offset, "count": len(rows)}
+                        offset += len(rows)
+                    filenames.append(f"{name}/{SOG_DESCRIPTION}")
+                    yield name, chunks, np.concatenate([leaves[leaf].rows[level] for leaf in chunk])
+                if len(sky) and not level:
+                    yield _ENVIRONMENT, chunks, sky
+
+        def packed(part: tuple[str, SogChunks, NDArray[np.int64]]) -> dict[str, bytes]:
+            name, chunks, rows = part
+            return {f"{name}/{file}": content for file, content in chunks.folder(rows).items()}
+
+        with Ahead(packed, parts(), min(os.cpu_count() or 1, _PACKING)) as made:
+            folder = dict(chain.from_iterable(own.items() for _, own in made))
         told = iter(zip(places, lost.tolist(), strict=True))
 
         def of_leaf(_: Node) -> dict[str, Any]:

@@ -7,7 +7,7 @@ first, each of which the next one replaces.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -15,6 +15,7 @@ import numpy as np
 
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes import gltf_file, spz, tileset
+from potr_cl.model.scene import Scene
 from potr_cl.outputs.level_folder import LevelFolder, archive
 from potr_cl.outputs.lod_tree import Node, lod_tree
 from potr_cl.outputs.output import LevelErrors, Output
@@ -47,9 +48,9 @@ class Tiles(LevelFolder, Gltf):
         """A .glb file."""
         return Gltf(version=self.version)
 
-    def levelled(self, files: Sequence[bytes], errors: LevelErrors) -> list[bytes]:
+    def levelled(self, files: Sequence[bytes], errors: LevelErrors, read: Callable[[int], Scene]) -> list[bytes]:
         """An archive of the folder."""
-        scenes = [self.of_level().read(data, trust=True) for data in files]
+        scenes = [read(level) for level in range(len(files))]
         packed = [gltf_file.spz_in(data) for data in files]
         lost = np.maximum.accumulate([_PIXELS * errors.of_level(level) for level in range(len(files))]).tolist()
         tree = lod_tree(scenes, self.limits)

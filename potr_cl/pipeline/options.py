@@ -228,7 +228,8 @@ def stage_changes(
 ) -> dict[str, dict[str, Any]]:
     """What keywords choose of stages, as :meth:`potr_cl.pipeline.options.EncodeOptions.changed` takes it.
 
-    A keyword that is a stage's own name may also be a mapping of options by field: ``prune={"iterations": 16}``.
+    A keyword that is a stage's own name may also be a mapping of options by field: ``prune={"iterations": 16}``; or
+    False or True, where it is no flag's: ``between=False``.
 
     Args:
         choices: by keyword; a value of None leaves the option as it is.
@@ -245,8 +246,8 @@ def stage_changes(
     for name, value in choices.items():
         if value is None:
             continue
-        if name in by_name and isinstance(value, Mapping):
-            more.setdefault(name, {}).update(value)
+        if name in by_name and (isinstance(value, Mapping) or name not in known):
+            more.setdefault(name, {}).update(_changes_of(name, value))
         elif name in known:
             kind, field, flag = known[name]
             field, chosen = _value(kind, field, flag, name, value)

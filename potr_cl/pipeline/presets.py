@@ -6,6 +6,7 @@ from potr_cl.codec.quantize import Preset
 from potr_cl.stages.code import Code
 from potr_cl.stages.compact import Compact
 from potr_cl.stages.fit import Fit
+from potr_cl.stages.merge import Merge
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.refit import Refit
 from potr_cl.stages.stage import Stage
@@ -19,6 +20,7 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
     "best": (
         Between(),
         Prune(),
+        Merge(),
         Fit(),
         Compact(on=False),
         Refit(steps=8),
@@ -27,6 +29,7 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
     "smallest": (
         Between(),
         Prune(iterations=32),
+        Merge(),
         Fit(steps="auto"),
         Compact(on=False),
         Refit(steps=8, at=(0.5,)),
@@ -35,6 +38,7 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
     "fast": (
         Between(),
         Prune(iterations=16),
+        Merge(),
         Fit(),
         Compact(on=False),
         Refit(steps=4),
@@ -43,6 +47,7 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
     "paper": (
         Between(views=0, weigh=False),
         Prune(tolerance=0.01),
+        Merge(),
         Fit(),
         Compact(),
         Refit(steps=0),

@@ -25,7 +25,7 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.resident import ResidentScene
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.stages.fit import Fit
-from potr_cl.stages.fitting.fit import held_out_error
+from potr_cl.stages.fitting.fit import Sight, held_out_error
 from potr_cl.stages.fitting.fitted import File, Fitted, LeftOut, TwoFiles
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.refit import Refit
@@ -101,7 +101,7 @@ class Trial:
             Rasterizer(self.device, self.source, background=self.background) as rasterizer,
         ):
             targets = RenderedTargets(rasterizer, state.views)
-            error = held_out_error(self.device, seen, state.views, targets, state.added, self.background)
+            error = held_out_error(self.device, seen, Sight(state.views, targets, state.added, self.background))
         return File(coded.nbytes, error)
 
 

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeVar
-
-import numpy as np
+from typing import Literal
 
 from potr_cl.errors import UsageError
 from potr_cl.formats.images import Colour
-from potr_cl.model.camera import Camera, test_views, train_views
+from potr_cl.model.camera import Camera, spread_evenly, test_views, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
@@ -26,8 +24,6 @@ from potr_cl.workers.pool import Pool
 _MOST_TRAINING_VIEWS = 32
 #: Beside held-out views so many training views are judged, as a part of them, and at least, and at most.
 _BESIDE, _LEAST_BESIDE, _MOST_BESIDE = 1 / 8, 4, 16
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -58,9 +54,9 @@ class EvaluationViews:
         if views:
             training = [camera for camera in cameras if camera.split == "train"]
             beside = min(max(round(_BESIDE * len(views)), _LEAST_BESIDE), _MOST_BESIDE)
-            return EvaluationViews(views, "test", len(views), tuple(_evenly(training, beside)))
+            return EvaluationViews(views, "test", len(views), tuple(spread_evenly(training, beside)))
         training = train_views(cameras)
-        return EvaluationViews(_evenly(training, _MOST_TRAINING_VIEWS), "train", len(training))
+        return EvaluationViews(spread_evenly(training, _MOST_TRAINING_VIEWS), "train", len(training))
 
     def named(self, name: str) -> int:
         """The number of the view of a name.
@@ -81,24 +77,12 @@ class EvaluationViews:
         return f"{which} {self.available} training views, for the cameras name no test views"
 
 
-def _evenly(views: Sequence[T], most: int) -> list[T]:
-    """So many of some views at most, from the first to the last."""
-    return [views[k] for k in np.linspace(0, len(views) - 1, min(len(views), most)).round().astype(int)]
-
-
 class Evaluator(Judging):
     """Compares candidates with one uncompressed scene.
 
     Args:
-        device: to render on.
-        scene: the uncompressed one.
-        views: to judge by.
-        background: behind both.
         pool: workers that the views are shared out to, of which ``device`` is the first; None: the device does all.
         remember: whether the scene's pictures are kept for the next candidate.
-
-    Attributes:
-        device, views: as given.
 
     Raises:
         DeviceError: the kernels cannot be built.
@@ -133,8 +117,10 @@ class Evaluator(Judging):
             coded: what the pool's workers on other computers are sent in its place.
             progress: called with the part of the views that is done.
         """
-        views = range(len(self.views.views))
-        return _mean_psnr(self.figures(candidate, views if most is None else _evenly(views, most), coded, progress))
+        count = len(self.views.views)
+        return _mean_psnr(
+            self.figures(candidate, spread_evenly(range(count), count if most is None else most), coded, progress)
+        )
 
     def judge(
         self, candidate: Drawable, progress: Callable[[str, float], None], coded: SceneHandle | None = None
@@ -166,11 +152,8 @@ def judge_by_photographs(
     """Judge a scene and its file by photographs of test views; where no test view has one, of training views.
 
     Args:
-        ground_truth: the photographs.
         cameras: all of the scene's.
         scenes: uncompressed, and as a decoder sees the file.
-        device: to render on.
-        background: behind both.
         pool: workers that views are shared out to, if they are devices of this computer, which has the photographs.
 
     Raises:

@@ -49,7 +49,6 @@ class Looks:
     """How pictures are made, and what besides they are compared with.
 
     Attributes:
-        background: behind all scenes.
         rules: of the rasterizer.
         ground_truth, lpips: as of :class:`potr_cl.quality.figures.Against`.
         remember: whether the uncompressed scene's pictures are kept for the next candidate.
@@ -66,10 +65,8 @@ class JudgingPart(Part):
     """Compares candidates with one uncompressed scene, on one device.
 
     Args:
-        device: to render on.
         memory: of no account: pictures come and go.
         reference: the uncompressed scene; its pictures are made when they are first wanted.
-        looks: how pictures are made.
         views: all views that may be judged.
         groups: of the reference's splats, where views see little of it.
 
@@ -101,7 +98,6 @@ class JudgingPart(Part):
         """Judge a candidate from now on, until :meth:`forget`.
 
         Args:
-            candidate: to judge.
             groups: of its splats, where it is better drawn by what views see of it.
 
         Raises:
@@ -123,10 +119,6 @@ class JudgingPart(Part):
 
     def figures(self, numbers: Sequence[int], told: Callable[[], None] = lambda: None) -> list[ViewFigures]:
         """The figures of some views, in their order.
-
-        Args:
-            numbers: of the views.
-            told: called after each.
 
         Raises:
             As :meth:`potr_cl.quality.figures.Against.figures`.
@@ -190,10 +182,7 @@ class Judging(Owner):
     """Compares candidates with one uncompressed scene.
 
     Args:
-        device: of this process, the pool's first.
-        reference: the uncompressed scene.
         views: all views that may be judged.
-        looks: how pictures are made.
         pool: workers that views are shared out to; None: the device does all.
         anyway: whether other computers are sent the uncompressed scene, however large.
         coded: the uncompressed scene for other computers, where there is something smaller.

@@ -8,26 +8,30 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from contextlib import ExitStack
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 from potr_cl.errors import UsageError
 from potr_cl.host.process import first_interrupt_asks
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import Scene
 from potr_cl.model.views_between import views_between
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.discovery import Family
 from potr_cl.quality.photographs import GroundTruth
-from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Rates
-from potr_cl.stages.fitting.fit import FitOptions, FitProgress, SupportsBool, fit_scene, held_out_error, kept_pictures
+from potr_cl.stages.fitting.fit import FitOptions, Following, Sight, SupportsBool, fit_scene, held_out_error
 from potr_cl.stages.fitting.fitted import Fitted, LeftOut
 from potr_cl.stages.fitting.photographs import fit_to_photographs, longer
-from potr_cl.stages.fitting.settling import Looking, Settling, settle
+from potr_cl.stages.fitting.settling import PicturesOf, Settling, settle
+from potr_cl.stages.fitting.together import kept_pictures
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
 from potr_cl.views.shares import HelpFrom
-from potr_cl.views.targets import RenderedTargets, TargetPictures, Targets
+from potr_cl.views.targets import RenderedTargets, targets_of
 
 #: Times the threshold of pruning up to which a fit makes up for splats, about (docs/benchmarks/findings.md): for this
 #: threshold, and for others as much more as its root is larger, because a fit brings the more, the fewer splats are
@@ -96,7 +100,7 @@ class Fit(Stage):
         choosing, rounding: how far what is left is fitted once more after the choice of coefficients and the rounding
             of geometry (:class:`potr_cl.stages.fitting.settling.Settling`).
         compared: whether two files say if it pays, where its gain is small (potr_cl/pipeline/run.py).
-        rounds: see :class:`potr_cl.stages.fitting.fit.FitOptions`.
+        rounds, batch: see :class:`potr_cl.stages.fitting.fit.FitOptions`.
 
     Raises:
         UsageError: a value is out of range.
@@ -123,6 +127,7 @@ class Fit(Stage):
     between: float | Literal["auto"] = option("auto")
     photograph_steps: int | Literal["auto"] = option("auto")
     rounds: int = option(FitOptions.rounds)
+    batch: int = option(FitOptions.batch)
     choosing: float = option(0.3)
     rounding: float = option(0.15)
     compared: bool = option(True)
@@ -167,7 +172,7 @@ class Fit(Stage):
         return BETWEEN[family] if self.between == "auto" else self.between
 
     def _options(self, family: Family, memory: int | None) -> FitOptions:
-        return FitOptions(steps=self.steps_on(family), rounds=self.rounds, memory=memory)
+        return FitOptions(steps=self.steps_on(family), batch=self.batch, rounds=self.rounds, memory=memory)
 
     def limit(self, price: float) -> float:
         """The threshold up to which splats are removed for a fit to make up for, where pruning had this one."""
@@ -185,16 +190,19 @@ class Fit(Stage):
         bench.progress("fit", 0.0)
         with ExitStack() as stack:
             stack.callback(bench.progress, "fit", 1.0)
-            source = bench.drawable(state.source)
-            rasterizer = stack.enter_context(Rasterizer(bench.opened, source, background=bench.background))
             asked = stack.enter_context(first_interrupt_asks())
             seen = self._looking_between(state, bench)
-            rendered = RenderedTargets(rasterizer, seen.views)
-            targets: Targets | TargetPictures = rendered
+
+            def pictures(scene: Scene, views: Sequence[Camera]) -> AbstractContextManager[RenderedTargets]:
+                visibility = bench.visibility_of_source(state, views) if scene is state.source else None
+                return targets_of(bench.opened, bench.drawable(scene), views, bench.background, visibility)
+
+            targets = stack.enter_context(pictures(state.source, seen.views))
+            sight = Sight(seen.views, targets, seen.added, bench.background, _help_from(bench, state))
             if bench.memory is None:  # else pruning needs all that is allowed, between two fits
-                targets = stack.enter_context(kept_pictures(bench.opened, seen.views, rendered))
-            help_from = _help_from(bench, state)
-            found = self._cycles(seen, bench, targets, asked, help_from)
+                kept = stack.enter_context(kept_pictures(bench.opened, seen.views, targets))
+                sight = dataclasses.replace(sight, targets=kept)
+            found = self._cycles(seen, bench, sight, asked)
             found = dataclasses.replace(found, views=state.views, added=state.added)
             if bench.photographs is not None and self.photograph_steps != 0 and not asked:
                 found = self._to_photographs(found, bench, asked)
@@ -203,12 +211,9 @@ class Fit(Stage):
             if asked or not (isinstance(told, Fitted) and told.spared):
                 return found
             if found.truth is not None:
-                rasterizer = stack.enter_context(Rasterizer(bench.opened, found.truth, background=bench.background))
-                targets = RenderedTargets(rasterizer, seen.views)
-            if found.goal is not state.goal:
-                help_from = _help_from(bench, found)
-            looking = Looking(seen.views, seen.added, targets, rasterizer, help_from)
-            return self._settled(found, bench, looking, asked)
+                targets = stack.enter_context(pictures(found.truth, seen.views))
+                sight = dataclasses.replace(sight, targets=targets, help_from=_help_from(bench, found))
+            return self._settled(found, bench, sight, partial(pictures, found.goal), asked)
 
     def _looking_between(self, state: State, bench: Workbench) -> State:
         """The state with the views that the fit looks at."""
@@ -219,14 +224,11 @@ class Fit(Stage):
         added = views_between(state.source, given, each)  # with threads it takes twice as long
         return dataclasses.replace(state, views=(*given, *added), added=len(added))
 
-    def _cycles(
-        self, state: State, bench: Workbench, targets: Targets | TargetPictures, asked: SupportsBool,
-        help_from: HelpFrom | None,
-    ) -> State:  # fmt: skip
+    def _cycles(self, state: State, bench: Workbench, sight: Sight, asked: SupportsBool) -> State:
         """Remove splats and fit by turns, each time up to a higher threshold, and keep what costs least."""
         price = state.results.price
         worth = 0.0 if price is None else _WORTH * price
-        without = held_out_error(bench.opened, state.scene, state.views, targets, state.added, bench.background)
+        without = held_out_error(bench.opened, state.scene, sight)
         least = plain = without + worth * len(state.scene)
         further = 1.0
         if price is not None:
@@ -244,7 +246,12 @@ class Fit(Stage):
             def progress(now: int, _steps: int, before: int = done) -> None:
                 bench.progress("fit", 0.99 * (before + now) / total)
 
-            fitted = self._fitted(last, bench, targets, steps, progress, asked, help_from)
+            options = dataclasses.replace(
+                self._options(bench.opened.family, bench.memory),
+                steps=steps,
+                rates=self._sparse(FitOptions.rates, last),
+            )
+            fitted = fit_scene(bench.opened, last.scene, sight, options, Following(progress, bench.tell, asked))
             last, done = dataclasses.replace(last, scene=fitted.scene, geometry=None), done + steps
             cost = fitted.error + worth * len(fitted.scene)
             spared = len(state.scene) - len(fitted.scene)
@@ -258,7 +265,9 @@ class Fit(Stage):
             return state.with_results(fitted=LeftOut(why, bool(asked)))
         return best.with_results(fitted=taken)
 
-    def _settled(self, state: State, bench: Workbench, looking: Looking, asked: SupportsBool) -> State:
+    def _settled(
+        self, state: State, bench: Workbench, sight: Sight, pictures: PicturesOf, asked: SupportsBool
+    ) -> State:
         """Choose coefficients and round geometry, with what is left fitted once more in between."""
         options = self._options(bench.opened.family, bench.memory)
         settling = Settling(self.choosing, self.rounding)
@@ -269,7 +278,7 @@ class Fit(Stage):
             done += steps
             bench.progress("fit", min(done / total, 1.0) * 0.99)
 
-        then, errors = settle(state, bench, looking, settling, options, asked, progress)
+        then, errors = settle(state, bench, sight, pictures, settling, options, asked, progress)
         told = state.results.fitted
         assert isinstance(told, Fitted)
         return then.with_results(fitted=dataclasses.replace(told, settled=errors))
@@ -293,9 +302,9 @@ class Fit(Stage):
             rates=self._sparse(longer(FitOptions.rates), state),
         )
         bench.progress("fit to photographs", 0.0)
+        following = Following(lambda done, steps: bench.progress("fit to photographs", done / steps), bench.tell, asked)
         found = fit_to_photographs(
-            bench.opened, state.scene, views, photographs, options, bench.background, bench.tell,
-            asked, lambda done, steps: bench.progress("fit to photographs", done / steps),
+            bench.opened, state.scene, views, photographs, options, bench.background, following
         )  # fmt: skip
         bench.progress("fit to photographs", 1.0)
         told = state.results.fitted
@@ -316,30 +325,10 @@ class Fit(Stage):
         left = Prune(iterations=ITERATIONS).run(state, alone)
         return dataclasses.replace(left, results=state.results)
 
-    def _fitted(
-        self,
-        state: State,
-        bench: Workbench,
-        targets: Targets | TargetPictures,
-        steps: int,
-        progress: FitProgress,
-        asked: SupportsBool,
-        help_from: HelpFrom | None,
-    ) -> Fitted:
-        options = dataclasses.replace(self._options(bench.opened.family, bench.memory), steps=steps)
-        options = dataclasses.replace(options, rates=self._sparse(options.rates, state))
-        return fit_scene(
-            bench.opened, state.scene, state.views, targets, options, state.added, bench.background, progress,
-            bench.tell, asked, help_from=help_from,
-        )  # fmt: skip
-
 
 def _help_from(bench: Workbench, state: State) -> HelpFrom | None:
     """Who helps to fit to the pictures of a state's goal."""
-    pool, kept = bench.pool, bench.kept
-    if pool is None:
+    pool, goal = bench.pool, state.goal
+    if pool is None or not (pool.in_process or pool.has(goal) or goal.nbytes <= _SENT_ANYWAY):
         return None
-    if not pool.in_process and not pool.has(state.goal) and state.goal.nbytes > _SENT_ANYWAY:
-        return None
-    there = kept is not None and pool.in_process and kept.is_of(state.goal)
-    return HelpFrom(pool, kept if kept is not None and there else state.goal)
+    return HelpFrom(pool, bench.as_shared(goal))

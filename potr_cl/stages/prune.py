@@ -15,7 +15,7 @@ from potr_cl.raster.resident import scene_on
 from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.stages.pruning.controller import prune_scene
 from potr_cl.stages.pruning.helpers import importances_of, measurement
-from potr_cl.stages.pruning.removal import LARGEST_LIMIT, RemovalSweep
+from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import Course, Pruned, PruningOptions
 from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
@@ -160,7 +160,7 @@ class Prune(Stage):
             hidden, area = unseen or find_unseen(state, groups, pool.map)
             visibility = visibility_of_large(state.scene, state.views, groups, pool.map) if likely else None
             groups = None
-            if visibility is not None and (bench.pool is None or bench.pool.in_process):
+            if visibility is not None and bench.all_here:
                 visibility = visibility.lasting()
         splats = int(np.count_nonzero(hidden))
         kept = self.unseen == "keep" and self.keep is None and self.count is None
@@ -169,12 +169,7 @@ class Prune(Stage):
         if not (kept and splats):
             return self._pruned(told, bench, visibility)
         # A copy of a large scene without them would take as much memory as the scene.
-        if (
-            visibility is not None
-            and (bench.pool is None or bench.pool.in_process)
-            and not bench.interludes
-            and bench.parameters.delta_mse_max < LARGEST_LIMIT
-        ):
+        if visibility is not None and bench.all_here and not bench.interludes:
             return self._pruned(told, bench, visibility, hidden=hidden)
         seen = np.flatnonzero(~hidden)
         if not len(seen):
@@ -203,7 +198,7 @@ class Prune(Stage):
             likely = seen_part(state.scene, state.views) <= MOST_SEEN
             groups = groups_of_large(state.scene, pool.map) if likely else None
             visibility = visibility_of_large(state.scene, state.views, groups, pool.map)
-            if visibility is not None and (bench.pool is None or bench.pool.in_process):
+            if visibility is not None and bench.all_here:
                 visibility = visibility.lasting()
         told = self._told(state, bench, visibility).with_results(unseen=unresolved)
         return self._pruned(told, bench, visibility)
@@ -213,7 +208,9 @@ class Prune(Stage):
         if state.scene is state.source:
             state = replace(state, visibility=visibility)
             if visibility is not None and bench.kept is not None and bench.kept.is_of(state.source):
-                bench.kept.groups = visibility.groups  # for who judges by pictures later
+                bench.kept.groups = visibility.groups  # for who judges by pictures later, and for coarser levels
+        else:
+            state = replace(state, visibility=bench.visibility_of_source(state, state.views))
         if self.keep is None and self.count is None:
             state = state.with_results(price=bench.parameters.delta_mse_max)
         return state
@@ -229,25 +226,24 @@ class Prune(Stage):
         """The state after pruning.
 
         Args:
-            state, bench: of the stage.
             visibility: what the views see of the splats that are pruned.
-            seen: (n,) numbers of these, ascending; None: all of the state's scene, where the measurement spares hidden
-                ones.
+            seen: (n,) numbers of these, ascending; None: all of the state's scene, hidden ones too.
             hidden: (N,) which splats are kept in any case, without what of their colours depends on the direction.
         """
-        spared = hidden if seen is None else None
         dealt = None
-        if visibility is not None and bench.pool is not None and not bench.pool.in_process:
+        if visibility is not None and bench.pool is not None and not bench.all_here:
             dealt = _dealt(state, seen, bench.pool, visibility)
             state = state.with_results(shares=dealt)
         unresolved = state.results.unresolved
-        stays = None if unresolved is None else unresolved.among(state.survivors)
+        stays = hidden if seen is None else None
+        if unresolved is not None:
+            stays = unresolved.among(state.survivors)
         waiting = sorted(bench.interludes, key=lambda interlude: interlude.after)
         schedule = self._schedule(bench.parameters.delta_mse_max, len(state.scene) if seen is None else len(seen))
         bench.progress("prepare views", 0.0)
-        with measurement(state, bench, self._sweep_options(bench.memory), visibility, spared, dealt, seen) as removal:
+        with measurement(state, bench, self._sweep_options(bench.memory), visibility, dealt, seen) as removal:
             course = _Course(state, removal, seen)
-            ready = removal.resident_views >= (1 - _MADE_AGAIN) * len(state.views)
+            ready = removal.ready_views >= (1 - _MADE_AGAIN) * len(state.views)
 
             def after_iteration(iteration: int) -> None:
                 while waiting and iteration + 1 >= waiting[0].after:

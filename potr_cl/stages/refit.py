@@ -55,6 +55,7 @@ class Refit(Stage):
         at: parts of the pruning iterations after which colours are re-fitted too, so that later iterations see colours
             that make up for the splats that went.
         at_steps: steps of each of these.
+        prior: see :class:`potr_cl.stages.refitting.refit_options.RefitOptions`.
         ground_truth: folder of the views' photographs, named after the views. The colours are then fitted to the
             photographs instead of the uncompressed scene's pictures, if photographs that are held out agree that this
             is better; but not if a fit of all parameters has come near to them before.
@@ -98,6 +99,7 @@ class Refit(Stage):
         ),
     )
     at_steps: int = option(3)
+    prior: float = option(RefitOptions.prior)
     ground_truth: Path | None = option(
         None,
         Flag(
@@ -114,7 +116,7 @@ class Refit(Stage):
         for part in self.at:
             if not 0 <= part <= 1:
                 raise UsageError(f"--refit-at is {part:g}, it must lie between 0 and 1")
-        _ = RefitOptions(steps=self.steps), RefitOptions(steps=self.at_steps)
+        _ = RefitOptions(steps=self.steps, prior=self.prior), RefitOptions(steps=self.at_steps)
 
     @classmethod
     def from_flags(cls, given: dict[str, Any]) -> dict[str, Any]:
@@ -139,7 +141,7 @@ class Refit(Stage):
         active = active_coefficients(state.scene.sh, parameters.sf_sh) if compacted else None
         if state.results.chosen == parameters:
             active = chosen_coefficients(state.scene.sh)
-        options = RefitOptions(steps=self.steps, drop=parameters.drop, memory=bench.memory)
+        options = RefitOptions(steps=self.steps, drop=parameters.drop, memory=bench.memory, prior=self.prior)
         on_grid = bench.output.on_grid(bench.request(state))
         # What has been fitted to photographs already is what the colours should show again once all else is rounded.
         folder = self.ground_truth if state.truth is None else None

@@ -30,7 +30,7 @@ from potr_cl.outputs.potr import Potr
 from potr_cl.raster.resident import ResidentScene, ResidentSubset
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.views.shares import ViewShares
-from potr_cl.views.visibility import Visibility
+from potr_cl.views.visibility import Visibility, visibility_of_large
 from potr_cl.workers.pool import Pool, Shared
 
 if TYPE_CHECKING:
@@ -206,28 +206,36 @@ class Workbench:
 
     @contextmanager
     def shared(self, pool: Pool, state: State, some: NDArray[np.int64] | None = None) -> Iterator[Shared]:
-        """The same for a pool's workers, as long as the context lasts.
+        """The same for workers of other processes, as long as the context lasts.
 
-        Threads of this process have it from what is kept on their devices. Others are sent the source, which later
-        stages need too, and numbers.
+        They are sent the source, which later stages need too, and numbers.
         """
-        if pool.in_process:
-            with pool.shared(self.scene_of(state, some)) as placed:
-                yield placed
-            return
         numbers = some
         if state.is_cut and state.scene is not state.source:
             numbers = state.survivors if some is None else state.survivors[some]
         with pool.shared(state.source if state.is_cut else state.scene) as whole:
             yield whole if numbers is None else Shared(whole.handle, numbers.astype(np.uint32))
 
+    @property
+    def all_here(self) -> bool:
+        """Whether nobody of another process works on it."""
+        return self.pool is None or self.pool.in_process
+
     def shared_source(self, state: State) -> Scene | ResidentScene | ViewShares:
         """A state's source for the pool's workers; where they have what their views see already, that."""
-        in_process = self.pool is not None and self.pool.in_process
         dealt = state.results.shares
-        if dealt is not None and dealt.views is state.views and not in_process:
+        if dealt is not None and dealt.views is state.views and not self.all_here:
             return dealt
-        return self.kept if self.kept is not None and in_process and self.kept.is_of(state.source) else state.source
+        return self.as_shared(state.source)
+
+    def as_shared(self, scene: Scene) -> Scene | ResidentScene:
+        """A scene for the pool's workers, or where they have it already."""
+        return self.kept if self.kept is not None and self.all_here and self.kept.is_of(scene) else scene
+
+    def visibility_of_source(self, state: State, views: Sequence[Camera]) -> Visibility | None:
+        """What views may draw of a state's source, where others were found to see little of it; else None."""
+        groups = self.kept.groups if self.kept is not None and self.kept.is_of(state.source) else None
+        return None if groups is None else visibility_of_large(state.source, views, groups)
 
     def request(self, state: State, metadata: bytes = b"", entropy: EntropyCoder | None = None) -> Request:
         """What the output is told besides the scene."""

@@ -107,8 +107,6 @@ class Unseen:
     """The splats that no training view sees.
 
     Attributes:
-        splats: how many they are.
-        of: how many splats the scene has.
         kept: whether they were kept, without what of their colours depends on the direction.
         find_area: returns their part of the scene's opacity-weighted area, once that is known.
     """
@@ -151,7 +149,6 @@ def find_unseen(
     Args:
         state: whose scene and views.
         groups: of the scene, where they are known.
-        run: shares the work out.
         surely_seen: finds quickly which splats some views see, (N,) :class:`potr_cl.views.reached.Seen`; those
             that it leaves undecided are looked at here.
     """

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import UsageError
 from potr_cl.host.threads import thread_pool
-from potr_cl.model.camera import Camera
+from potr_cl.model.camera import Camera, spread_evenly
 from potr_cl.model.given_views import GivenViews
 from potr_cl.model.scene import Scene
 from potr_cl.model.views_between import SPREAD, views_between
@@ -53,7 +53,6 @@ def needed(shown_by: float, views: int, slow: bool) -> float:
 
     Args:
         shown_by: how many training views show the scene where few do, as :func:`views_where_few` finds it.
-        views: the number of training views.
         slow: whether a CPU has to look at them.
     """
     few = shown_by < _FEW and not slow
@@ -107,7 +106,7 @@ def room_for(added: Sequence[Camera], state: State, bench: Workbench) -> int:
     pixels = sum(view.width * view.height for view in (*state.views, *added))
     if budget > _SPLAT * len(state.source) * (len(state.views) + len(added)) + _PIXEL * pixels:
         return len(added)
-    sampled = _some_of(state.views, _SAMPLE), _some_of(added, _SAMPLE)
+    sampled = spread_evenly(state.views, _SAMPLE), spread_evenly(added, _SAMPLE)
     if seen_part(state.source, state.views) <= MOST_SEEN:
         if _by_view(state, bench):
             own, more = (_nbytes_by_view(state, views) for views in (state.views, added))
@@ -125,19 +124,14 @@ def room_for(added: Sequence[Camera], state: State, bench: Workbench) -> int:
 
 def _by_view(state: State, bench: Workbench) -> bool:
     """Whether views that do not fit are made again in batches."""
-    shared = bench.pool is None or bench.pool.in_process
-    return shared and bench.opened.family == "gpu" and fits_whole(bench.opened, bench.drawable(state.source))
+    device = bench.opened
+    return bench.all_here and device.family == "gpu" and fits_whole(device, bench.drawable(state.source))
 
 
 def _nbytes_by_view(state: State, views: Sequence[Camera]) -> float:
     """Bytes that is kept of a view where each is looked at by itself: about the mean."""
     pixels = sum(view.width * view.height for view in views) / len(views)
     return _DRAWN * seen_part(state.source, views) * len(state.source) + _TARGET * pixels
-
-
-def _some_of(views: Sequence[Camera], count: int) -> list[Camera]:
-    """So many of some views at most, from the first to the last."""
-    return [views[round(place)] for place in np.linspace(0, len(views) - 1, min(count, len(views)))]
 
 
 def _nbytes_of_parts(state: State, bench: Workbench, views: Sequence[Camera]) -> float:
@@ -157,9 +151,8 @@ def _nbytes(bench: Workbench, scene: Drawable, views: Sequence[Camera]) -> float
     """Bytes that is kept of a view while splats are removed: the mean of some."""
     with Rasterizer(bench.opened, scene, background=bench.background) as rasterizer:
         with ExitStack() as prepared, rasterizer.preparing_many():
-            for number, view in enumerate(views):
-                own = PreparedSet(rasterizer, [number], rasterizer.prepare_set([view]))
-                prepared.enter_context(own)
+            for view in views:
+                prepared.enter_context(PreparedSet(rasterizer, rasterizer.prepare_set([view])))
             held = rasterizer.device.allocated
         # What the rasterizer works with is there before and after.
         return (held - rasterizer.device.allocated) / len(views)
@@ -206,7 +199,6 @@ class Added:
     """What the stage has added.
 
     Attributes:
-        given: the number of training views that were given.
         added: of views between them.
         shown_by: how many given views at most show the quarter of the scene that the fewest show; None if nobody asked,
             or they show nothing.

@@ -1,4 +1,8 @@
-"""Who decides what stays on the device: the memory that views may fill, and which groups of a plan get it.
+"""Who decides which views stay on the device: the memory that they may fill, and which groups of a plan get it.
+
+Other things than views have their own places: the uncompressed scene :mod:`potr_cl.raster.resident`, pictures
+:mod:`potr_cl.views.targets` (but what pruning compares streamed views with is :meth:`Budget.of_pictures`' matter).
+How much of what a user allows is the views' at all, :func:`potr_cl.pipeline.fallback.for_views` says.
 
 A :class:`Budget` is asked for each group, in the plan's order, how many bytes it may take (:meth:`Budget.room`), and is
 told what it has taken (:meth:`Budget.took`). A group with less room than it takes is streamed: made again whenever it
@@ -37,7 +41,6 @@ class ViewCache(Owner):
     one projection, which is made again whenever it is needed.
 
     Args:
-        device: that they are prepared on.
         budget: bytes that they may take.
         others: bytes of the budget for which others have more use than views have for geometry of their own.
 
@@ -143,7 +146,6 @@ def free_memory(device: Device, later: int = 0) -> float:
     """Bytes that the views may take beside what is there: two fifths of what is free, or a quarter of the host's.
 
     Args:
-        device: that they are prepared on.
         later: bytes that others will take, which the views leave free.
     """
     free = device.info.memory - device.allocated
@@ -239,7 +241,6 @@ class NamedBudget(Budget):
     Args:
         memory: in all.
         groups: the views, in their order.
-        cameras: all views.
         totals: bytes of what they measure together.
 
     Attributes:
@@ -247,13 +248,13 @@ class NamedBudget(Budget):
     """
 
     def __init__(self, memory: int, groups: Sequence[ViewGroup], cameras: Sequence[Camera], totals: int) -> None:
-        self._left, self.streamed = memory, int(STREAMED_NAMED * memory)
-        self._targets = {number: target_bytes(cameras[number]) for each in groups for number in each.numbers}
+        self._left, self.streamed, self._cameras = memory, int(STREAMED_NAMED * memory), cameras
+        targets = sum(map(self._target, groups))
         # For the targets of all views that do not stay room is left, unless all will stay.
         self._reserved = 0
-        if _NAMED * sum(each.count for each in groups) + sum(self._targets.values()) > memory:
+        if _NAMED * sum(each.count for each in groups) + targets > memory:
             self._left -= self.streamed + totals
-            self._reserved = sum(self._targets.values())
+            self._reserved = targets
 
     def room(self, group: ViewGroup) -> float:
         target = self._target(group)
@@ -268,7 +269,7 @@ class NamedBudget(Budget):
         return self._left + sum(map(self._target, groups))
 
     def _target(self, group: ViewGroup) -> int:
-        return sum(self._targets[number] for number in group.numbers)
+        return sum(target_bytes(self._cameras[number]) for number in group.numbers)
 
 
 class KnownBudget(Budget):

@@ -53,8 +53,6 @@ class Ready(Generic[W]):
 
     Attributes:
         numbers: of the views among all.
-        subset: the splats.
-        views: projection and lists.
         work: what the use has made of it.
         geometry: shapes and colours, its own or, where it has none, those that it shares with other sets.
     """
@@ -103,7 +101,6 @@ class ViewEngine(Owner, Generic[W]):
 
     Args:
         source: of the groups' splats; the engine's from now on.
-        cameras: all views.
         plan: of those that are looked at here.
         attach: makes the use's work of numbers, subset and prepared views, which are the work's to close from then on.
         most_views: how many views one launch can do.
@@ -176,7 +173,7 @@ class ViewEngine(Owner, Generic[W]):
         device, plan = self.device, self.plan
         before, some, most = device.allocated, list[Ready[W]](), 0
         subset: Subset | None = None
-        with ExitStack() as stack, nullcontext() if plan.in_sets else suppress(DeviceMemoryError):
+        with ExitStack() as stack, suppress(DeviceMemoryError) if plan.singly else nullcontext():
             memory = stack.enter_context(Memory(device))
             subset = self.source.open(stack, memory, group)
             if subset is None:
@@ -184,7 +181,7 @@ class ViewEngine(Owner, Generic[W]):
                 plan.budget.took(group, 0)
                 return []
             cache = plan.budget.cache
-            if cache is None and plan.in_sets:
+            if cache is None and not plan.singly:
                 cache = stack.enter_context(ViewCache(device, room))
             some, most = self._prepare_all(group, subset, cache, room, before, said)
             if some:

@@ -41,14 +41,9 @@ class SeenRasterizer(Owner):
     for each view, so that the device never holds a whole scene of the host.
 
     Args:
-        device: to render on.
         scene: the scene; it must outlive this object.
         groups: of its splats.
         rules: of the rasterizer to follow.
-        background: R, G, B behind the scene.
-
-    Attributes:
-        device, rules, background: as given.
     """
 
     def __init__(
@@ -69,8 +64,6 @@ class SeenRasterizer(Owner):
             self._picker: Picker | None = None
             if isinstance(scene, SceneBuffers) and device.family == "gpu":
                 self._picker = owned.enter_context(Picker(device, groups.group_of))
-                # Drawn where a view sees nothing: it is not in the picture either.
-                self._any = owned.enter_context(Memory(device)).upload(np.zeros(1, np.uint32), "the number of a splat")
             self._owned = owned.pop_all()
 
     def picks(self, memory: Memory, seen: NDArray[np.bool_]) -> IndexSubsets:
@@ -91,7 +84,6 @@ class SeenRasterizer(Owner):
         Args:
             picks: the views' splats.
             numbers: of the views among them.
-            cameras: the views.
             target, start: as of :meth:`render_into`.
         """
         first = 0
@@ -117,6 +109,14 @@ class SeenRasterizer(Owner):
         self, picks: IndexSubsets, numbers: Sequence[int], cameras: Sequence[Camera], target: cl.Buffer, start: int
     ) -> int:
         """Render views with one launch of each kernel; returns the byte where they end."""
+        with self._picked(picks, numbers) as rasterizer:
+            views = rasterizer.prepare_set(cameras, self._passing)
+            rasterizer.pictures_into(views, target, start)
+            return start + 12 * views.pixels
+
+    @contextmanager
+    def _picked(self, picks: IndexSubsets, numbers: Sequence[int]) -> Iterator[Rasterizer]:
+        """A rasterizer of some views' splats, each with its own."""
         assert isinstance(self._scene, SceneBuffers)
         stride = -(-max(1, *(picks.counts[number] for number in numbers)) // SPLAT_GROUP) * SPLAT_GROUP
         try:
@@ -126,19 +126,6 @@ class SeenRasterizer(Owner):
                 if picks.counts[number]:
                     picks.numbers_into(picked, place * stride, number)
             with self._rasterizer(IndexSubset(self._scene, picked, stride, apart=stride)) as rasterizer:
-                views = rasterizer.prepare_set(cameras, self._passing)
-                rasterizer.pictures_into(views, target, start)
-                return start + 12 * views.pixels
-        finally:
-            self._passing.close()
-
-    @contextmanager
-    def _picked(self, picks: IndexSubsets, number: int) -> Iterator[Rasterizer]:
-        assert isinstance(self._scene, SceneBuffers)
-        try:
-            splats = picks.counts[number]
-            numbers = picks.numbers(self._passing, number) if splats else self._any
-            with self._rasterizer(IndexSubset(self._scene, numbers, max(splats, 1))) as rasterizer:
                 yield rasterizer
         finally:
             self._passing.close()
@@ -163,7 +150,6 @@ class SeenRasterizer(Owner):
         """Render views one behind the other into a buffer.
 
         Args:
-            cameras: of the views.
             target: takes (pixels, 3) float32.
             start: byte where they begin.
         """
@@ -200,7 +186,7 @@ class SeenRasterizer(Owner):
                 yield stack.enter_context(self._gathered(seen))
             else:
                 memory = stack.enter_context(Memory(self.device))
-                yield stack.enter_context(self._picked(self.picks(memory, seen[None]), 0))
+                yield stack.enter_context(self._picked(self.picks(memory, seen[None]), [0]))
 
 
 def rasterizer_for(
@@ -245,10 +231,7 @@ def groups_worth_it(
     """The groups of a scene's splats, where it pays to render each view with what it may show; else None.
 
     Args:
-        device: that renders.
         scene: clean.
-        cameras: the views.
-        near: as in the rasterizer's rules.
         there: whether all of the scene is on the device already.
         large: whether it takes too much of the device's memory, or of what a user allows, to be there.
         known: its groups, where somebody has found that views see little of it.

@@ -57,23 +57,23 @@ class ViewPlan:
         groups: they. idle: numbers of views that draw nothing.
         budget: says which of them stay.
         together: makes groups that are streamed of those that do not stay.
-        in_sets: whether one launch does several views of a group, and whether these give up their geometry before they
-            are streamed; if not, a view stays as it is or not at all.
-        queues: on how many queues sets are swept at the same time, where a device takes more than one; 0: as many as
-            suit a launch of many views.
+        singly: whether each group is one view, which stays as it is or not at all. Others are prepared as many as one
+            launch does, and give up their geometry before they are streamed.
         copies_rest: whether copies of splats are on the device only while they are projected.
-        patience: how much streamed views may have lost before they are looked at again, in tolerances of a tile; 0:
-            they are looked at each time.
     """
 
     groups: Sequence[ViewGroup]
     budget: Budget
     idle: Sequence[int] = ()
     together: Callable[[Sequence[ViewGroup]], list[ViewGroup]] = list
-    in_sets: bool = False
-    queues: int = 0
+    singly: bool = False
     copies_rest: bool = False
-    patience: float = 0.0
+
+    @property
+    def patience(self) -> float:
+        """How much streamed views may have lost before they are looked at again, in tolerances of a tile; 0: they are
+        looked at each time."""
+        return _PATIENCE if self.singly else 0.0
 
     @property
     def numbers(self) -> list[int]:
@@ -89,7 +89,7 @@ def none() -> ViewPlan:
 def whole(numbers: Sequence[int], splats: int, memory: int) -> ViewPlan:
     """All views with all splats."""
     group = ViewGroup(tuple(numbers), splats)
-    return ViewPlan([group], ClusterBudget(memory, [group]), in_sets=True)
+    return ViewPlan([group], ClusterBudget(memory, [group]))
 
 
 def in_launches(
@@ -114,7 +114,7 @@ def in_launches(
         groups.append(ViewGroup(left[:most], stride, most=most))
         left = left[most:]
     cache.largest = max((len(group.numbers) * group.count for group in groups), default=0)
-    return ViewPlan(groups, CacheBudget(cache), in_sets=True)
+    return ViewPlan(groups, CacheBudget(cache))
 
 
 def by_view(
@@ -124,7 +124,6 @@ def by_view(
 
     Args:
         visibility: of all views.
-        cameras: all views.
         numbers: of those that are meant.
         memory: bytes of the device's that they may take.
         totals: bytes of what is summed up beside that.
@@ -138,9 +137,7 @@ def by_view(
         return neighbours(others, visibility.groups.counts, cameras, budget.streamed)
 
     idle = [number for number in order if not counts[number]]
-    return ViewPlan(
-        groups, budget, idle, together, queues=8, patience=_PATIENCE
-    )  # fmt: skip
+    return ViewPlan(groups, budget, idle, together, singly=True)
 
 
 def neighbours(
@@ -151,7 +148,6 @@ def neighbours(
     Args:
         others: single views, in an order in which neighbours see much of the same.
         counts: (G,) splats of each cell.
-        cameras: all views.
         passing: bytes that a group may take while it is there.
     """
     found: list[ViewGroup] = []
@@ -180,7 +176,7 @@ def by_cluster(clusters: Sequence[ViewGroup], memory: int, splat: int) -> ViewPl
         splat: bytes of a splat in a scene.
     """
     budget = ClusterBudget(memory, clusters, splat)
-    return ViewPlan(clusters, budget, in_sets=True, copies_rest=budget.scenes_rest)
+    return ViewPlan(clusters, budget, copies_rest=budget.scenes_rest)
 
 
 def as_drawn(
@@ -191,7 +187,6 @@ def as_drawn(
 
     Args:
         source: fills what is projected to find these.
-        cameras: all views.
         clusters: of those that are meant.
         memory: bytes of the device's that they may take.
         progress: called with the views whose splats are found, and their number.
@@ -208,7 +203,7 @@ def as_drawn(
 
     widest_first = sorted((each for each in found if each.count), key=lambda each: (-each.nbytes, each.numbers))
     idle = [number for each in found if not each.count for number in each.numbers]
-    return ViewPlan(widest_first, budget, idle, together, queues=8, copies_rest=True, patience=_PATIENCE)
+    return ViewPlan(widest_first, budget, idle, together, singly=True, copies_rest=True)
 
 
 def _drawn(source: CopiedSplats, cameras: Sequence[Camera], cluster: ViewGroup) -> list[ViewGroup]:

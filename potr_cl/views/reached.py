@@ -77,8 +77,6 @@ def reached_splats(
     """The splats that each of some views reaches.
 
     Args:
-        rasterizer: of the scene.
-        cameras: all views.
         numbers: of those that are meant.
         memory: bytes of the device's memory that the user would have taken; None: as much as there is.
 
@@ -198,7 +196,6 @@ def surely_seen(scene: SceneBuffers, cameras: Sequence[Camera]) -> NDArray[np.ui
 
     Args:
         scene: the splats on a device.
-        cameras: the views.
 
     Returns:
         (N,) :class:`Seen` of each splat; undecided where rounding could decide it.

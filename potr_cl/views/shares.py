@@ -92,7 +92,6 @@ class HelpFrom:
     """Workers that do some of the views.
 
     Attributes:
-        pool: the workers.
         source: the scene whose pictures are the targets, perhaps kept on devices, or with pictures of it there; or who
             does which views, and has what these see of it.
         visibility: what the views may draw of the source, where it is the same for all workers, and where no view sees

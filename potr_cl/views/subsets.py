@@ -50,12 +50,9 @@ class Subset:
     """The splats of a group, on the device.
 
     Attributes:
-        rasterizer: of these.
-        count: how many they are.
         numbers: (count,) uint32 in the device's memory, their numbers in the scene, ascending; None: they are all. With
             splats of each view's own, (views, count).
         splats: the same on the host, where they are copied.
-        scene: the copy.
     """
 
     rasterizer: Rasterizer
@@ -69,7 +66,6 @@ class SplatSource(Owner, ABC):
     """Gives groups their splats, in the colours that they have by now.
 
     Attributes:
-        device: where.
         splats: N, of the scene. stride: N padded.
         selects: whether a group that is opened for those that are left has no others.
         copies: whether it wants to know on the host which splats are left.
@@ -97,7 +93,6 @@ class SplatSource(Owner, ABC):
 
         Args:
             stack, memory: own what is taken.
-            group: the group.
             left: take only these; None: all.
         """
 
@@ -137,12 +132,7 @@ class SplatSource(Owner, ABC):
 
 
 class NoSplats(SplatSource):
-    """Of a device that looks at no view itself.
-
-    Args:
-        device: the device.
-        splats: N.
-    """
+    """Of a device that looks at no view itself."""
 
     def __init__(self, device: Device, splats: int) -> None:
         self.device, self.splats, self.stride = device, splats, stride_of(splats)
@@ -195,6 +185,9 @@ class _Parted(SplatSource):
             Rasterizer, device, rules=rules, background=background, preparing=self._preparing
         )  # fmt: skip
 
+    def streams_in(self) -> Memory:
+        return Reused(self.device)
+
     def close(self) -> None:
         self._preparing.close()
 
@@ -203,9 +196,7 @@ class NamedSplats(_Parted):
     """Splats of a scene that lies whole on a GPU, by their numbers.
 
     Args:
-        whole: the scene.
         group_of: (N,) the cell of each splat.
-        background: R, G, B behind the scene.
     """
 
     def __init__(
@@ -215,9 +206,6 @@ class NamedSplats(_Parted):
         self._whole, self._memory = whole, Memory(whole.device)
         self._picker = Picker(whole.device, group_of)
         self._foreseen: tuple[IndexSubsets, dict[ViewGroup, int]] | None = None
-
-    def streams_in(self) -> Memory:
-        return Reused(self.device)
 
     def open(self, stack: ExitStack, memory: Memory, group: ViewGroup, left: Left | None = None) -> Subset | None:
         assert group.cells is not None
@@ -272,9 +260,6 @@ class ListedSplats(_Parted):
         super().__init__(rasterizer.device, self._whole, rasterizer.stride, rasterizer.background, rasterizer.rules)
         self._listed = dict(reach.of)
 
-    def streams_in(self) -> Memory:
-        return Reused(self.device)
-
     def room(self, number: int) -> int:
         return max(-(-len(self._listed[number]) // SPLAT_GROUP), 1) * SPLAT_GROUP
 
@@ -302,10 +287,8 @@ class CopiedSplats(_Parted):
     """Copies of splats, from the host or from a scene on the device.
 
     Args:
-        device: where they go.
         scene: the scene on the host.
         whole: the same to be drawn, perhaps on the device already.
-        background: R, G, B behind the scene.
     """
 
     copies = True
@@ -314,9 +297,6 @@ class CopiedSplats(_Parted):
         super().__init__(device, scene, stride_of(len(scene)), background)
         self._scene, self._whole = scene, whole
         self._other: FloatArray | None = None
-
-    def streams_in(self) -> Memory:
-        return Reused(self.device)
 
     def empty(self, count: int, memory: Memory | None = None) -> SceneBuffers:
         """Room for so many splats."""

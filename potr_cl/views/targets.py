@@ -53,7 +53,6 @@ class Targets(Protocol):
         """Write the pictures of several views to device memory.
 
         Args:
-            numbers: of the views.
             buffer: takes (H, W, 3) float32 of each, one behind the other.
             start: byte where they begin.
         """
@@ -65,8 +64,6 @@ class RenderedTargets:
     """The pictures that another scene gives: the uncompressed one's.
 
     Attributes:
-        rasterizer: of that scene.
-        cameras: the views.
         picks: what each of them may draw, where the rasterizer goes by that.
     """
 
@@ -118,9 +115,7 @@ class PhotographTargets:
     """Photographs, read anew whenever they are asked for.
 
     Attributes:
-        device: that they go to.
         photographs: of all the cameras.
-        cameras: the views.
     """
 
     device: Device
@@ -145,11 +140,6 @@ class HostTargets(Owner):
     """The pictures of others, asked for once and kept on the host: what made them can go.
 
     Where memory is bounded, many of them lie in a temporary file (:mod:`potr_cl.host.mapped`).
-
-    Args:
-        device: that computes.
-        targets: give the pictures.
-        cameras: the views.
 
     Raises:
         PotrError: there is no room for them.
@@ -198,14 +188,8 @@ class PicturesAhead(Owner):
     A CPU renders none: it has other things to do.
 
     Args:
-        source: the scene.
-        background: R, G, B behind it.
-        cameras: all views.
         numbers: of the views whose pictures each device will be asked for.
         visibility: what each view may draw, where no view sees much of the scene.
-
-    Attributes:
-        source: as given.
     """
 
     def __init__(
@@ -216,12 +200,26 @@ class PicturesAhead(Owner):
         numbers: Mapping[Device, Sequence[int]],
         visibility: Visibility | None = None,
     ) -> None:
-        self.source = source
-        self._begun: dict[Device, Future[_Rendered | None]] = {
-            device: in_background(_rendered, device, source, background, cameras, some, visibility)
+        self.source, self._background, self._cameras, self._visibility = source, background, cameras, visibility
+        self._begun = {
+            device: in_background(self._rendered, device, some)
             for device, some in numbers.items()
             if device.family == "gpu" and some
         }
+
+    def _rendered(self, device: Device, numbers: Sequence[int]) -> _Rendered | None:
+        """Some views' pictures on a device; None: it has not much room, or the scene does not lie there."""
+        if sum(target_bytes(self._cameras[number]) for number in numbers) > AHEAD * device.info.memory:
+            return None
+        scene = self.source.found_on(device)
+        if not isinstance(scene, SceneBuffers):
+            return None
+        with suppress(DeviceMemoryError), device.all_or_nothing():
+            rendered = _Rendered(device, self._cameras, numbers)
+            with targets_of(device, scene, self._cameras, self._background, self._visibility) as targets:
+                targets.into(numbers, rendered.buffer)
+            return rendered
+        return None
 
     def before(self, device: Device, targets: Targets) -> Targets:
         """The pictures that ``targets`` gives, on a device: it is asked for those that were not rendered ahead.
@@ -282,28 +280,6 @@ class _Rendered(Owner):
         self._memory.close()
 
 
-def _rendered(
-    device: Device,
-    source: ResidentScene,
-    background: tuple[float, float, float],
-    cameras: Sequence[Camera],
-    numbers: Sequence[int],
-    visibility: Visibility | None,
-) -> _Rendered | None:
-    """Some views' pictures on a device; None: it has not much room, or the scene does not lie there."""
-    if sum(target_bytes(cameras[number]) for number in numbers) > AHEAD * device.info.memory:
-        return None
-    scene = source.found_on(device)
-    if not isinstance(scene, SceneBuffers):
-        return None
-    with suppress(DeviceMemoryError), device.all_or_nothing():
-        rendered = _Rendered(device, cameras, numbers)
-        with targets_of(device, scene, cameras, background, visibility) as targets:
-            targets.into(numbers, rendered.buffer)
-        return rendered
-    return None
-
-
 @dataclass
 class Room:
     """Bytes that are left of a budget of one's own."""
@@ -315,8 +291,6 @@ class TargetPictures(Owner):
     """Pictures that are asked for again and again. They are kept on the device after their first use.
 
     Args:
-        device: whose memory it is.
-        cameras: the views.
         budget: that the pictures which are kept are taken from.
         targets: give them, until others are named (:meth:`fill`, :meth:`of`).
         sets: of views that will be asked for, always together: there is room for the largest in any case. None: views
@@ -355,7 +329,6 @@ class TargetPictures(Owner):
         """(pixels, 3) float32, what some views should show, one behind the other; valid until the next call.
 
         Args:
-            numbers: of the views.
             targets: as of :meth:`fill`. Others than before take the place of what was kept.
         """
         self._show(targets)

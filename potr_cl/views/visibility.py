@@ -28,7 +28,6 @@ class ViewGroup:
 
     Attributes:
         numbers: of the views among all.
-        count: how many splats these are.
         cells: (G,) the groups of the scene's splats (:class:`potr_cl.model.splat_groups.SplatGroups`); None: not so.
         among, bits: a bit for each of the splats of these numbers, ascending, packed; no bits: all of them. None: not
             so.
@@ -101,9 +100,7 @@ class Visibility:
         Args:
             scene: clean.
             cameras: the views, at least one.
-            near: as in the rasterizer's rules.
             groups: of the scene, where they are known.
-            run: shares the work out.
         """
         groups = groups or SplatGroups.of(scene, run=run)
         return Visibility(groups, groups.visible_by(cameras, near, run))
@@ -209,8 +206,6 @@ def seen_part(scene: Scene, cameras: Sequence[Camera], near: float = INRIA.near)
 
     Args:
         scene: clean, at least one splat.
-        cameras: the views.
-        near: as in the rasterizer's rules.
     """
     if len(scene) < LEAST_SPLATS or not cameras:
         return 1.0
@@ -232,9 +227,7 @@ def visibility_of_large(
 
     Args:
         scene: clean.
-        cameras: the views.
         groups: of the scene, where they are known.
-        run: shares the work out.
     """
     if len(scene) < LEAST_SPLATS or not cameras:
         return None

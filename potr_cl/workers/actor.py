@@ -31,12 +31,9 @@ class ClusterWorker(Worker):
     """One of Dask's workers, with a actor for this pool.
 
     Args:
-        pool: that it is of.
-        name: its address.
         place: its number among the workers of its computer.
 
     Attributes:
-        host: the computer.
         device, digits: the name of its device and how it rounds, once it has been met.
     """
 
@@ -132,11 +129,7 @@ class ClusterWorker(Worker):
 
 
 class WorkerFailed(DeviceError):
-    """Something else than this package failed on a worker.
-
-    Attributes:
-        said: what it says.
-    """
+    """Something else than this package failed on a worker."""
 
     def __init__(self, address: str, said: str) -> None:
         super().__init__(f"worker {address} failed ({said})")
@@ -212,16 +205,11 @@ class WorkerActor:
 
     def make(self, number: int, kind: type[Part], memory: int | None, given: Sequence[Any]) -> None:
         """Make a part."""
-        device = _device(self._place)
-        things = [each.of(self._known[each.handle.number]) if isinstance(each, Shared) else each for each in given]
-        # A failure may leave buffers behind that nobody owns any more.
-        with device.all_or_nothing(), device.errors("failed while encoding"):
-            self._parts[number] = kind(device, memory, *things)
+        self._parts[number] = kind.made(_device(self._place), memory, given, lambda known: self._known[known.number])
 
     def run(self, number: int, command: str, args: Sequence[Any]) -> Any:
         """Give a part a command."""
-        with _device(self._place).errors("failed while encoding"):
-            return getattr(self._parts[number], command)(*args)
+        return self._parts[number].told(_device(self._place), command, args)
 
     def drop(self, number: int) -> None:
         """Give a part's memory back."""

@@ -68,9 +68,6 @@ class Pulse:
     """Asks workers for a sign of life, by way of the scheduler.
 
     A process that stands still keeps its connections, and Dask takes it for alive for minutes.
-
-    Args:
-        client: of the cluster.
     """
 
     def __init__(self, client: Client) -> None:

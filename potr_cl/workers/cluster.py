@@ -11,9 +11,9 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Any
 
 from potr_cl.errors import DeviceError, PotrError, UsageError
@@ -21,7 +21,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.workers.actor import ClusterWorker, WorkerFailed, host_of
 from potr_cl.workers.client import Pulse, client_of, first_line
 from potr_cl.workers.host import DeviceThread
-from potr_cl.workers.pool import Pool, Shared, Traffic, Worker, WorkerLost, tell_of_kinds
+from potr_cl.workers.pool import Pool, Traffic, Worker, WorkerLost, tell_of_kinds
 
 if TYPE_CHECKING:
     from dask.distributed import Client
@@ -51,14 +51,10 @@ class ClusterPool(Pool):
     Args:
         cluster: the scheduler's address, or a client of it, which stays the caller's.
         first: the master's device.
-        patience: see :class:`potr_cl.workers.pool.Pool`.
 
     Raises:
         UsageError: Dask is not installed, no scheduler answers there, no worker comes, or one cannot do the work.
     """
-
-    takes_part = False
-    sparse = True
 
     def __init__(self, cluster: str | Client, first: Device, patience: float = 60.0) -> None:
         self.first, self.traffic, self.patience = first, Traffic(), patience
@@ -102,11 +98,6 @@ class ClusterPool(Pool):
     @property
     def names(self) -> tuple[str, ...]:
         return tuple(worker.name for worker in [*self._workers, *([] if self._here is None else [self._here])])
-
-    @contextmanager
-    def shared(self, thing: Any) -> Iterator[Shared]:
-        """A worker is sent it when it first makes a part of it, and keeps it for the parts that follow."""
-        yield Shared(thing)
 
     def has(self, thing: Any) -> bool:
         return all(worker.has(thing) for worker in self._workers if not worker.lost)
@@ -153,8 +144,6 @@ class ClusterPool(Pool):
         """What a worker answers.
 
         Args:
-            answer: a future of Dask's.
-            address: of the worker.
             most: seconds to wait.
 
         Raises:

@@ -22,7 +22,6 @@ class Helping(Owner):
     """The parts, as long as there are any.
 
     Args:
-        device: the master's.
         verb: what they help to do, for a message.
 
     Attributes:
@@ -47,6 +46,9 @@ class Helping(Owner):
             self.parts = opened(self._left)
         except DeviceError as error:
             self._lose(error)
+        except BaseException as error:
+            self.__exit__(type(error), error, None)
+            raise
         return self.parts
 
     def asked(self, call: Callable[[Parts], T]) -> T | None:

@@ -9,15 +9,14 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from potr_cl.errors import UsageError
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import DeviceInfo, choose_devices
-from potr_cl.workers.pool import Held, Part, Pool, Shared, Traffic, Worker, tell_of_kinds
+from potr_cl.opencl.memory import Owner
+from potr_cl.workers.pool import Held, Part, Pool, Traffic, Worker, tell_of_kinds
 
 if TYPE_CHECKING:
     from dask.distributed import Client
@@ -33,8 +32,6 @@ class HostPool(Pool):
         UsageError: there is no device, or they run different kernels, which round differently.
     """
 
-    takes_part = True
-    sparse = False
     in_process = True
 
     def __init__(self, devices: Sequence[Device]) -> None:
@@ -64,9 +61,6 @@ class HostPool(Pool):
     def reserve(self) -> list[Worker]:
         return [self._reserve]
 
-    def shared(self, thing: Any) -> AbstractContextManager[Shared]:
-        return nullcontext(Shared(thing))  # threads see what the master sees
-
     @property
     def names(self) -> tuple[str, ...]:
         return (f"0: {self.first.info}", *(worker.name for worker in self._workers))
@@ -86,11 +80,8 @@ class DeviceThread(Worker):
 
     def make(self, kind: type[Part], memory: int | None, given: Sequence[Any]) -> Future[Held]:
         def made() -> Held:
-            # A failure may leave buffers behind that nobody owns any more.
-            with self._device.all_or_nothing(), self._device.errors("failed while encoding"):
-                things = [each.of(each.handle) if isinstance(each, Shared) else each for each in given]
-                part = kind(self._device, memory, *things)
-                return _HeldHere(self._thread, threading.get_ident(), self._device, part)
+            part = kind.made(self._device, memory, given)
+            return _HeldHere(self._thread, threading.get_ident(), self._device, part)
 
         return self._thread.submit(made)
 
@@ -105,11 +96,7 @@ class _HeldHere(Held):
         self._thread, self._ident, self._device, self._part = thread, ident, device, part
 
     def begin(self, command: str, args: Sequence[Any]) -> Future[Any]:
-        def done() -> Any:
-            with self._device.errors("failed while encoding"):
-                return getattr(self._part, command)(*args)
-
-        return self._thread.submit(done)
+        return self._thread.submit(self._part.told, self._device, command, args)
 
     def close(self) -> None:
         if threading.get_ident() == self._ident:  # it has just been made there, and nobody wants it any more
@@ -125,11 +112,10 @@ ClusterSource: TypeAlias = "str | Client | None"
 
 
 @dataclass(frozen=True)
-class Workers(AbstractContextManager["Workers"]):
+class Workers(Owner):
     """What computes.
 
     Attributes:
-        device: the first device.
         pool: where there is more than one device; else None.
     """
 
@@ -145,11 +131,6 @@ class Workers(AbstractContextManager["Workers"]):
         """Leave the workers."""
         if self.pool is not None:
             self.pool.close()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def open_workers(devices: DevicesSource = None, cluster: ClusterSource = None) -> Workers:

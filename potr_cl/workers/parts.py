@@ -32,8 +32,6 @@ class Parts(Owner):
     """Parts of one work on the workers of a pool.
 
     Args:
-        pool: of the workers.
-        kind: of all parts.
         given: what each part is made with, see :class:`potr_cl.workers.pool.Part`.
         memory: bytes of a device's memory that may be filled with views; None: the parts' own default.
         names: of the workers that the parts are meant for; those that are lost are replaced by others.
@@ -85,7 +83,6 @@ class Parts(Owner):
         """Give all parts a command, and do something else until :meth:`Pending.results`.
 
         Args:
-            command: the parts' method.
             args: of the method, the same for all parts where they are no :class:`Each`.
             logged: whether it changes the parts.
             anew: whether nothing that they were told before matters after it.

@@ -1,7 +1,8 @@
 """A pool of workers, each with a device of its own: :class:`Pool`. What they compute is in :mod:`.parts`.
 
-Whoever asks a pool for work (the *master*) has a device too, the pool's ``first``. It may do a share of the work itself
-(``takes_part``), as with several devices of one computer, or only add up what the workers find, as with a cluster.
+Whoever asks a pool for work (the *master*) has a device too, the pool's ``first``. Where workers are threads of its
+process, as with several devices of one computer, it does a share of the work; with a cluster it only adds up what they
+find.
 """
 
 from __future__ import annotations
@@ -9,15 +10,21 @@ from __future__ import annotations
 import logging
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future
-from contextlib import AbstractContextManager
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from potr_cl.errors import DeviceError
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+
+_FAILED = "failed while encoding"
 
 
 class WorkerLost(DeviceError):
@@ -49,6 +56,22 @@ class Part(Owner, ABC):
 
     @abstractmethod
     def __init__(self, device: Device, memory: int | None, *given: Any) -> None: ...
+
+    @classmethod
+    def made(
+        cls, device: Device, memory: int | None, given: Sequence[Any], known: Callable[[Any], Any] = lambda thing: thing
+    ) -> Self:
+        """A part on this device, of what was given; ``known`` finds what was shared by its handle."""
+        # A failure may leave buffers behind that nobody owns any more.
+        with device.all_or_nothing(), device.errors(_FAILED):
+            return cls(
+                device, memory, *(each.of(known(each.handle)) if isinstance(each, Shared) else each for each in given)
+            )
+
+    def told(self, device: Device, command: str, args: Sequence[Any]) -> Any:
+        """What a command returns, on the device that the part is on."""
+        with device.errors(_FAILED):
+            return getattr(self, command)(*args)
 
 
 class Held(ABC):
@@ -145,23 +168,19 @@ class Traffic:
                 self.of[what] = Went(before.answers + answers, before.sent + sent, before.received + received)
 
 
-class Pool(ABC):
+class Pool(Owner, ABC):
     """Workers that share a work.
 
     Attributes:
         first: the master's own device.
-        takes_part: whether the master does a share of the work on it.
-        sparse: whether workers send what has changed, and not all of it: worth its time where bytes travel slowly.
-        in_process: whether workers are threads of this process: what lies on a device can then be lent
-            (:mod:`potr_cl.opencl.relay`), and goes to another device without a stay on the host.
-        traffic: so far.
+        in_process: whether workers are threads of this process. Then the master does a share of the work on its device,
+            and what lies on a device can be lent (:mod:`potr_cl.opencl.relay`): it goes to another one without a stay
+            on the host. Others send what has changed, and not all of it.
         patience: seconds, or ten times as long as the others took if that is longer, after which a worker that alone
             has not answered counts as lost; None: workers are waited for.
     """
 
     first: Device
-    takes_part: bool
-    sparse: bool
     in_process: bool = False
     traffic: Traffic
     patience: float | None = None
@@ -183,9 +202,14 @@ class Pool(ABC):
         """Who does the work of lost workers when none is left."""
         return []
 
-    @abstractmethod
-    def shared(self, thing: Any) -> AbstractContextManager[Shared]:
-        """Give something to all workers once, for parts that are made as long as the context lasts."""
+    @contextmanager
+    def shared(self, thing: Any) -> Iterator[Shared]:
+        """Give something to all workers once, for parts that are made as long as the context lasts.
+
+        Threads see what the master sees. Others are sent it when they first make a part of it, and keep it for the
+        parts that follow.
+        """
+        yield Shared(thing)
 
     def has(self, thing: Any) -> bool:
         """Whether all workers have something that was shared with them, so that it is not sent again."""
@@ -194,12 +218,6 @@ class Pool(ABC):
     @abstractmethod
     def close(self) -> None:
         """Leave the workers; none of them goes on working for this pool."""
-
-    def __enter__(self) -> Pool:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     @property
     @abstractmethod
@@ -225,17 +243,15 @@ def shares(pool: Pool, views: int, own_speed: float = 1.0) -> Shares:
     """Share so many views out to a pool.
 
     Args:
-        pool: the workers.
-        views: how many there are.
         own_speed: of the master against a worker, if it takes part.
 
     Raises:
         WorkerLost: no worker is left.
     """
     workers = pool.workers()
-    speeds = [*([own_speed] if pool.takes_part else []), *[1.0] * len(workers)]
+    speeds = [*([own_speed] if pool.in_process else []), *[1.0] * len(workers)]
     dealt = deal(views, speeds)
-    own, others = (dealt[0], dealt[1:]) if pool.takes_part else ([], dealt)
+    own, others = (dealt[0], dealt[1:]) if pool.in_process else ([], dealt)
     busy = [(worker, each) for worker, each in zip(workers, others, strict=True) if each]
     return Shares(own, [each for _, each in busy], tuple(worker.name for worker, _ in busy))
 
@@ -247,7 +263,6 @@ def deal(views: int, speeds: Sequence[float]) -> list[list[int]]:
     where there are fewer views than workers.
 
     Args:
-        views: how many there are.
         speeds: of the workers, above 0.
     """
     shares: list[list[int]] = [[] for _ in speeds]

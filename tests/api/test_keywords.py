@@ -33,6 +33,7 @@ from potr_cl.host import process
 from potr_cl.model.virtual_cameras import PREFIX
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.run import Run
+from potr_cl.stages.views_between import Between
 from tests.reference.scenes import ring_of_cameras
 
 #: The commands that have a function of their name.
@@ -345,6 +346,7 @@ def test_choices_of_stages_by_name() -> None:
     assert (options.compact.two_pass, options.refit.steps) == (False, 3)
     assert not encode_options(None, "best", {"refit": False}).refit.on
     assert not encode_options(None, "best", {"prune": False}).prune.on
+    assert not encode_options(None, "best", {"between": False}).stage(Between).on
     assert encode_options(None, "best", {"refit": "auto"}).refit.steps == 8
 
 
@@ -356,6 +358,7 @@ def test_choices_of_stages_by_name() -> None:
         ({"entropy": "gzip"}, "choose one of"),
         ({"one_pass": 1}, "True or False"),
         ({"keep": "half"}, "invalid value"),
+        ({"between": 0}, "'between' is 0: give a mapping of its options"),
         ({"keep": 1.5}, "at most 1"),
     ],
 )

@@ -20,8 +20,6 @@ class ElsewherePool(HostPool):
         scenes: bytes of what was shared, each thing once.
     """
 
-    takes_part = False
-    sparse = True
     in_process = False
 
     def __init__(self, devices):

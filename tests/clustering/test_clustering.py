@@ -181,3 +181,29 @@ def test_along_the_curve_all_bits_count_and_equal_points_keep_their_order():
     grid = np.array([[65535, 0, 0], [0, 0, 0], [65535, 0, 1], [0, 0, 0], [0, 0, 1]], np.uint16)
     assert along_curve(grid)[:2].tolist() == [1, 3]
     assert along_curve(grid)[2] == 4
+
+
+def test_the_curve_is_that_of_skillings_transformation():
+    """J. Skilling, "Programming the Hilbert curve", AIP Conference Proceedings 707, 2004: bits one after the other."""
+    points = np.random.default_rng(3).integers(0, 1 << 16, (500, 3))
+
+    def place(axes: list[int]) -> int:
+        for bit in reversed(range(1, 16)):
+            below = (1 << bit) - 1
+            for number in range(3):
+                if axes[number] >> bit & 1:
+                    axes[0] ^= below
+                else:
+                    turned = (axes[0] ^ axes[number]) & below
+                    axes[0] ^= turned
+                    axes[number] ^= turned
+        axes[1] ^= axes[0]
+        axes[2] ^= axes[1]
+        carried = 0
+        for bit in range(1, 16):
+            carried ^= (1 << bit) - 1 if axes[2] >> bit & 1 else 0
+        axes = [axis ^ carried for axis in axes]
+        return sum((axes[number] >> bit & 1) << (3 * bit + 2 - number) for bit in range(16) for number in range(3))
+
+    places = [place(point) for point in points.tolist()]
+    assert along_curve(points.astype(np.uint16)).tolist() == sorted(range(len(places)), key=places.__getitem__)

@@ -154,7 +154,8 @@ def files(plush_excerpt: Scene, tmp_path_factory: Any) -> tuple[Path, Path]:
     for output, part, name in ((StreamedSog(lod_chunk_count=1), Sog(), "lod-meta.json"), (Potr(), Potr(), "a.potr")):
         own = [b"".join(part.file(plush_excerpt.subset(np.arange(n)), None, request).pieces) for n in LEVELS]
         with (folder / name).open("wb") as file:
-            output.write(output.levelled(own, Told()), file, folder / name)
+            pieces = output.levelled(own, Told(), lambda level, own=own, part=part: part.read(own[level]))
+            output.write(pieces, file, folder / name)
         found.append(folder / name)
     return found[0], found[1]
 

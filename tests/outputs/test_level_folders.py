@@ -76,7 +76,8 @@ def files_of(part: Output) -> list[bytes]:
 def written(output: Any, files: list[bytes], errors: Any, path: Path) -> tuple[Path, dict[str, Any]]:
     """The description of the levels in a folder, as it is and as what it says."""
     with path.open("wb") as file:
-        output.write(output.levelled(files, errors), file, path)
+        pieces = output.levelled(files, errors, lambda level: output.of_level().read(files[level]))
+        output.write(pieces, file, path)
     return path, json.loads(path.read_text())
 
 

@@ -10,7 +10,7 @@ from potr_cl.model import splat_groups
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.raster.resident import ResidentScene
-from potr_cl.stages.pruning.removal import planned_sweep
+from potr_cl.stages.pruning.removal import Wanted, planned_sweep
 from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.stages.views_between import room_for
@@ -73,8 +73,8 @@ def test_elsewhere_as_many_as_fit_with_what_each_may_draw(monkeypatch):
     some = int(np.flatnonzero((np.array(found) > 0) & (np.array(found) < len(more)))[0])
     views = [*own, *more[: found[some]]]
     options = SweepOptions(memory=memories[some])
-    with planned_sweep(device, scene, views, options, visibility=Visibility.of(scene, views)) as removal:
-        assert removal.resident_views == len(views)
+    with planned_sweep(device, scene, Wanted(views, options, visibility=Visibility.of(scene, views))) as removal:
+        assert removal.ready_views == len(views)
     # More than if each view needed room for the whole scene.
     monkeypatch.setattr(visibility, "LEAST_SPLATS", 1 << 30)
     assert sum(found) > sum(rooms(device, memories)) + 3

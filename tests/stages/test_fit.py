@@ -13,7 +13,7 @@ from potr_cl.errors import UsageError
 from potr_cl.model.views_between import views_between
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fit import Fit
-from potr_cl.stages.fitting.fit import FitOptions, batches, fit_scene, held_out_error
+from potr_cl.stages.fitting.fit import FitOptions, Following, Sight, batches, fit_scene, held_out_error
 from potr_cl.stages.fitting.fitted import File, Fitted, LeftOut, TwoFiles
 from potr_cl.stages.held_out import share_out
 from potr_cl.stages.prune import Prune
@@ -40,9 +40,11 @@ def shaken(scene, seed=0, only=PARAMETERS):
     return dataclasses.replace(scene, **changes)
 
 
-def fitted_to(device, source, scene, cameras, options=STEPS, **more):
+def fitted_to(device, source, scene, cameras, options=STEPS, **following):
     with Rasterizer(device, source) as rasterizer:
-        return fit_scene(device, scene, cameras, RenderedTargets(rasterizer, cameras), options, **more)
+        return fit_scene(
+            device, scene, Sight(cameras, RenderedTargets(rasterizer, cameras)), options, Following(**following)
+        )
 
 
 def test_views_that_judge_find_the_mean_squared_error(device):
@@ -53,7 +55,7 @@ def test_views_that_judge_find_the_mean_squared_error(device):
     cameras = [*ring_of_cameras(3, size=48), *ring_of_cameras(3, size=131)]
     for targets in (source, bright):
         with Rasterizer(device, targets) as rasterizer:
-            found = held_out_error(device, scene, cameras, RenderedTargets(rasterizer, cameras))
+            found = held_out_error(device, scene, Sight(cameras, RenderedTargets(rasterizer, cameras)))
         _, held_out = share_out(len(cameras), 0)
         assert found == pytest.approx(mean_error(device, targets, scene, [cameras[k] for k in held_out]), rel=1e-5)
 
@@ -131,7 +133,7 @@ def test_what_does_not_help_is_not_kept(family_device):
     wrong = [picture if number in held_out else 1 - picture for number, picture in enumerate(pictures)]
     start = shaken(SOURCE, only=("sh",))
     with Pictures(family_device, wrong) as targets:
-        result = fit_scene(family_device, start, CAMERAS, targets, STEPS)
+        result = fit_scene(family_device, start, Sight(CAMERAS, targets), STEPS)
     assert result.kept == 0
     assert result.steps < STEPS.steps, "the fit should end before"
     for name in PARAMETERS:
@@ -143,7 +145,7 @@ def test_no_splat_leaves_the_range_of_sizes_and_opacities(family_device):
     with Pictures(family_device, [np.zeros((40, 40, 3), np.float32)] * 8) as targets:
         rates = dataclasses.replace(STEPS.rates, log_scales=1.0, opacity_logits=5.0)
         options = FitOptions(steps=40, rates=rates, patience=10)
-        result = fit_scene(family_device, start, CAMERAS, targets, options)
+        result = fit_scene(family_device, start, Sight(CAMERAS, targets), options)
     assert result.kept > 0
     assert result.scene.log_scales.min() >= start.log_scales.min()
     assert result.scene.log_scales.max() <= start.log_scales.max()
@@ -281,7 +283,7 @@ def test_little_is_left_to_the_refit(family_device, plush_excerpt, small_views):
     after = Fit(steps=2, between=0).run(before, bench_of(family_device))
     with Rasterizer(family_device, plush_excerpt) as rasterizer:
         alone = fit_scene(
-            family_device, start, small_views, RenderedTargets(rasterizer, small_views), FitOptions(steps=2)
+            family_device, start, Sight(small_views, RenderedTargets(rasterizer, small_views)), FitOptions(steps=2)
         )
     assert 0.7 * alone.errors[0] < alone.error < alone.errors[0], "the fit gains, but little"
     assert isinstance(after.results.fitted, LeftOut)

@@ -12,7 +12,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.forecast import fit_bytes, memory_needed
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.fitting.fit import FitOptions, fit_scene
+from potr_cl.stages.fitting.fit import FitOptions, Sight, fit_scene
 from potr_cl.views.targets import RenderedTargets
 from tests.cases.memory import taken_of
 
@@ -30,7 +30,7 @@ def peak(device, source, scene, views, memory):
     """Bytes of the device that a fit of a few steps took at its peak."""
     options = FitOptions(steps=4, rounds=1, memory=memory)
     with Rasterizer(device, source) as rasterizer, taken_of(device) as taken:
-        fit_scene(device, scene, views, RenderedTargets(rasterizer, views), options)
+        fit_scene(device, scene, Sight(views, RenderedTargets(rasterizer, views)), options)
     return max(in_all for _, in_all in taken)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -13,8 +14,8 @@ from potr_cl.outputs.ply import Ply
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fit import Fit
 from potr_cl.stages.fitting.adam import Factors, in_form_of_files
-from potr_cl.stages.fitting.fit import FitOptions, fit_scene
-from potr_cl.stages.fitting.settling import Looking, Settling, settle
+from potr_cl.stages.fitting.fit import FitOptions, Sight, fit_scene
+from potr_cl.stages.fitting.settling import Settling, settle
 from potr_cl.stages.held_out import share_out
 from potr_cl.stages.refit import Refit
 from potr_cl.stages.stage import State, Workbench
@@ -30,8 +31,12 @@ def settled(device, scene, views, settling, **changes):
     bench = dataclasses.replace(Workbench(PARAMETERS, device=device), **changes)
     before = State.of(scene, views)
     with Rasterizer(device, scene) as rasterizer:
-        looking = Looking(views, 0, RenderedTargets(rasterizer, views), rasterizer)
-        then, errors = settle(before, bench, looking, settling, OPTIONS)
+        sight = Sight(views, RenderedTargets(rasterizer, views))
+
+        def pictures(some):
+            return nullcontext(RenderedTargets(rasterizer, some))
+
+        then, errors = settle(before, bench, sight, pictures, settling, OPTIONS)
     return before, then, errors, bench
 
 
@@ -62,9 +67,9 @@ def test_a_fit_can_look_at_what_a_file_will_hold(family_device, plush_excerpt, s
     factors = Factors(world.sf_scale, world.sf_rotation, world.sf_opacity)
     scene = in_form_of_files(plush_excerpt)
     with Rasterizer(family_device, plush_excerpt) as rasterizer:
-        targets = RenderedTargets(rasterizer, small_views)
-        found = fit_scene(family_device, scene, small_views, targets, FitOptions(steps=0), factors=factors)
-        unrounded = fit_scene(family_device, scene, small_views, targets, FitOptions(steps=0))
+        sight = Sight(small_views, RenderedTargets(rasterizer, small_views))
+        found = fit_scene(family_device, scene, sight, FitOptions(steps=0), factors=factors)
+        unrounded = fit_scene(family_device, scene, sight, FitOptions(steps=0))
     _, held_out = share_out(len(small_views), 0)
     expected = mean_error(family_device, plush_excerpt, decoded, [small_views[k] for k in held_out])
     assert found.errors[0] == pytest.approx(expected, rel=1e-3)

@@ -23,7 +23,7 @@ from potr_cl.stages import prune
 from potr_cl.stages.pruning import removal
 from potr_cl.stages.pruning.controller import prune_scene
 from potr_cl.stages.pruning.helpers import measurement
-from potr_cl.stages.pruning.removal import RemovalSweep, planned_sweep
+from potr_cl.stages.pruning.removal import RemovalSweep, Wanted, planned_sweep
 from potr_cl.stages.pruning.schedule import PruningOptions
 from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.stages.stage import State, Workbench
@@ -67,9 +67,7 @@ def _small_groups(request, kernels, monkeypatch):
 
 
 @contextmanager
-def sweep(
-    kernels, grouping="whole", tolerance=0.0, residency="all", workers="one device", spared=None, of=(SCENE, CAMERAS)
-):
+def sweep(kernels, grouping="whole", tolerance=0.0, residency="all", workers="one device", of=(SCENE, CAMERAS)):
     """A measurement of the street as a plan says, and that it gave all memory back."""
     (scene, cameras), (count, elsewhere) = of, WORKERS[workers]
     devices = [shared_device(kernels, number) for number in range(count)]
@@ -86,7 +84,7 @@ def sweep(
             names = [worker.name for worker in pool.workers()]
             dealt = ViewShares.of(cameras, visibility, [1.0] * len(names), scene, np.arange(len(scene)), names)
         bench = Workbench(HyperParameters.from_quality(0.5), device=devices[0], memory=options.memory, pool=pool)
-        yield stack.enter_context(measurement(State.of(scene, cameras), bench, options, visibility, spared, dealt))
+        yield stack.enter_context(measurement(State.of(scene, cameras), bench, options, visibility, dealt))
     assert not any(helper.allocated for helper in devices[1:]), "not all memory was given back"
 
 
@@ -101,7 +99,7 @@ def course(kernels, tolerance=0.0):
 def choice(kernels, limit, iterations, tolerance):
     """What pruning makes of that, and whether the device steers it."""
     with sweep(kernels, tolerance=tolerance) as wanted:
-        return prune_scene(wanted, PruningOptions(limit, iterations)), wanted.steering is not None
+        return prune_scene(wanted, PruningOptions(limit, iterations)), wanted.can_steer
 
 
 @pytest.mark.parametrize(
@@ -121,8 +119,8 @@ def test_the_same_bits(kernels, grouping, residency, workers):
     """While splats go and colours change. Which views are resident is another matter: so no tile may be skipped."""
     with sweep(kernels, grouping, 0.0, residency, workers) as got:
         if workers == "one device":
-            assert residency != "nothing" or got.resident_views == 0
-            assert residency != "some" or 0 < got.resident_views < len(CAMERAS)
+            assert residency != "nothing" or got.ready_views == 0
+            assert residency != "some" or 0 < got.ready_views < len(CAMERAS)
         course(kernels).check(got)
 
 
@@ -130,7 +128,7 @@ def test_the_same_bits(kernels, grouping, residency, workers):
 def test_the_same_tiles_are_skipped(kernels, grouping):
     """By a tolerance, where all views are resident."""
     with sweep(kernels, grouping, 0.05) as got:
-        assert got.resident_views == len(CAMERAS)
+        assert got.ready_views == len(CAMERAS)
         course(kernels, 0.05).check(got)
 
 
@@ -139,7 +137,7 @@ def test_the_same_choice(kernels, grouping):
     """By the host, or by the device's own controller where there is one."""
     wanted, steered = choice(kernels, 1e-5, 12, 0.01)
     with sweep(kernels, grouping, 0.01) as got:
-        assert (got.steering is not None) == steered
+        assert got.can_steer == steered
         found = prune_scene(got, PruningOptions(1e-5, 12))
     assert np.array_equal(found.order, wanted.order)
     assert found.kept == wanted.kept < len(SCENE)
@@ -190,8 +188,8 @@ def test_views_that_draw_nothing_are_views_too(kernels, grouping, residency):
 )
 def test_spared_splats_stay(kernels, grouping, residency):
     spared = np.random.default_rng(2).random(len(SCENE)) < 0.3
-    with sweep(kernels, grouping, residency=residency, spared=spared) as removal:
-        kept = prune_scene(removal, PruningOptions(1e-2, 4)).survivors
+    with sweep(kernels, grouping, residency=residency) as removal:
+        kept = prune_scene(removal, PruningOptions(1e-2, 4), spared=spared).survivors
     assert not np.isin(np.flatnonzero(spared), choice(kernels, 1e-2, 4, 0.0)[0].survivors).all()
     assert np.isin(np.flatnonzero(spared), kept).all()
     assert len(kept) < len(SCENE) - 100
@@ -222,9 +220,9 @@ def test_streamed_views_wait_until_they_have_lost_enough(kernels, grouping):
 def test_resident_views_keep_to_the_memory(device, grouping, memory):
     """Where it is the host's."""
     seen = Visibility.of(SCENE, CAMERAS)
-    with planned_sweep(device, SCENE, CAMERAS, SweepOptions(0.0, memory=memory), visibility=seen) as drawn:
+    with planned_sweep(device, SCENE, Wanted(CAMERAS, SweepOptions(0.0, memory=memory), visibility=seen)) as drawn:
         totals = 16 * len(SCENE) + len(SCENE)
-        assert 0 < drawn.resident_views < len(CAMERAS)
+        assert 0 < drawn.ready_views < len(CAMERAS)
         assert device.allocated <= memory + totals
 
 
@@ -232,8 +230,8 @@ def test_from_a_scene_on_the_device(device, kernels):
     """Copies are gathered there."""
     visibility = Visibility.of(SCENE, CAMERAS)
     with uploaded(device, SCENE) as whole:
-        given = (device, whole, CAMERAS, SweepOptions(0.0, turns=2), (0.0, 0.0, 0.0), visibility, None, None, SCENE)
-        with planned_sweep(*given) as got:
+        wanted = Wanted(CAMERAS, SweepOptions(0.0, turns=2), visibility=visibility)
+        with planned_sweep(device, whole, wanted, SCENE) as got:
             found = got.measure()
     with Rasterizer(device, SCENE) as rasterizer, RemovalSweep(rasterizer, CAMERAS, SweepOptions(0.0)) as wanted:
         assert np.array_equal(wanted.measure()[0], found[0])
@@ -270,7 +268,7 @@ def test_copies_of_clusters_wake_one_at_a_time(kernels, grouping, monkeypatch):
     monkeypatch.setattr(SceneBuffers, "wake", woken)
     monkeypatch.setattr(SceneBuffers, "close", closed)
     with sweep(kernels, grouping, residency="some") as got:
-        assert got.resident_views > 0
+        assert got.ready_views > 0
         most.clear()
         got.measure()
     copies, together = zip(*most, strict=True)

@@ -25,7 +25,7 @@ def cameras(plush_excerpt_cameras):
 
 def run(device, scene, cameras, options, sweep=None, on_device=True, after_iteration=None):
     with Rasterizer(device, scene) as rasterizer, RemovalSweep(rasterizer, cameras, sweep or SweepOptions()) as removal:
-        assert removal.steering is not None
+        assert removal.can_steer
         if on_device:
             result = prune_scene(removal, options, after_iteration=after_iteration and after_iteration(removal))
         else:
@@ -160,7 +160,7 @@ def test_options_that_only_the_host_knows(gpu, plush_excerpt, cameras):
     with Rasterizer(gpu, plush_excerpt) as rasterizer:
         for sweep in (SweepOptions(turns=2), SweepOptions(memory=0)):
             with RemovalSweep(rasterizer, cameras, sweep) as removal:
-                assert removal.steering is None
+                assert not removal.can_steer
                 assert prune_scene(removal, OPTIONS).kept < 1500
         with RemovalSweep(rasterizer, cameras) as removal:
             assert prune_scene(removal, PruningOptions(0, 3, count=700)).kept == 700

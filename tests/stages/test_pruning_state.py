@@ -46,15 +46,16 @@ def on_device(device, survivors) -> list[int]:
     return device.download(survivors.buffer, (8,), np.uint8).tolist()
 
 
-def test_a_removal_is_news_to_the_device_until_it_is_settled(usual_device, survivors, waits):
+def test_a_removal_is_settled_once_the_kernels_that_look_for_it_are_done(usual_device, survivors, waits):
     assert survivors.alive.tolist() == [True] * 5
     assert on_device(usual_device, survivors) == [ALIVE] * 8
-    survivors.remove(np.array([1, 3]))
+    survivors.mark(np.array([0b01010], np.uint8))
+    survivors.are_marked()
     just = [ALIVE, JUST_REMOVED, ALIVE, JUST_REMOVED, *[ALIVE] * 4]
     assert on_device(usual_device, survivors) == just
     assert waits == []
     assert survivors.alive.tolist() == [True, False, True, False, True]
-    assert waits == [just]  # the kernels that look for them were waited for before the states changed
+    assert waits == [just]  # before the states changed
     assert on_device(usual_device, survivors) == [ALIVE, REMOVED, ALIVE, REMOVED, *[ALIVE] * 4]
     survivors.settle()
     assert len(waits) == 1
@@ -63,18 +64,18 @@ def test_a_removal_is_news_to_the_device_until_it_is_settled(usual_device, survi
 def test_what_the_device_has_marked_reaches_the_host(usual_device, survivors):
     marked = np.array([ALIVE, ALIVE, JUST_REMOVED, REMOVED, *[ALIVE] * 4], np.uint8)
     cl.enqueue_copy(usual_device.queue, survivors.buffer, marked, is_blocking=True)
-    survivors.marked_by_device()
+    survivors.are_marked()
     assert survivors.alive.tolist() == [True, True, False, False, True]
     assert on_device(usual_device, survivors) == [ALIVE, ALIVE, REMOVED, REMOVED, *[ALIVE] * 4]
 
 
-def test_removals_of_host_and_device_add_up(usual_device, survivors):
-    survivors.remove(np.array([0]))
-    survivors.settle()
-    marked = np.array([REMOVED, JUST_REMOVED, *[ALIVE] * 6], np.uint8)
-    cl.enqueue_copy(usual_device.queue, survivors.buffer, marked, is_blocking=True)
-    survivors.marked_by_device()
-    survivors.remove(np.array([4]))
+def test_removals_add_up(survivors):
+    """Settled in between or not."""
+    for splats, settled in ((0b1, True), (0b10, False), (0b10000, False)):
+        survivors.mark(np.array([splats], np.uint8))
+        survivors.are_marked()
+        if settled:
+            survivors.settle()
     assert survivors.alive.tolist() == [False, False, True, True, False]
 
 
@@ -87,18 +88,11 @@ def test_marks_travel_as_bits(usual_device, survivors):
         ):
             states = np.array([*marks, *[ALIVE] * 3], np.uint8)
             cl.enqueue_copy(usual_device.queue, survivors.buffer, states, is_blocking=True)
-            survivors.marked_by_device()
+            survivors.are_marked()
             told.mark(survivors.just_marked())
-            told.marked_by_device()
+            told.are_marked()
             assert on_device(usual_device, told) == states.tolist()
         assert told.alive.tolist() == survivors.alive.tolist() == [False, False, True, True, False]
-
-
-def test_a_mark_after_a_removal_by_the_host(usual_device, survivors):
-    survivors.remove(np.array([0]))
-    survivors.mark(np.array([0b10], np.uint8))
-    survivors.marked_by_device()
-    assert survivors.alive.tolist() == [False, False, True, True, True]
 
 
 def refusing(*_args, **_more):
@@ -106,9 +100,10 @@ def refusing(*_args, **_more):
 
 
 def test_what_the_driver_refuses_is_told_in_one_line(survivors, monkeypatch):
+    survivors.are_marked()
     monkeypatch.setattr(cl, "enqueue_copy", refusing)
     with pytest.raises(DeviceError, match="INVALID_MEM_OBJECT"):
-        survivors.remove(np.array([1]))
+        survivors.settle()
     monkeypatch.undo()
 
 

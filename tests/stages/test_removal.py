@@ -157,7 +157,7 @@ def test_buffers_too_small_for_all_views_change_nothing(device, plush_excerpt, p
             removal.measure()
             removal.remove(np.arange(0, 1500, 10))
             results.append(np.stack(removal.measure())[:, np.arange(1, 1500, 10)])
-            assert removal.resident_views == 7
+            assert removal.ready_views == 7
     assert np.array_equal(*results)
 
 
@@ -248,7 +248,7 @@ def test_a_failure_gives_all_memory_back(device, monkeypatch, share):
         before = device.allocated
         with RemovalSweep(rasterizer, cameras, keep_all) as removal:
             needed = device.allocated - before
-            assert removal.resident_views == 5
+            assert removal.ready_views == 5
         scratch = device.allocated - before
         limit = int(before + scratch + share * (needed - scratch))
         monkeypatch.setattr(device, "info", dataclasses.replace(device.info, memory=limit))

@@ -106,7 +106,7 @@ def test_only_as_many_are_added_as_fit_the_memory(usual_device, plush_excerpt, p
     with Rasterizer(usual_device, plush_excerpt) as rasterizer:
         before = usual_device.allocated
         with RemovalSweep(rasterizer, state.views, SweepOptions(memory=some * 1_000_000)) as sweep:
-            assert sweep.resident_views == len(state.views)
+            assert sweep.ready_views == len(state.views)
             assert usual_device.allocated - before < (some + 1) * 1_000_000
     assert usual_device.allocated == 0
 

@@ -55,7 +55,8 @@ def test_every_view_is_walked_once_and_shows_the_scene(device, memory, copied):
         whole = stack.enter_context(Rasterizer(device, SCENE))
         if copied:
             groups = [ViewGroup((number,), len(SCENE), among=ALL, nbytes=1) for number in range(len(CAMERAS))]
-            source, plan = CopiedSplats(device, SCENE, SCENE, BLACK), ViewPlan(groups, KnownBudget(memory))
+            source = CopiedSplats(device, SCENE, SCENE, BLACK)
+            plan = ViewPlan(groups, KnownBudget(memory), singly=True)
         else:
             cache = stack.enter_context(ViewCache(device, memory))
             strides = dict.fromkeys(range(len(CAMERAS)), whole.stride)

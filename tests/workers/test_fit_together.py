@@ -11,7 +11,7 @@ import pytest
 from potr_cl.errors import DeviceError
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting import together
-from potr_cl.stages.fitting.fit import FitOptions, fit_scene
+from potr_cl.stages.fitting.fit import FitOptions, Sight, fit_scene
 from potr_cl.stages.fitting.together import FitPart
 from potr_cl.views.shares import HelpFrom
 from potr_cl.views.targets import RenderedTargets
@@ -30,7 +30,7 @@ OPTIONS = FitOptions(steps=9, rounds=2, batch=4)
 def fitted(device, pool=None, options=OPTIONS):
     with Rasterizer(device, SOURCE) as rasterizer:
         help_from = None if pool is None else HelpFrom(pool, SOURCE)
-        return fit_scene(device, START, VIEWS, RenderedTargets(rasterizer, VIEWS), options, help_from=help_from)
+        return fit_scene(device, START, Sight(VIEWS, RenderedTargets(rasterizer, VIEWS), help_from=help_from), options)
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +97,7 @@ def test_after_a_fit_that_help_made_slower_others_go_alone(family, alone, monkey
     with HostPool(devices) as pool, Rasterizer(devices[0], SOURCE) as rasterizer:
         help_from, targets = HelpFrom(pool, SOURCE), RenderedTargets(rasterizer, VIEWS)
         for taken in (4, 4):
-            found = fit_scene(devices[0], START, VIEWS, targets, OPTIONS, help_from=help_from)
+            found = fit_scene(devices[0], START, Sight(VIEWS, targets, help_from=help_from), OPTIONS)
             assert same(found, alone)
             assert len(steps) == taken
 

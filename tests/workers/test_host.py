@@ -269,7 +269,7 @@ def test_large_scenes_view_by_view(kept, monkeypatch):
 
     def noting(self, *given, **named):
         made(self, *given, **named)
-        shares.append(self.resident_views)
+        shares.append(self.ready_views)
 
     monkeypatch.setattr(removal.RemovalSweep, "__init__", noting)
     monkeypatch.setattr(removal.plans, "by_view", lambda *given: plans.append(len(given[2])) or by_view(*given))

@@ -74,8 +74,6 @@ class FakeHeld(Held):
 
 
 class FakePool(Pool):
-    takes_part = False
-    sparse = False
     names = ()
 
     def __init__(self, *workers, patience=None):

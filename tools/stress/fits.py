@@ -9,6 +9,8 @@ finite.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +25,8 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import RasterRules
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
-from potr_cl.stages.fitting.fit import FitOptions, fit_scene
-from potr_cl.stages.fitting.settling import Looking, Settling, settle
+from potr_cl.stages.fitting.fit import FitOptions, Sight, fit_scene
+from potr_cl.stages.fitting.settling import Settling, settle
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.views.targets import RenderedTargets
 from tests.reference.derivatives import gradient
@@ -61,7 +63,7 @@ def _fitted(device: Device, scene: Scene, view: Camera) -> float:
     """
     views = [view, dataclasses.replace(view, name="the same again")]  # to fit to, and to judge by
     with Rasterizer(device, scene) as rasterizer:
-        fitted = fit_scene(device, _shaken(scene), views, RenderedTargets(rasterizer, views), _STEPS)
+        fitted = fit_scene(device, _shaken(scene), Sight(views, RenderedTargets(rasterizer, views)), _STEPS)
     if not is_finite(fitted.scene):
         return np.inf
     if not np.isfinite(fitted.errors[0]):
@@ -75,9 +77,13 @@ def _settled(device: Device, scene: Scene, view: Camera) -> float:
     bench = Workbench(_PARAMETERS, device=device)
     settling = Settling(choosing=0.5, rounding=0.5, gentle=1.0, through=1.0)
     with Rasterizer(device, scene) as rasterizer:
-        looking = Looking(views, 0, RenderedTargets(rasterizer, views), rasterizer)
+        sight = Sight(views, RenderedTargets(rasterizer, views))
+
+        def pictures(some: Sequence[Camera]) -> AbstractContextManager[RenderedTargets]:
+            return nullcontext(RenderedTargets(rasterizer, some))
+
         try:
-            state, _ = settle(State.of(scene, views), bench, looking, settling, _STEPS)
+            state, _ = settle(State.of(scene, views), bench, sight, pictures, settling, _STEPS)
         except DataError:  # no file holds such a scene, and the encode says so
             return 0.0
     finite = is_finite(state.scene)

@@ -57,7 +57,7 @@ from potr_cl.raster.scene_buffers import Drawable, uploaded
 from potr_cl.stages.pruning.buffers import Survivors
 from potr_cl.stages.pruning.controller import prune_scene
 from potr_cl.stages.pruning.exchange import AddedChanges, AlivePacking, ChangedTotals
-from potr_cl.stages.pruning.removal import planned_sweep
+from potr_cl.stages.pruning.removal import Wanted, planned_sweep
 from potr_cl.stages.pruning.schedule import PruningOptions
 from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.stages.refitting import coefficients, sliced_arrays
@@ -137,7 +137,7 @@ def view_by_view(device: Device) -> None:
         given += [(whole, None, 0.0), (whole, 0, 0.05)] if device.family == "gpu" else []
         for source, memory, tolerance in given:
             options = SweepOptions(tolerance, memory=memory)
-            with planned_sweep(device, source, views, options, visibility=visibility) as removal:
+            with planned_sweep(device, source, Wanted(views, options, visibility=visibility)) as removal:
                 removal.measure()
                 removal.remove(np.arange(0, len(scene), 5))
                 removal.measure()
@@ -200,7 +200,7 @@ def packing(device: Device) -> None:
 def marks(device: Device) -> None:
     """The bits of splats that go, and back; totals of those that are left, and their changes, packed, and back."""
     with Survivors(device, 61, 64, device.queue.finish) as survivors, Memory(device) as memory:
-        survivors.remove(np.arange(0, 61, 3))
+        survivors.mark(np.packbits(np.arange(61) % 3 == 0, bitorder="little"))
         survivors.mark(survivors.just_marked())
         totals = memory.upload(np.ones((64, 2), np.int64), "totals")
         with AlivePacking(device, 61, survivors.buffer) as packing:

@@ -41,6 +41,7 @@ from potr_cl.formats.scenes.sog_images import (
 )
 from potr_cl.formats.scenes.sog_values import areas, in_order, palette_of, quantised, unpacked_means, unpacked_rotations
 from potr_cl.host.atomic_write import replacing
+from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
 
 #: What is packed in a SOG file is compressed already; only its description shrinks.
@@ -214,17 +215,8 @@ class Sog:
                 self._check_pixels(name, index)
         scene = Scene.blank(count, coefficients, by_splat=True)
         self._fill_means(scene.means)
-        quaternions, scales = self._pixels("quats", 0), self._pixels("scales", 0)
-        book = self._codebook("scales")
-        for block in self._blocks():
-            scene.quaternions[block] = unpacked_rotations(quaternions[block])
-            scene.log_scales[block] = book.take(scales[block, :3])
-        del quaternions, scales
-        colours, book = self._pixels("sh0", 0), self._codebook("sh0")
-        logits = byte_logits()
-        for block in self._blocks():
-            scene.sh[block, 0] = book.take(colours[block, :3])
-            scene.opacity_logits[block] = logits.take(colours[block, 3])
+        self._fill_shapes(scene)
+        self._fill_colours(scene)
         if coefficients > 1:
             self._fill_rest(scene.sh[:, 1:])
         return scene.rendered(self._meta.get("model") == ANTIALIASED)
@@ -232,10 +224,32 @@ class Sog:
     def _fill_means(self, means: FloatArray) -> None:
         low, high = self._pixels("means", 0), self._pixels("means", 1)
         least, most = (np.array(self._numbers("means", key, 3), np.float32) for key in ("mins", "maxs"))
-        for block in self._blocks():
+
+        def fill(block: slice) -> None:
             steps = low[block, :3] | high[block, :3].astype(np.uint16) << np.uint16(8)
             with np.errstate(over="ignore"):  # such a splat is dropped
                 means[block] = unpacked_means(steps, least, most)
+
+        self._in_blocks(fill)
+
+    def _fill_shapes(self, scene: Scene) -> None:
+        quaternions, scales = self._pixels("quats", 0), self._pixels("scales", 0)
+        book = self._codebook("scales")
+
+        def fill(block: slice) -> None:
+            scene.quaternions[block] = unpacked_rotations(quaternions[block])
+            scene.log_scales[block] = book.take(scales[block, :3])
+
+        self._in_blocks(fill)
+
+    def _fill_colours(self, scene: Scene) -> None:
+        colours, book, logits = self._pixels("sh0", 0), self._codebook("sh0"), byte_logits()
+
+        def fill(block: slice) -> None:
+            scene.sh[block, 0] = book.take(colours[block, :3])
+            scene.opacity_logits[block] = logits.take(colours[block, 3])
+
+        self._in_blocks(fill)
 
     def _fill_rest(self, rest: FloatArray) -> None:
         part, coefficients = self._meta["shN"], rest.shape[1]
@@ -247,16 +261,22 @@ class Sog:
             raise self._damaged(f"a palette of {width} x {height} pixels for {entries} entries")
         self._check_pixels("shN", 1)
         palette = self._pixels("shN", 0)[:, :3].reshape(-1, coefficients, 3)
-        values = self._codebook("shN").take(palette)
-        values[entries:] = 0
+        values = np.zeros((entries + 1, coefficients, 3), np.float32)
+        values[:entries] = self._codebook("shN").take(palette[:entries])
         labels = self._pixels("shN", 1)
-        for block in self._blocks():
-            index = labels[block, 0] | labels[block, 1].astype(np.intp) << 8
-            index[index >= entries] = -1  # beyond the palette stands nothing: colours that do not change
-            rest[block] = np.where((index >= 0)[:, None, None], values[index], np.float32(0))
 
-    def _blocks(self) -> list[slice]:
-        return [slice(start, min(start + _BLOCK, self.count)) for start in range(0, self.count, _BLOCK)]
+        def fill(block: slice) -> None:
+            index = labels[block, 0] | labels[block, 1].astype(np.intp) << 8
+            # Beyond the palette stands nothing: colours that do not change.
+            rest[block] = values.take(np.minimum(index, entries), axis=0)
+
+        self._in_blocks(fill)
+
+    def _in_blocks(self, fill: Callable[[slice], None]) -> None:
+        """Call a function with each block of splats, in several threads."""
+        blocks = [slice(start, min(start + _BLOCK, self.count)) for start in range(0, self.count, _BLOCK)]
+        with thread_pool() as pool:
+            list(pool.map(fill, blocks))
 
     def _codebook(self, name: str) -> FloatArray:
         return np.array(self._numbers(name, "codebook", CODEBOOK), np.float32)

@@ -86,18 +86,13 @@ class Adam(Owner):
     what suits all. Their averages (Polyak and Juditsky, 1992) do not: on plush they are 0.9 dB nearer to its pictures.
 
     Args:
-        device: to compute on.
         scene: where the parameters begin.
         buffers: of a rasterizer that has this scene; each step writes the new parameters there.
-        columns: which parameter is in which column.
-        rates: of a step.
-        limits: of the parameters.
         factors: what the rasterizer's scene is rounded with, while ``values`` are not; the scene has to be
             :func:`in_form_of_files` then. The gradient is taken for that of the parameters, as if nothing were rounded
             (the straight-through estimator of Bengio et al., 2013).
 
     Attributes:
-        buffers, columns: as given.
         values: (columns, stride) float32, the parameters; quaternions of length 1 at first.
     """
 

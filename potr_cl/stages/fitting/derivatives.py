@@ -72,12 +72,9 @@ class PictureDerivatives(Owner):
     """Jᵀ W v of one scene, whose parameters may change on the device between two calls.
 
     Args:
-        device: to compute on.
         scene: of N splats.
-        rules, background: of the rasterizer.
 
     Attributes:
-        rasterizer: of the scene.
         columns: which parameter is in which column of the gradient.
         gradient: (columns, stride) float32, what :meth:`add` adds to; zero at first.
     """
@@ -125,7 +122,6 @@ class PictureDerivatives(Owner):
         """Add Jᵀ W v of some views to the gradient.
 
         Args:
-            cameras: of the views.
             target: (pixels, 3) float32, the pictures of the views, one behind the other.
             given: whether ``target`` holds v; if not, v is the views' difference to these pictures.
             unit: by what v is multiplied while it is summed up: with large numbers small differences keep their digits,

@@ -29,7 +29,7 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.stages.fitting.adam import UNROUNDED, Adam, Factors, Limits, Rates
 from potr_cl.stages.fitting.fitted import Fitted, decibels
-from potr_cl.stages.fitting.together import Batch, DeviceFit, Ground, SharedFit, room_for_pictures, together
+from potr_cl.stages.fitting.together import Batch, DeviceFit, Ground, SharedFit, kept_pictures
 from potr_cl.stages.held_out import share_out
 from potr_cl.views.shares import HelpFrom
 from potr_cl.views.targets import TargetPictures, Targets
@@ -100,122 +100,103 @@ class SupportsBool(Protocol):
 FitProgress = Callable[[int, int], None]
 
 
+@dataclass(frozen=True)
+class Following:
+    """Who follows a fit.
+
+    Attributes:
+        progress: called after each step.
+        tell: called with a line for each round.
+        asked: whether to end before the next step, with the best of the whole rounds; looked at after each.
+    """
+
+    progress: FitProgress = lambda done, steps: None
+    tell: Callable[[str], None] = logger.debug
+    asked: SupportsBool = False
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What a fit looks at.
+
+    Attributes:
+        targets: the picture that each of them should show; pictures that are kept already stay so.
+        added: how many of the views, the last ones, lie between those that were given: they are never held out.
+        help_from: do some of the views; the result is the same.
+        judges: numbers of the views to judge by; None: some of the given ones are held out.
+        fit_to: numbers of the views to look at; None: those that do not judge.
+    """
+
+    cameras: Sequence[Camera]
+    targets: Targets | TargetPictures
+    added: int = 0
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    help_from: HelpFrom | None = None
+    judges: Sequence[int] | None = None
+    fit_to: Sequence[int] | None = None
+
+    @property
+    def held_out(self) -> Sequence[int]:
+        """Numbers of the views to judge by."""
+        return share_out(len(self.cameras) - self.added, self.added)[1] if self.judges is None else self.judges
+
+    def pictures(self, device: Device, memory: int | None) -> AbstractContextManager[TargetPictures]:
+        """The pictures, of which so many bytes are kept for as long as the context lasts, unless they are already."""
+        if isinstance(self.targets, TargetPictures):
+            return nullcontext(self.targets)
+        return kept_pictures(device, self.cameras, self.targets, memory)
+
+
 def fit_scene(
     device: Device,
     scene: Scene,
-    cameras: Sequence[Camera],
-    targets: Targets | TargetPictures,
+    sight: Sight,
     options: FitOptions | None = None,
-    added: int = 0,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    progress: FitProgress | None = None,
-    tell: Callable[[str], None] | None = None,
-    asked: SupportsBool = False,
-    held_out: Sequence[int] | None = None,
-    fit_to: Sequence[int] | None = None,
+    following: Following | None = None,
     factors: Factors = UNROUNDED,
-    help_from: HelpFrom | None = None,
 ) -> Fitted:
     """Fit all parameters of a scene to pictures of some views.
 
     Args:
-        device: to compute on.
         scene: where the fit begins.
-        cameras: the views.
-        targets: the picture that each of them should show; pictures that are kept already stay so.
-        options: of the fit.
-        added: how many of the views, the last ones, lie between those that were given: they are never held out.
-        background: R, G, B behind the scene.
-        progress: called after each step.
-        tell: called with a line for each round.
-        asked: whether to end before the next step, with the best of the whole rounds; looked at after each.
-        held_out: numbers of the views to judge by; None: some of the given ones.
-        fit_to: numbers of the views to look at, where the judges are given; None: all others.
         factors: what a file will round shapes and opacities with. All is looked at as it is rounded, but what comes of
             it is not. The scene as :class:`potr_cl.stages.fitting.adam.Adam` takes it then.
-        help_from: do some of the views; the result is the same.
 
     Raises:
         UsageError: there are fewer than two given views, so that none can be held out.
         DeviceError: the scene does not fit the device.
     """
-    options = options or FitOptions()
-    if held_out is None:
-        fit_to, held_out = share_out(len(cameras) - added, added)
-    elif fit_to is None:
-        fit_to = [number for number in range(len(cameras)) if number not in set(held_out)]
+    options, cameras, held_out = options or FitOptions(), sight.cameras, sight.held_out
+    fit_to = sight.fit_to or [number for number in range(len(cameras)) if number not in set(held_out)]
     if not held_out or not fit_to:
         raise UsageError("a fit needs two training views or more: one of them is held out and tells whether it helps")
     rates = dataclasses.replace(options.rates, means=options.rates.means * _usual_size(scene))
-    ground = Ground(scene, cameras, background, rates, _limits(scene), factors)
-    with (
-        _pictures_of(device, cameras, targets, options.memory) as pictures,
-        DeviceFit(device, ground, pictures) as descent,
-    ):
+    ground = Ground(scene, cameras, sight.background, rates, _limits(scene), factors)
+    with sight.pictures(device, options.memory) as pictures, DeviceFit(device, ground, pictures) as descent:
         if options.memory is None and options.steps * options.batch >= len(fit_to):
             pictures.fill([(number,) for number in (*held_out, *fit_to)])
-        batch = min(options.batch, len(fit_to))
+        batch, helping = min(options.batch, len(fit_to)), sight.help_from if options.steps else None
         with (
             Judges(device, descent.derivatives.rasterizer, cameras, pictures, held_out) as judges,
-            together(descent, ground, help_from if options.steps else None, options.memory, batch) as steps,
+            SharedFit(descent, ground, helping, options.memory, batch) as steps,
         ):
-            return _run(options, steps, descent.adam, judges, fit_to, progress, tell or logger.debug, asked)
+            return _run(options, steps, descent.adam, judges, fit_to, following or Following())
 
 
-def held_out_error(
-    device: Device,
-    scene: Drawable,
-    cameras: Sequence[Camera],
-    targets: Targets | TargetPictures,
-    added: int = 0,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-) -> float:
-    """The mean squared error of a scene in the views that a fit to these views holds out: what it is judged by.
-
-    Args:
-        device, scene, cameras, targets, added, background: as of :func:`fit_scene`.
-    """
-    _, held_out = share_out(len(cameras) - added, added)
+def held_out_error(device: Device, scene: Drawable, sight: Sight) -> float:
+    """The mean squared error of a scene in the views that a fit which looks at these holds out."""
     with (
-        Rasterizer(device, scene, background=background) as rasterizer,
-        _pictures_of(device, cameras, targets, 0) as pictures,
-        Judges(device, rasterizer, cameras, pictures, held_out) as judges,
+        Rasterizer(device, scene, background=sight.background) as rasterizer,
+        sight.pictures(device, 0) as pictures,
+        Judges(device, rasterizer, sight.cameras, pictures, sight.held_out) as judges,
     ):
         return judges.error()
 
 
-def kept_pictures(
-    device: Device, cameras: Sequence[Camera], targets: Targets, memory: int | None = None
-) -> TargetPictures:
-    """Target pictures for several fits to the same views, as many as there is room for; the caller closes them.
-
-    Args:
-        device, cameras, targets: as of :func:`fit_scene`.
-        memory: bytes of device memory that they may take; None: a quarter of what is free.
-    """
-    return TargetPictures(device, cameras, room_for_pictures(device, memory), targets)
-
-
-def _pictures_of(
-    device: Device, cameras: Sequence[Camera], targets: Targets | TargetPictures, memory: int | None
-) -> AbstractContextManager[TargetPictures]:
-    """The pictures, and if they are not the caller's, their end."""
-    if isinstance(targets, TargetPictures):
-        return nullcontext(targets)
-    return kept_pictures(device, cameras, targets, memory)
-
-
 def _run(
-    options: FitOptions,
-    steps: SharedFit,
-    adam: Adam,
-    judges: Judges,
-    fit_to: Sequence[int],
-    progress: FitProgress | None,
-    tell: Callable[[str], None],
-    asked: SupportsBool,
+    options: FitOptions, steps: SharedFit, adam: Adam, judges: Judges, fit_to: Sequence[int], following: Following
 ) -> Fitted:
-    errors = [judges.error()]
+    errors, asked = [judges.error()], following.asked
     pace = options.start * min(max(math.sqrt(errors[0]) / _USUAL_ERROR, _SLOWEST), 1.0)
     slowing = options.last ** (1 / max(options.steps - 1, 1))
     kept = done = since = 0
@@ -227,8 +208,7 @@ def _run(
         while done < end and not asked:
             steps.step(Batch(next(order), unit, pace * slowing**done))
             done += 1
-            if progress is not None:
-                progress(done, options.steps)
+            following.progress(done, options.steps)
         if done < end:
             break
         with adam.averaged():
@@ -239,7 +219,7 @@ def _run(
             else:
                 since += 1
         now, first = decibels(errors[-1]), decibels(errors[0])
-        tell(f"fit: {done} steps, held-out views {now:.2f} dB, {first:.2f} dB at first")
+        following.tell(f"fit: {done} steps, held-out views {now:.2f} dB, {first:.2f} dB at first")
         if since >= options.patience:
             break
     return Fitted(adam.kept(), done, kept, tuple(errors), len(judges), bool(asked))
@@ -274,9 +254,7 @@ class Judges(Owner):
     """Views that are held out of a fit.
 
     Args:
-        device: to compute on.
         rasterizer: of the scene, which may change between two calls.
-        cameras: all views.
         pictures: what they should show.
         held_out: the numbers of those that judge.
     """

@@ -11,14 +11,15 @@ little is lost. If it matches them better, the scene is fitted to all photograph
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.stages.fitting.adam import Rates
-from potr_cl.stages.fitting.fit import FitOptions, FitProgress, SupportsBool, fit_scene, kept_pictures
+from potr_cl.stages.fitting.fit import FitOptions, Following, Sight, fit_scene
 from potr_cl.stages.fitting.fitted import FittedToPhotographs
+from potr_cl.stages.fitting.together import kept_pictures
 from potr_cl.stages.held_out import hold_out
 from potr_cl.views.targets import Photographs, PhotographTargets
 
@@ -36,23 +37,17 @@ def fit_to_photographs(
     views: Sequence[Camera],
     photographs: Photographs,
     options: FitOptions,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    tell: Callable[[str], None] | None = None,
-    asked: SupportsBool = False,
-    progress: FitProgress | None = None,
+    background: tuple[float, float, float],
+    following: Following,
 ) -> FittedToPhotographs:
     """Fit all parameters of a scene to photographs, if some that are held out agree.
 
     Args:
-        device: to compute on.
         scene: where the fit begins.
         views: that have photographs.
         photographs: of these.
         options: of the fit; their rounds and patience mean nothing here.
-        background: R, G, B behind the scene.
-        tell: called with a line for each look at photographs.
-        asked: whether to end before the next step.
-        progress: called after each step of the fit.
+        following: of the fit, not of the trial before it.
 
     Raises:
         UsageError: there are fewer than two photographs, or one cannot be opened.
@@ -60,35 +55,22 @@ def fit_to_photographs(
         DeviceError: the scene does not fit the device.
     """
     fit_to, judging = hold_out(views)
-    cameras = [*fit_to, *judging]
-    every, judges = range(len(cameras)), range(len(fit_to), len(cameras))
-    # Photographs that it looks at are no judges: these only see to it that nothing goes wrong.
-    some = range(0, len(cameras), max(len(cameras) // len(judging), 1))
+    cameras, asked = [*fit_to, *judging], following.asked
     trial_options = dataclasses.replace(
         options, steps=_TRIAL_STEPS, rounds=_TRIAL_LOOKS, patience=_TRIAL_LOOKS, last=1.0,
         rates=times(options.rates, _TRIAL_RATES),
     )  # fmt: skip
     with kept_pictures(device, cameras, PhotographTargets(device, photographs, cameras), options.memory) as pictures:
-        trial = fit_scene(
-            device,
-            scene,
-            cameras,
-            pictures,
-            trial_options,
-            0,
-            background,
-            None,
-            tell,
-            asked,
-            judges,
-            range(len(fit_to)),
-        )
+        sight = Sight(cameras, pictures, background=background, judges=range(len(fit_to), len(cameras)))
+        trial = fit_scene(device, scene, sight, trial_options, Following(tell=following.tell, asked=asked))
         if asked or not trial.kept:
-            return FittedToPhotographs(None, len(cameras), 0, len(judges), trial.errors, (), bool(asked))
+            return FittedToPhotographs(None, len(cameras), 0, len(judging), trial.errors, (), bool(asked))
+        # Photographs that it looks at are no judges: these only see to it that nothing goes wrong.
+        some, every = range(0, len(cameras), max(len(cameras) // len(judging), 1)), range(len(cameras))
         options = dataclasses.replace(options, rounds=_ROUNDS, patience=_ROUNDS)
-        found = fit_scene(device, scene, cameras, pictures, options, 0, background, progress, tell, asked, some, every)
+        found = fit_scene(device, scene, dataclasses.replace(sight, judges=some, fit_to=every), options, following)
     return FittedToPhotographs(
-        found.scene if found.kept else None, len(cameras), found.kept, len(judges), trial.errors, found.errors,
+        found.scene if found.kept else None, len(cameras), found.kept, len(judging), trial.errors, found.errors,
         found.ended_early,
     )  # fmt: skip
 

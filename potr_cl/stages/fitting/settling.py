@@ -16,25 +16,26 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from typing import TypeAlias
 
 from potr_cl.codec.geometry import Geometry
 from potr_cl.codec.quantisers import QUANTISERS, Balanced
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
-from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import UNROUNDED, Factors, Rates, in_form_of_files
-from potr_cl.stages.fitting.fit import FitOptions, SupportsBool, fit_scene
-from potr_cl.stages.held_out import share_out
+from potr_cl.stages.fitting.fit import FitOptions, Following, Sight, SupportsBool, fit_scene
 from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.stage import State, Workbench
-from potr_cl.views.shares import HelpFrom
-from potr_cl.views.targets import RenderedTargets, TargetPictures, Targets
+from potr_cl.views.targets import Targets
 
 #: Steps of the solution that coefficients are chosen by; the last solution, of the re-fit, takes more.
 _CHOICE_STEPS = 4
+#: A scene's pictures in some views.
+PicturesOf: TypeAlias = Callable[[Sequence[Camera]], AbstractContextManager[Targets]]
 
 
 @dataclass(frozen=True)
@@ -56,28 +57,11 @@ class Settling:
     last: float = 0.1
 
 
-@dataclass(frozen=True)
-class Looking:
-    """What these fits look at.
-
-    Attributes:
-        views: of the fit; the last ``added`` of them are not given ones. added: see there.
-        targets: what these should show.
-        rasterizer: of the scene that they show.
-        help_from: do some of the views of fits.
-    """
-
-    views: Sequence[Camera]
-    added: int
-    targets: Targets | TargetPictures
-    rasterizer: Rasterizer
-    help_from: HelpFrom | None = None
-
-
 def settle(
     state: State,
     bench: Workbench,
-    looking: Looking,
+    sight: Sight,
+    pictures: PicturesOf,
     settling: Settling,
     options: FitOptions,
     asked: SupportsBool = False,
@@ -87,10 +71,7 @@ def settle(
 
     Args:
         state: that was fitted; its views are those that the file is made for.
-        bench: of the stage.
-        looking: what the fits look at.
-        settling: how far they go.
-        options: of the fit before.
+        pictures: of the scene that the targets show, in other views.
         asked: whether to end early: nothing more is fitted then.
         progress: called with the number of steps that a fit has taken.
 
@@ -108,17 +89,14 @@ def settle(
         more = dataclasses.replace(
             options, steps=steps, rounds=3, rates=rates, start=start, last=settling.last, patience=3
         )
-        found = fit_scene(
-            bench.opened, scene, looking.views, looking.targets, more, looking.added, bench.background,
-            tell=bench.tell, asked=asked, factors=factors, help_from=looking.help_from,
-        )  # fmt: skip
+        found = fit_scene(bench.opened, scene, sight, more, Following(tell=bench.tell, asked=asked), factors)
         errors.append(found.error)
         progress(steps)
         return found.scene
 
     still = ("ac",)
     if settling.choosing and bench.parameters.drop and not state.results.compacted:
-        scene = fitted(_with_chosen(state, bench, looking), settling.choosing, settling.gentle, still)
+        scene = fitted(_with_chosen(state, bench, sight, pictures), settling.choosing, settling.gentle, still)
         state = dataclasses.replace(state, scene=scene, geometry=None).with_results(chosen=bench.parameters)
     rounded = bench.output.geometry(state.scene, bench.request(state)) if settling.rounding else None
     if not isinstance(rounded, Geometry) or not isinstance(QUANTISERS[rounded.parameters.quantiser], Balanced):
@@ -134,11 +112,11 @@ def settle(
     return then, tuple(errors)
 
 
-def _with_chosen(state: State, bench: Workbench, looking: Looking) -> Scene:
+def _with_chosen(state: State, bench: Workbench, sight: Sight, pictures: PicturesOf) -> Scene:
     """The scene with the AC coefficients that are worth their bytes, solved for without a look at held-out views."""
-    _, held_out = share_out(len(looking.views) - looking.added, looking.added)
-    views = [view for number, view in enumerate(state.views) if number not in held_out]  # given ones come first in both
+    # Given ones come first in both.
+    views = [view for number, view in enumerate(state.views) if number not in sight.held_out]
     options = RefitOptions(steps=_CHOICE_STEPS, drop=bench.parameters.drop, memory=bench.memory)
-    targets = RenderedTargets(looking.rasterizer, views)
-    refitted = refit_colours(bench.opened, state.scene, views, targets, options, background=bench.background)
+    with pictures(views) as targets:
+        refitted = refit_colours(bench.opened, state.scene, views, targets, options, background=bench.background)
     return dataclasses.replace(state.scene, sh=refitted.sh)

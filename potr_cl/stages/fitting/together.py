@@ -11,8 +11,8 @@ given all of the first one's numbers then.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 
@@ -26,7 +26,7 @@ from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.stages.fitting.adam import UNROUNDED, Adam, Factors, Limits, Rates
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from potr_cl.views.shares import HelpFrom
-from potr_cl.views.targets import Room, TargetPictures, targets_of
+from potr_cl.views.targets import Room, TargetPictures, Targets, targets_of
 from potr_cl.workers.helping import Helping
 from potr_cl.workers.parts import Each, Parts
 from potr_cl.workers.pool import Part
@@ -46,8 +46,6 @@ class Ground:
 
     Attributes:
         scene: whose parameters move.
-        cameras: all views.
-        background: R, G, B behind the scene.
         rates, limits, factors: as of :class:`potr_cl.stages.fitting.adam.Adam`.
     """
 
@@ -64,7 +62,6 @@ class Batch:
     """What a step looks at.
 
     Attributes:
-        numbers: of the views.
         unit: as of :meth:`potr_cl.stages.fitting.derivatives.PictureDerivatives.add`.
         part: of the rates that the step is long.
     """
@@ -74,17 +71,21 @@ class Batch:
     part: float
 
 
-def room_for_pictures(device: Device, memory: int | None) -> Room:
-    """Bytes that target pictures may take; None: a quarter of what is free."""
-    return Room((device.info.memory - device.allocated) * _SHARE if memory is None else memory)
+def kept_pictures(
+    device: Device, cameras: Sequence[Camera], targets: Targets, memory: int | None = None
+) -> TargetPictures:
+    """Target pictures for fits, kept in so many bytes of device memory (None: a quarter of what is free).
+
+    The caller closes them.
+    """
+    room = Room((device.info.memory - device.allocated) * _SHARE if memory is None else memory)
+    return TargetPictures(device, cameras, room, targets)
 
 
 class DeviceFit(Owner):
     """A fit on one device.
 
     Args:
-        device: to compute on.
-        ground: where it begins.
         pictures: the targets; the caller's.
 
     Attributes:
@@ -136,9 +137,7 @@ class FitPart(Part):
     """A :class:`DeviceFit` that follows another one.
 
     Args:
-        device: to compute on.
         memory: bytes of its memory that target pictures may take; None: a quarter of what is free.
-        ground: where it begins.
         source: the scene whose pictures are the targets.
     """
 
@@ -146,8 +145,7 @@ class FitPart(Part):
         with ExitStack() as owned:
             scene = owned.enter_context(scene_on(device, source))
             targets = owned.enter_context(targets_of(device, scene, ground.cameras, ground.background))
-            room = room_for_pictures(device, memory)
-            pictures = owned.enter_context(TargetPictures(device, ground.cameras, room, targets))
+            pictures = owned.enter_context(kept_pictures(device, ground.cameras, targets, memory))
             self._descent = owned.enter_context(DeviceFit(device, ground, pictures))
             self._owned = owned.pop_all()
 
@@ -173,44 +171,50 @@ class FitPart(Part):
         self._descent.taken = taken
 
 
-class SharedFit:
-    """A fit that others help with, as long as this is faster.
+class SharedFit(Helping):
+    """A fit that others help with, each a :class:`FitPart`, as long as this is faster.
 
     Args:
         descent: the first device's.
-        helping: the others, each a :class:`FitPart`.
         help_from: where they are from, which is told if they make it slower; None: there are none.
+        memory: bytes of a device's memory that target pictures may take; None: a quarter of what is free.
+        batch: views of a step: there is no use for more workers.
     """
 
-    def __init__(self, descent: DeviceFit, helping: Helping, help_from: HelpFrom | None) -> None:
-        self._descent, self._helping, self._help_from = descent, helping, help_from
-        self._takes_part = help_from is not None and help_from.pool.takes_part
+    def __init__(
+        self, descent: DeviceFit, ground: Ground, help_from: HelpFrom | None, memory: int | None, batch: int
+    ) -> None:
+        super().__init__(descent.device, "fit")
+        self._descent, self._help_from, self._takes_part = descent, help_from, False
         self._before: tuple[Batch, Sums] | None = None
         self._steps = 0
         self._since, self._seconds = 0.0, list[float]()
+        if help_from is not None and not help_from.slower and help_from.pool.first is descent.device:
+            self._takes_part = help_from.pool.in_process
+            self.open(partial(_parts, help_from, ground, memory, batch))
 
     def step(self, batch: Batch) -> None:
         """Take a step."""
         self._look_at_the_time()
-        if self._helping.parts is None or _FIRST + _TRIED <= self._steps < _FIRST + 2 * _TRIED:
+        if self.parts is None or _FIRST + _TRIED <= self._steps < _FIRST + 2 * _TRIED:
             self._descent.step(batch)
         else:
             self._step_together(batch)
         self._steps += 1
 
     def _step_together(self, batch: Batch) -> None:
-        descent, helping, count = self._descent, self._helping, len(batch.numbers)
-        assert helping.parts is not None
-        doing = len(helping.parts) + self._takes_part
+        descent, count = self._descent, len(batch.numbers)
+        assert self.parts is not None
+        doing = len(self.parts) + self._takes_part
         dealt = [list(range(first, count, doing)) for first in range(doing)]
         own, others = (dealt[0], dealt[1:]) if self._takes_part else ([], dealt)
         before = self._before if descent.taken else None
 
-        pending = helping.begin("sums", descent.taken, before, batch, Each(others), logged=False)
+        pending = self.begin("sums", descent.taken, before, batch, Each(others), logged=False)
         sums = descent.sums(batch, own)
-        for place, found in enumerate(helping.results(pending) or []):
+        for place, found in enumerate(self.results(pending) or []):
             if found is None:
-                found = helping.asked(partial(self._adopted, batch, place, others[place]))
+                found = self.asked(partial(self._adopted, batch, place, others[place]))
             sums += found or []
         known = {place for place, _ in sums}
         sums += descent.sums(batch, [place for place in range(count) if place not in known])
@@ -225,7 +229,7 @@ class SharedFit:
 
     def _look_at_the_time(self) -> None:
         """Measure both ways once, and stay with the faster one: the bits are the same."""
-        if self._helping.parts is None or self._steps not in (_FIRST, _FIRST + _TRIED, _FIRST + 2 * _TRIED):
+        if self.parts is None or self._steps not in (_FIRST, _FIRST + _TRIED, _FIRST + 2 * _TRIED):
             return
         with self._descent.device.errors("failed while computing"):
             self._descent.device.queue.finish()
@@ -233,40 +237,17 @@ class SharedFit:
         self._seconds.append(now - self._since)
         self._since = now
         if len(self._seconds) == 3 and self._seconds[1] > self._seconds[2]:
-            self._helping.close()
+            self.close()
             if self._help_from is not None:
                 self._help_from.slower = True
 
 
-@contextmanager
-def together(
-    descent: DeviceFit, ground: Ground, help_from: HelpFrom | None, memory: int | None, batch: int
-) -> Iterator[SharedFit]:
-    """A fit by all who are there.
-
-    Args:
-        descent: the first device's.
-        ground: where it begins.
-        help_from: who does views besides; None: nobody.
-        memory: bytes of a device's memory that target pictures may take; None: a quarter of what is free.
-        batch: views of a step: there is no use for more workers.
-    """
-    if help_from is not None and (help_from.slower or help_from.pool.first is not descent.device):
-        help_from = None
-    pool = None if help_from is None else help_from.pool
-    with Helping(descent.device, "fit") as helping:
-
-        def opened(stack: ExitStack) -> Parts | None:
-            assert pool is not None
-            assert help_from is not None
-            count = min(len(pool.workers()), batch - pool.takes_part)
-            given = [stack.enter_context(pool.shared(each)) for each in (ground, help_from.source)]
-            if count <= 0:
-                return None
-            parts = stack.enter_context(Parts(pool, FitPart, [given] * count, memory))
-            parts.ready()
-            return parts
-
-        if pool is not None:
-            helping.open(opened)
-        yield SharedFit(descent, helping, help_from)
+def _parts(help_from: HelpFrom, ground: Ground, memory: int | None, batch: int, stack: ExitStack) -> Parts | None:
+    pool = help_from.pool
+    count = min(len(pool.workers()), batch - pool.in_process)
+    given = [stack.enter_context(pool.shared(each)) for each in (ground, help_from.source)]
+    if count <= 0:
+        return None
+    parts = stack.enter_context(Parts(pool, FitPart, [given] * count, memory))
+    parts.ready()
+    return parts

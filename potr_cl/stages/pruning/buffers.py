@@ -7,7 +7,7 @@ out.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from enum import IntEnum
 
 import numpy as np
@@ -22,7 +22,6 @@ from potr_cl.raster.sweep import totals_limits
 from potr_cl.raster.view_set import View, ViewSet
 from potr_cl.views.subsets import Subset
 
-Indices = NDArray[np.int64]
 Bits = NDArray[np.uint8]
 
 #: Work-items of a work-group of the kernels that turn marks to bits and back; each has eight splats.
@@ -40,13 +39,9 @@ class SplatState(IntEnum):
 
 
 class Survivors(Owner):
-    """The state of each splat. Host and device have one copy each, and :meth:`settle` makes them agree.
-
-    The host is ahead after :meth:`remove`, until the kernels that look for JUST_REMOVED are done. The device is ahead
-    after it has marked splats itself (:meth:`marked_by_device`).
+    """The state of each splat, on the device; the host has a copy, which :meth:`settle` brings up to date.
 
     Args:
-        device: that has the copy.
         splats: N.
         stride: N padded; the buffer holds so many, and all are alive at first.
         wait: returns once the device has finished what was enqueued.
@@ -57,10 +52,8 @@ class Survivors(Owner):
 
     def __init__(self, device: Device, splats: int, stride: int, wait: Callable[[], None]) -> None:
         self.device = device
-        self._splats = splats
-        self._wait = wait
+        self._splats, self._wait, self._are_marked = splats, wait, False
         self._states = np.full(stride, SplatState.ALIVE, np.uint8)
-        self._host_is_ahead = self.device_is_ahead = False
         self._memory = Memory(device)
         self.buffer = self._memory.upload(self._states, "the splats that are left")
 
@@ -71,22 +64,12 @@ class Survivors(Owner):
         alive: NDArray[np.bool_] = self._states[: self._splats] == SplatState.ALIVE
         return alive
 
-    def remove(self, splats: Indices) -> None:
-        """Remove splats. On the device they are JUST_REMOVED until the next :meth:`settle`."""
-        self.settle()
-        self._states[splats] = SplatState.JUST_REMOVED
-        self.device.copy(self.buffer, self._states)
-        self._states[splats] = SplatState.REMOVED
-        self._host_is_ahead = True
-
     def mark(self, splats: Bits) -> None:
-        """Mark splats on the device as JUST_REMOVED, as a controller there does; :meth:`marked_by_device` follows.
+        """Mark splats as JUST_REMOVED, as a controller on the device does; :meth:`are_marked` follows.
 
         Args:
             splats: as :meth:`just_marked` gives them.
         """
-        if self._host_is_ahead:
-            self.settle()
         with Memory(self.device) as memory:
             bits = memory.upload(splats, "the splats that go")
             self._launch("mark_bits", bits)
@@ -105,21 +88,18 @@ class Survivors(Owner):
         kernel.bind(states=self.buffer, splats=self._splats, bits=bits)
         kernel.launch((-(-self._splats // (8 * _GROUP)) * _GROUP,), (_GROUP,))
 
-    def marked_by_device(self) -> None:
-        """Note that the device has changed states from ALIVE to JUST_REMOVED, and that the host does not know which."""
-        self.device_is_ahead = True
+    def are_marked(self) -> None:
+        """Note that splats have been marked, and that the host does not know which."""
+        self._are_marked = True
 
     def settle(self) -> None:
         """Make host and device agree on the splats that are left; none is JUST_REMOVED afterwards."""
-        if self._host_is_ahead:
-            self._host_is_ahead = False
-            self._wait()
-        elif self.device_is_ahead:
-            self.device_is_ahead = False
-            self._states = self.device.download(self.buffer, self._states.shape, np.uint8)
-            self._states[self._states == SplatState.JUST_REMOVED] = SplatState.REMOVED
-        else:
+        if not self._are_marked:
             return
+        self._are_marked = False
+        self._wait()
+        self._states = self.device.download(self.buffer, self._states.shape, np.uint8)
+        self._states[self._states == SplatState.JUST_REMOVED] = SplatState.REMOVED
         self.device.copy(self.buffer, self._states)
 
 
@@ -128,14 +108,12 @@ class PreparedSet(Owner):
 
     Args:
         rasterizer: that prepared them.
-        numbers: of the views among the cameras.
         views: projection and lists, as they were prepared for the first time; this object's from now on.
         memory: to take the rest from, which is closed with this object; None: memory of its own.
         target: the pictures before any removal, which stay the caller's; None: memory for them.
         pending: as of :meth:`potr_cl.opencl.device.Device.upload`.
 
     Attributes:
-        numbers, views: as given.
         lengths: (tiles,) uint32, intersections that a tile has left.
         sums: (intersections, 2) float32, ΔMSE and I of an intersection, summed over its tile's pixels.
         target: (pixels, 3) float32, the pictures before any removal.
@@ -145,7 +123,6 @@ class PreparedSet(Owner):
     def __init__(
         self,
         rasterizer: Rasterizer,
-        numbers: Sequence[int],
         views: ViewSet,
         memory: Memory | None = None,
         target: cl.Buffer | None = None,
@@ -153,7 +130,7 @@ class PreparedSet(Owner):
     ) -> None:
         self._device = device = rasterizer.device
         self._memory = memory or Memory(device)
-        self.numbers, self.views = numbers, views
+        self.views = views
         self.first_tile = 0
         try:
             lengths = np.concatenate([np.diff(offsets) for offsets in views.found_offsets])
@@ -206,27 +183,29 @@ class Ledger(Owner):
 
     Args:
         survivors: the scene's marks.
-        totals: (N, 2) int64 that the kernels add to, by the splats' numbers.
-        subset: the splats of the views.
+        totals: (N, 2) int64 that the kernels add to, by the splats' numbers; None: nobody asks for what they add.
+        subset: the splats of the views, n of N.
 
     Attributes:
-        marks, totals, numbers: for the kernels; no numbers: they know places only.
+        marks, totals: for the kernels: (N,) :class:`SplatState`, (N, 2) int64.
+        numbers: for GPU kernels, (n,) uint32, the splats' numbers among those N; None: they are numbered as these.
         is_local: whether :meth:`add_to` has anything to do.
     """
 
-    def __init__(self, survivors: Survivors, totals: cl.Buffer, subset: Subset) -> None:
+    def __init__(self, survivors: Survivors, totals: cl.Buffer | None, subset: Subset) -> None:
         self._survivors, self._device, self._count = survivors, survivors.device, subset.count
         self._own_numbers = subset.numbers
         self._memory = Memory(self._device)
-        self.is_local = subset.numbers is not None and self._device.family == "cpu"
+        self.is_local = subset.numbers is not None and (self._device.family == "cpu" or totals is None)
         self.marks, self.totals, self.numbers = survivors.buffer, totals, subset.numbers
-        if self.is_local:
-            stride = subset.rasterizer.stride
-            with self._device.all_or_nothing():
+        stride = subset.rasterizer.stride
+        with self._device.all_or_nothing():
+            if self.is_local:
                 alive = np.full(stride, SplatState.ALIVE, np.uint8)
-                self.marks = self._memory.upload(alive, "the splats that are left")
-                self.totals = self._memory.upload(np.zeros((stride, 4), np.uint32), "the removal effects")
-            self.numbers = None
+                self.marks, self.numbers = self._memory.upload(alive, "the splats that are left"), None
+            if self.is_local or totals is None:
+                self.totals = self._memory.allocate(16 * stride, "the removal effects")
+                self._device.fill(self.totals, np.int64(0))
 
     def take_marks(self) -> None:
         """Enqueue that the marks are those of the scene."""

@@ -18,7 +18,7 @@ from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.opencl.structs import bytes_before, struct_dtype
 from potr_cl.raster.sweep import totals_limits
 from potr_cl.stages.pruning.removal import RemovalSweep
-from potr_cl.stages.pruning.schedule import Course, Indices, Iteration, Pruned, PruningOptions, prune
+from potr_cl.stages.pruning.schedule import BEYOND, Course, Indices, Iteration, Pruned, PruningOptions, prune
 
 _SOURCE = "prune/choose_gpu.cl"
 #: A score has so many digits, each of so many values; a work-group has a work-item for each value.
@@ -35,9 +35,9 @@ def prune_scene(
     spared: NDArray[np.bool_] | None = None,
 ) -> Pruned:
     """As :func:`potr_cl.stages.pruning.schedule.prune`, on the device if it can decide for itself, else on the host."""
-    if removal.steering is None or options.count is not None or not np.isfinite(options.delta_mse_max):
+    if not removal.can_steer or options.count is not None or not np.isfinite(options.delta_mse_max):
         return prune(removal, removal.splats, options, progress, after_iteration, spared)
-    with _Controller(removal.steering, options, spared) as controller:
+    with _Controller(removal, options, spared) as controller:
         return controller.run(progress, after_iteration)
 
 
@@ -87,7 +87,7 @@ class _Controller(Owner):
         """Mark the splats that go in an iteration, and return their number."""
         removal, options = self._removal, self._options
         remaining = options.iterations - iteration
-        effect_unit, importance_unit = removal.units
+        effect_unit, importance_unit = removal.fixed_point.units
         everywhere = {"splats": self._splats, "totals": removal.totals, "keys": self._keys, "state": self._state}
         self._device.fill(self._state, np.uint32(0), _STATE.itemsize)
         self._rank.bind(
@@ -127,6 +127,7 @@ class _Controller(Owner):
         device, n = self._device, self._splats
         alive = self._removal.alive.copy()
         smoothed = device.download(self._smoothed, (n,), np.float32)
+        smoothed[device.download(self._spared, (n,), np.bool_)] = BEYOND
         removed = device.download(self._removed, (n,), _REMOVED)
         iteration = removed["iteration"].astype(np.int32)
         iteration[alive] = -1

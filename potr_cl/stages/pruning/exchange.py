@@ -1,5 +1,6 @@
-"""Totals of splats as they travel from one device to another: :class:`AlivePacking` of those that are left, where
-devices share a process; :class:`ChangedTotals` and :class:`AddedChanges` by how much they have changed, where not.
+"""Totals of splats as they are added up (:func:`add_totals`), and as they travel from one device to another:
+:class:`AlivePacking` of those that are left, where devices share a process; :class:`ChangedTotals` and
+:class:`AddedChanges` by how much they have changed, where not.
 
 A bit for each splat says whether its totals have changed, and a row has the changes of those whose bit is set. Of large
 scenes the host would take longer to compare than a device takes to measure.
@@ -7,7 +8,7 @@ scenes the host would take longer to compare than a device takes to measure.
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import pyopencl as cl
@@ -31,11 +32,20 @@ _TOTALS = 16
 _WHAT = "the removal effects"
 
 
+def add_totals(device: Device, totals: cl.Buffer, more: cl.Buffer, splats: int, how: str = "add_totals") -> None:
+    """Enqueue: totals of so many splats += others, or -= with "subtract_totals"."""
+    _over(device.shared_kernel("prune/add_totals.cl", how), 2 * splats, totals=totals, more=more, count=2 * splats)
+
+
+def _over(kernel: Kernel, items: int, **arguments: Any) -> None:
+    """Enqueue a kernel with a work-item for each of so many things."""
+    kernel.bind(**arguments).launch((-(-items // _GROUP) * _GROUP,), (_GROUP,))
+
+
 class AlivePacking(Owner):
     """Packs and unpacks; devices that have removed the same splats agree on where each of the others is.
 
     Args:
-        device: that has the totals.
         splats: N.
         states: (N,) uint8 in its memory, :class:`potr_cl.stages.pruning.buffers.SplatState`.
     """
@@ -50,10 +60,7 @@ class AlivePacking(Owner):
 
     def note(self) -> None:
         """Pack by the states as they are on the device from now on; before the first call all splats are packed."""
-        runs = self._runs
-        self._alive.bind(states=self._states, splats=self._splats, masks=runs.masks, counts=runs.starts)
-        self._alive.launch((-(-runs.count // _GROUP) * _GROUP,), (_GROUP,))
-        self._left = runs.begin()
+        self._left = self._runs.counted(self._alive, states=self._states, splats=self._splats)
 
     def lend(self, totals: cl.Buffer) -> Lent:
         """What others need of (N, 2) int64 totals, until the next call; all of them where all splats are left."""
@@ -72,10 +79,8 @@ class AlivePacking(Owner):
         return lent.nbytes < _TOTALS * self._splats
 
     def _launch(self, kernel: Kernel, totals: cl.Buffer, packed: cl.Buffer, **more: bool) -> None:
-        kernel.bind(
-            totals=totals, splats=self._splats, masks=self._runs.masks, starts=self._runs.starts, packed=packed, **more
-        )  # fmt: skip
-        kernel.launch((-(-self._splats // _GROUP) * _GROUP,), (_GROUP,))
+        places = {"masks": self._runs.masks, "starts": self._runs.starts}
+        _over(kernel, self._splats, totals=totals, splats=self._splats, packed=packed, **places, **more)
 
     def close(self) -> None:
         """Give the device's memory back."""
@@ -87,7 +92,6 @@ class ChangedTotals(Owner):
     """What has changed on a device since it was asked last; at first all totals are 0.
 
     Args:
-        device: that has the totals.
         splats: N.
         states: (N,) uint8 in its memory, :class:`potr_cl.stages.pruning.buffers.SplatState`. Nobody asks for the
             totals of splats that are not alive.
@@ -109,31 +113,22 @@ class ChangedTotals(Owner):
     def take(self, totals: cl.Buffer) -> Changes:
         """The changes in (N, 2) int64 totals; valid until the next call."""
         runs = self._runs
-        everywhere = {"totals": totals, "before": self._before, "splats": self._splats, "masks": runs.masks}
-        self._find.bind(**everywhere, states=self._states, counts=runs.starts)
-        self._find.launch((-(-runs.count // _GROUP) * _GROUP,), (_GROUP,))
-        changed = runs.begin()
+        everywhere = {"totals": totals, "before": self._before, "splats": self._splats}
+        changed = runs.counted(self._find, **everywhere, states=self._states)
         masks: NDArray[np.uint64] = self._masks.download(runs.masks, (runs.count,), np.uint64)
         self._changes.reserve(_TOTALS * max(changed, 1))
-        self._take.bind(**everywhere, starts=runs.starts, changes=self._changes.buffer)
-        self._take.launch((-(-self._splats // _GROUP) * _GROUP,), (_GROUP,))
+        changes = self._changes.buffer
+        _over(self._take, self._splats, **everywhere, masks=runs.masks, starts=runs.starts, changes=changes)
         return masks, self._narrowing.download(self._changes.buffer, (changed, 2))
 
     def close(self) -> None:
         """Give the device's memory back."""
-        self._runs.close()
-        self._changes.close()
-        self._masks.close()
-        self._narrowing.close()
-        self._memory.close()
+        for owner in (self._runs, self._changes, self._masks, self._narrowing, self._memory):
+            owner.close()
 
 
 class AddedChanges(Owner):
-    """Adds to the totals on a device what has changed elsewhere.
-
-    Args:
-        device: that has the totals.
-    """
+    """Adds to the totals on a device what has changed elsewhere."""
 
     def __init__(self, device: Device) -> None:
         self._device = device
@@ -173,12 +168,11 @@ class AddedChanges(Owner):
             self._narrowing.upload(self._changes.buffer, found)
         else:
             device.copy(self._changes.buffer, found)
-        self._count.bind(masks=runs.masks, runs=runs.count, counts=runs.starts)
-        self._count.launch((-(-runs.count // _GROUP) * _GROUP,), (_GROUP,))
-        if runs.begin() != changed:
+        if runs.counted(self._count, runs=runs.count) != changed:
             raise ValueError(f"{changed} changes do not fit the bits that are set")
-        add = self._add[int(numbers is not None)]
-        add.bind(
+        _over(
+            self._add[int(numbers is not None)],
+            splats,
             totals=totals,
             numbers=runs.starts if numbers is None else numbers,
             splats=splats,
@@ -186,15 +180,12 @@ class AddedChanges(Owner):
             starts=runs.starts,
             changes=self._changes.buffer,
         )
-        add.launch((-(-splats // _GROUP) * _GROUP,), (_GROUP,))
         device.finish()  # before the next ones are written over these
 
     def close(self) -> None:
         """Give the device's memory back."""
-        for runs in self._runs.values():
-            runs.close()
-        self._changes.close()
-        self._narrowing.close()
+        for owner in (*self._runs.values(), self._changes, self._narrowing):
+            owner.close()
 
 
 class _Runs(Owner):
@@ -208,8 +199,9 @@ class _Runs(Owner):
             self.masks = self._memory.allocate(8 * self.count, _WHAT)
             self.starts = self._memory.allocate(4 * self.count, _WHAT)
 
-    def begin(self) -> int:
-        """From how many have changed in each run make where each begins; how many have changed in all."""
+    def counted(self, kernel: Kernel, **arguments: Any) -> int:
+        """Have a kernel count in each run, and make where each run's begin of that; how many there are in all."""
+        _over(kernel, self.count, masks=self.masks, counts=self.starts, **arguments)
         counts = self._device.download(self.starts, (self.count,), np.uint32)
         ends = np.cumsum(counts, dtype=np.uint32)
         self._device.copy(self.starts, ends - counts)

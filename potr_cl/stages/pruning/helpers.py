@@ -12,14 +12,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from functools import cached_property
+from itertools import islice
 from typing import Any
 
 import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner, Scratch
@@ -27,8 +28,8 @@ from potr_cl.opencl.relay import Lent, Relay
 from potr_cl.raster.resident import DeviceScene, SceneHandle, scene_on, whole_on_device
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
 from potr_cl.stages.pruning.buffers import Bits
-from potr_cl.stages.pruning.exchange import AddedChanges, AlivePacking, ChangedTotals, Changes
-from potr_cl.stages.pruning.removal import F64, Indices, RemovalSweep, add_totals, planned_sweep
+from potr_cl.stages.pruning.exchange import AddedChanges, AlivePacking, ChangedTotals, Changes, add_totals
+from potr_cl.stages.pruning.removal import F64, Indices, RemovalSweep, Wanted, planned_sweep
 from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.views.plan import none
@@ -43,35 +44,19 @@ class RemovalPart(Part):
     """Some of the views; see :class:`potr_cl.stages.pruning.removal.RemovalSweep`.
 
     Args:
-        device: to compute on.
         memory: bytes of its memory that the views may take; None: the default.
         scene: the uncompressed scene, perhaps on devices; or of it what these views may draw
             (:mod:`potr_cl.views.shares`).
-        cameras: all views.
-        options: speed/accuracy trade-offs.
-        background: R, G, B behind the scene.
-        numbers: of the views of this part, ascending.
-        visibility: of all views, where each had better be looked at with what it sees; None: with all splats.
+        wanted: what is measured, with the numbers of this part's views.
     """
 
-    def __init__(
-        self,
-        device: Device,
-        memory: int | None,
-        scene: Scene | SceneHandle,
-        cameras: Sequence[Camera],
-        options: SweepOptions,
-        background: tuple[float, float, float],
-        numbers: Sequence[int],
-        visibility: Visibility | None = None,
-    ) -> None:
-        options = SweepOptions(**{**vars(options), "memory": memory})
+    def __init__(self, device: Device, memory: int | None, scene: Scene | SceneHandle, wanted: Wanted) -> None:
+        wanted = replace(wanted, options=replace(wanted.options, memory=memory))
         with ExitStack() as owned:
             drawable = owned.enter_context(scene_on(device, scene))
-            if visibility is not None:
+            if wanted.visibility is not None:
                 drawable = owned.enter_context(whole_on_device(device, drawable))
-            sweep = planned_sweep(device, drawable, cameras, options, background, visibility, numbers)
-            self._sweep = owned.enter_context(sweep)
+            self._sweep = owned.enter_context(planned_sweep(device, drawable, wanted))
             self._alive = owned.enter_context(AlivePacking(device, self._sweep.splats, self._sweep.marks))
             self._changed: ChangedTotals | None = None
             self._owned = owned.pop_all()
@@ -80,7 +65,7 @@ class RemovalPart(Part):
 
     def can_steer(self) -> bool:
         """Whether the device can list stale tiles itself."""
-        return self._sweep.steering is not None
+        return self._sweep.can_steer
 
     def changes(self, again: bool | None = None) -> Changes:
         """By how much the totals of the splats that are left have changed since the last call; all, at the first.
@@ -109,12 +94,7 @@ class RemovalPart(Part):
 
     def remove_marked(self, splats: Bits) -> None:
         """Take splats out for good, a bit each (:meth:`Survivors.just_marked`)."""
-        if self._sweep.steering is None:
-            marked = np.unpackbits(splats, count=self._sweep.splats, bitorder="little")
-            self._sweep.remove(np.flatnonzero(marked))
-        else:
-            self._sweep.mark(splats)
-            self._sweep.remove_marked()
+        self._sweep.remove_bits(splats)
         self._alive.note()
 
     def replace_sh(self, sh: FloatArray) -> None:
@@ -137,9 +117,7 @@ class RemovalPart(Part):
             pixels; None behind the last view.
         """
         if self._told is None or self._told[0] != place:
-            known = self._sweep.known_importances()
-            for _ in range(place):
-                next(known, None)
+            known: Iterator[tuple[int, Indices, F64]] = islice(self._sweep.known_importances(), place, None)
         else:
             known = self._told[1]
         found = next(known, None)
@@ -151,10 +129,8 @@ class RemovalHelpers(Owner):
     """What others measure, for the :class:`potr_cl.stages.pruning.removal.RemovalSweep` of the master's device.
 
     Args:
-        device: the master's.
         splats: N.
         others: parts, each a :class:`RemovalPart`.
-        pool: of their workers.
         numbers: of each part's splats, (n,) int64, ascending, where it has no others and knows them by their places;
             None: all parts have all.
     """
@@ -162,7 +138,7 @@ class RemovalHelpers(Owner):
     def __init__(
         self, device: Device, splats: int, others: Parts, pool: Pool, numbers: Sequence[Indices] | None = None
     ) -> None:
-        assert numbers is None or pool.sparse
+        assert numbers is None or not pool.in_process
         self._device, self._splats, self._others, self._numbers = device, splats, others, numbers
         self._relay: Relay | None = None
         self._added: AddedChanges | None = None
@@ -171,7 +147,7 @@ class RemovalHelpers(Owner):
         with ExitStack() as owned:
             memory = owned.enter_context(Memory(device))
             self._more = owned.enter_context(Scratch(device, "the removal effects"))
-            if pool.sparse:
+            if not pool.in_process:
                 self._added = owned.enter_context(AddedChanges(device))
                 for place, theirs in enumerate(numbers or ()):
                     buffer = memory.upload(theirs.astype(np.uint32), "the splats of workers")
@@ -181,7 +157,7 @@ class RemovalHelpers(Owner):
             self._owned = owned.pop_all()
 
     @cached_property
-    def steers(self) -> bool:
+    def can_steer(self) -> bool:
         """Whether all of them can list stale tiles themselves."""
         return all(self._others.ask(place, "can_steer") for place in range(len(self._others)))
 
@@ -254,16 +230,13 @@ def measurement(
     bench: Workbench,
     options: SweepOptions,
     visibility: Visibility | None = None,
-    spared: NDArray[np.bool_] | None = None,
     dealt: ViewShares | None = None,
     seen: NDArray[np.int64] | None = None,
 ) -> Iterator[RemovalSweep]:
     """A removal sweep over the views of a state, its splats numbered as in the state's scene.
 
     Args:
-        state, bench, options: of the stage.
         visibility: what the views see, where each had better be looked at with what it sees.
-        spared: as of :class:`~potr_cl.stages.pruning.removal.RemovalSweep`; only with ``visibility``.
         dealt: the views, for a pool whose workers get what these see and no more of the scene.
         seen: (n,) numbers of the splats that the sweep is to have, ascending, which it numbers from 0 on; None: all.
     """
@@ -272,6 +245,7 @@ def measurement(
         bench.progress("prepare views", done / count)
 
     device, pool, views = bench.opened, bench.pool, state.views
+    wanted = Wanted(views, options, bench.background, visibility)
     splats = len(state.scene) if seen is None else len(seen)
     share = None if pool is None else shares(pool, len(views))
     with ExitStack() as stack:
@@ -282,16 +256,15 @@ def measurement(
                 whole = stack.enter_context(whole_on_device(device, bench.drawable(scene)))
             else:
                 whole = stack.enter_context(scene_on(device, bench.scene_of(state, seen)))
-            given_all = (device, whole, views, options, bench.background, visibility, None, progress, scene, spared)
-            yield stack.enter_context(planned_sweep(*given_all))
+            yield stack.enter_context(planned_sweep(device, whole, wanted, scene, progress))
             return
-        given: list[tuple[Any, ...]] = []
+        given: list[tuple[Any, Wanted]] = []
         drawable: Drawable | None = None
         if dealt is not None:
             share = dealt.dealt
             for part in dealt.shares:
                 subset = stack.enter_context(pool.shared(part.subset))
-                given.append((subset, views, options, bench.background, part.numbers, part.visibility))
+                given.append((subset, replace(wanted, numbers=part.numbers, visibility=part.visibility)))
         else:
             if pool.in_process:
                 placed: Scene | SceneHandle = bench.scene_of(state, seen)
@@ -304,14 +277,13 @@ def measurement(
                 sent = stack.enter_context(pool.shared(placed))
             else:
                 sent, visibility = stack.enter_context(bench.shared(pool, state, seen)), None
-            given = [(sent, views, options, bench.background, numbers, visibility) for numbers in share.others]
+            given = [(sent, replace(wanted, numbers=numbers, visibility=visibility)) for numbers in share.others]
         parts = stack.enter_context(Parts(pool, RemovalPart, given, options.memory, share.names))
         numbers = None if dealt is None else [each.splats for each in dealt.shares]
         helpers = stack.enter_context(RemovalHelpers(device, splats, parts, pool, numbers))
         if drawable is not None and share.own:
-            scene = drawable if isinstance(drawable, Scene) else None
-            own = (device, drawable, views, options, bench.background, visibility, share.own, progress, scene, spared)
-            sweep = stack.enter_context(planned_sweep(*own, helpers=helpers))
+            own = replace(wanted, numbers=share.own)
+            sweep = stack.enter_context(planned_sweep(device, drawable, own, progress=progress, helpers=helpers))
         else:
             source = NoSplats(device, splats)
             sweep = stack.enter_context(RemovalSweep(source, views, options, plan=none(), helpers=helpers))

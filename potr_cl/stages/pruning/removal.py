@@ -17,6 +17,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,8 +32,9 @@ from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
 from potr_cl.raster.view_set import ViewSet
-from potr_cl.stages.pruning.buffers import Bits, Ledger, PreparedSet, Survivors
-from potr_cl.stages.pruning.resident import Queues, ResidentSweep
+from potr_cl.stages.pruning.buffers import Bits, PreparedSet, Survivors
+from potr_cl.stages.pruning.exchange import add_totals
+from potr_cl.stages.pruning.resident import ResidentSweep
 from potr_cl.stages.pruning.streamed import StreamedSweep
 from potr_cl.stages.pruning.sweep import FixedPoint, SweepOptions, family_of
 from potr_cl.views import plan as plans
@@ -48,10 +50,6 @@ if TYPE_CHECKING:
 F64 = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-#: The total that spares a splat: a ΔMSE of about 1, by the bounds of :class:`FixedPoint`; and what limits it is beyond.
-_SPARED, LARGEST_LIMIT = 1 << 58, 0.1
-_GROUP = 64
-
 
 class RemovalSweep(Owner):
     """Measures removal effects and importances while splats are taken out, on one device; others may help.
@@ -64,18 +62,17 @@ class RemovalSweep(Owner):
         progress: called with the views prepared and their number.
         numbers: of the views that are measured here, ascending, where others are measured elsewhere; None: all.
         plan: of these views; None: all of them with all splats.
-        spared: (N,) splats whose effects are to be beyond :data:`LARGEST_LIMIT`, so that they are never removed.
         helpers: measure the other views. All totals are integers in units that follow from all views, so it makes no
             difference to any bit who measures which.
 
     Attributes:
         device: where the totals and the marks are. splats: N.
-        totals: (N, 2) int64 in the device's memory, and units: ΔMSE and I of 1 there.
+        totals: (N, 2) int64 in the device's memory.
         marks: (N,) uint8 in the device's memory, :class:`~potr_cl.stages.pruning.buffers.SplatState`. A controller on
             the device marks splats as JUST_REMOVED and calls :meth:`remove_marked`; when it marks the next ones, it
             changes the earlier marks to REMOVED.
         fixed_point: the totals' units, those of all views.
-        resident_views: how many views stay on the device, or draw nothing, or are measured by others.
+        ready_views: how many views need not be made again here: they stay, draw nothing, or others measure them.
 
     Raises:
         UsageError: no camera.
@@ -90,16 +87,14 @@ class RemovalSweep(Owner):
         progress: Callable[[int, int], None] | None = None,
         numbers: Sequence[int] | None = None,
         plan: ViewPlan | None = None,
-        spared: NDArray[np.bool_] | None = None,
         helpers: RemovalHelpers | None = None,
     ) -> None:
         source = scene if isinstance(scene, SplatSource) else WholeScene(scene)
         if not cameras:
             raise UsageError("removal effects need at least one view")
-        self._options = options = options or SweepOptions()
-        self.device, self.splats, self._spared = source.device, source.splats, spared
+        options = options or SweepOptions()
+        self.device, self.splats = source.device, source.splats
         self.fixed_point = FixedPoint.of_views(cameras)
-        self.units = self.fixed_point.units
         if plan is None:
             room = default_memory(self.device) if options.memory is None else options.memory
             plan = plans.whole(range(len(cameras)) if numbers is None else numbers, self.splats, room)
@@ -111,31 +106,17 @@ class RemovalSweep(Owner):
             self._own = self.totals
             if helpers is not None:
                 self.device.fill(self.totals, np.int64(0))
-                if plan.groups or spared is not None:
+                if plan.groups:
                     self._own = self._memory.allocate(16 * source.stride, "the removal effects")
-            self._begin_totals()
+            self.device.fill(self._own, np.int64(0))
             self._survivors = owned.enter_context(
-                Survivors(self.device, self.splats, source.stride, lambda: self._queues.wait())
+                Survivors(self.device, self.splats, source.stride, lambda: self._resident.queues.wait())
             )
             self.marks: cl.Buffer = self._survivors.buffer
-            family = family_of(self.device)
-            self._queues = Queues(self.device, 1)
-            self._engine = ViewEngine(source, cameras, plan, self._attach, family.most_views, progress)
+            self._engine = ViewEngine(source, cameras, plan, self._attach, family_of(self.device).most_views, progress)
             owned.enter_context(self._engine)
             self._pending.clear()
-            resident = self._engine.resident
-            ledgers = {
-                id(each): owned.enter_context(Ledger(self._survivors, self._own, each))
-                for each in {id(ready.subset): ready.subset for ready in resident}.values()
-            }
-            self._local = [ledger for ledger in ledgers.values() if ledger.is_local]
-            # Sets that share the memory of their projections have to be swept one after the other.
-            if not any(ready.shares for ready in resident):
-                self._queues = Queues(self.device, min(plan.queues or family.most_queues, len(resident)))
-            of_sets = [ledgers[id(ready.subset)] for ready in resident]
-            self._resident = ResidentSweep(
-                self._engine, of_sets, self._survivors, self._queues, options, self.fixed_point
-            )
+            self._resident = ResidentSweep(self._engine, self._survivors, self._own, options, self.fixed_point)
             owned.enter_context(self._resident)
             self._streamed = StreamedSweep(self._engine, self._survivors, options, self.fixed_point)
             owned.enter_context(self._streamed)
@@ -143,21 +124,14 @@ class RemovalSweep(Owner):
                 helpers.are_left(self.marks, first=True)
             self._owned = owned.pop_all()
         self._measured = self._streamed_added = False
-        elsewhere = len(cameras) - len(plan.numbers) if helpers else 0
-        self.resident_views = elsewhere + len(self._engine.idle) + sum(len(ready.numbers) for ready in resident)
+        resident = sum(len(ready.numbers) for ready in self._engine.resident)
+        self.ready_views = resident + len(self._engine.idle) + (len(cameras) - len(plan.numbers) if helpers else 0)
 
     def _attach(
         self, numbers: Sequence[int], subset: Subset, views: ViewSet, memory: Memory | None, target: cl.Buffer | None
     ) -> PreparedSet:
         # The device sorts the lists while the next view is made ready.
-        return PreparedSet(subset.rasterizer, numbers, views, memory, target, None if memory else self._pending)
-
-    def _begin_totals(self) -> None:
-        self.device.fill(self._own, np.int64(0))
-        if self._spared is not None:
-            first = np.zeros((self.splats, 2), np.int64)
-            first[self._spared, 0] = _SPARED
-            self.device.copy(self._own, first)
+        return PreparedSet(subset.rasterizer, views, memory, target, None if memory else self._pending)
 
     @property
     def sweeps(self) -> float:
@@ -166,12 +140,12 @@ class RemovalSweep(Owner):
         return (self._resident.tiles_swept + self._streamed.tiles_swept) / tiles
 
     @property
-    def steering(self) -> RemovalSweep | None:
-        """Itself, for a controller on the device; None if the host has to decide: where it is asked which tiles are
-        swept, or where streamed views are measured so often that nothing is gained."""
+    def can_steer(self) -> bool:
+        """Whether a controller on the device can decide: not where the host is asked which tiles are swept, nor where
+        streamed views are measured so often that nothing is gained."""
         often = self._engine.streamed and not self._engine.plan.patience
-        helpers = self._helpers is None or self._helpers.steers
-        return self if self._resident.device_lists and not often and helpers else None
+        helpers = self._helpers is None or self._helpers.can_steer
+        return self._resident.device_lists and not often and helpers
 
     @property
     def alive(self) -> NDArray[np.bool_]:
@@ -195,14 +169,9 @@ class RemovalSweep(Owner):
         if self._engine.plan.groups:
             resident.list_stale()
             resident.sweep()
-            if self._local:
-                if self._engine.streamed and again:
-                    streamed.measure()
-                self._begin_totals()
-                for ledger in self._local:
-                    ledger.add_to(self._own)
+            if resident.gather():
                 self._streamed_added = False
-            elif self._engine.streamed and again:
+            if self._engine.streamed and again:
                 if self._streamed_added:
                     add_totals(self.device, self._own, streamed.totals, self.splats, "subtract_totals")
                 self._streamed_added = False
@@ -217,21 +186,21 @@ class RemovalSweep(Owner):
                 add_totals(self.device, self.totals, self._own, self.splats)
 
     def remove_marked(self) -> None:
-        """Take the splats out that are marked JUST_REMOVED."""
+        """Take the splats out that are marked JUST_REMOVED; note how much each tile loses."""
         if self._helpers is not None:
             # They go on with it while this device does its own, and whoever tells them more waits for them.
             self._helpers.remove(self._survivors.just_marked())
         self._resident.note_removal()
-        self._survivors.marked_by_device()
+        self._survivors.are_marked()
         if self._helpers is not None:
             self._helpers.are_left(self.marks)
 
-    def mark(self, splats: Bits) -> None:
-        """Mark splats that a controller elsewhere has chosen, as its :meth:`just_marked` gives them.
-
-        :meth:`remove_marked` follows.
-        """
+    def remove_bits(self, splats: Bits) -> None:
+        """Take splats out that a controller elsewhere has chosen, (N / 8, rounded up) uint8, the lowest first."""
+        self._see_targets()
+        self._resident.prepare_removal()
         self._survivors.mark(splats)
+        self.remove_marked()
 
     # ----------------------------------------------------------------------------------- for a controller on the host
 
@@ -250,24 +219,18 @@ class RemovalSweep(Owner):
         return self.device.download(self.totals, (self.splats, 2), np.int64)
 
     def remove(self, splats: Indices) -> None:
-        """Take splats, (n,) by number, out of all lists; note how much each tile loses."""
-        if self._helpers is not None:
-            gone = np.zeros(self.splats, bool)
-            gone[splats] = True
-            self._helpers.remove(np.packbits(gone, bitorder="little"))
-        self._see_targets()
-        self._resident.prepare_removal()
-        self._survivors.remove(splats)
-        self._resident.note_removal()
-        if self._helpers is not None:
-            self._helpers.are_left(self.marks)
+        """Take splats, (n,) by number, out of all lists."""
+        gone = np.zeros(self.splats, bool)
+        gone[splats] = True
+        self.remove_bits(np.packbits(gone, bitorder="little"))
 
     def replace_sh(self, sh: FloatArray) -> None:
         """Continue with other colours, (N, M, 3) float32 of the same degree. The target pictures stay as they are."""
         pending = None if self._helpers is None else self._helpers.replace_sh(sh)
         self._see_targets()
         self._engine.source.replace_sh(sh)
-        self.project_again()
+        self._resident.project_again()
+        self.sweep_everything()
         if pending is not None:
             pending.results()
 
@@ -275,11 +238,6 @@ class RemovalSweep(Owner):
         """The target pictures are stored by the first measurement, before anything changes."""
         if not self._measured:
             self.measure_on_device(alone=True)
-
-    def project_again(self) -> None:
-        """Continue with the colours that the rasterizer's scene has by now; so with others, if it has got others."""
-        self._resident.project_again()
-        self.sweep_everything()
 
     def sweep_everything(self) -> None:
         """Have the next measurement sweep every tile, whatever has changed."""
@@ -347,37 +305,41 @@ class RemovalSweep(Owner):
         return splats[left], total[seen[left]] / view.pixels
 
 
-def add_totals(device: Device, totals: cl.Buffer, more: cl.Buffer, splats: int, how: str = "add_totals") -> None:
-    """Enqueue: totals of so many splats += others, or -= with "subtract_totals"."""
-    kernel = device.shared_kernel("prune/add_totals.cl", how)
-    kernel.bind(totals=totals, more=more, count=2 * splats)
-    kernel.launch((-(-2 * splats // _GROUP) * _GROUP,), (_GROUP,))
+@dataclass(frozen=True)
+class Wanted:
+    """What is measured of a scene, of which views.
+
+    Attributes:
+        cameras: all views; the totals' units follow from them.
+        options: speed/accuracy trade-offs.
+        visibility: what the views may draw, where each had better be looked at with that; None: with all splats.
+        numbers: of the views that are measured here, ascending, where others are measured elsewhere; None: all.
+    """
+
+    cameras: Sequence[Camera]
+    options: SweepOptions
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    visibility: Visibility | None = None
+    numbers: Sequence[int] | None = None
 
 
 @contextmanager
 def planned_sweep(
     device: Device,
     drawable: Drawable,
-    cameras: Sequence[Camera],
-    options: SweepOptions,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    visibility: Visibility | None = None,
-    numbers: Sequence[int] | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    wanted: Wanted,
     scene: Scene | None = None,
-    spared: NDArray[np.bool_] | None = None,
+    progress: Callable[[int, int], None] | None = None,
     helpers: RemovalHelpers | None = None,
 ) -> Iterator[RemovalSweep]:
     """A removal sweep over some views, as long as the context lasts.
 
     Args:
-        device: that computes.
         drawable: the uncompressed scene, perhaps on the device.
-        cameras, options, numbers, progress, spared, helpers: as of :class:`RemovalSweep`.
-        background: R, G, B behind the scene.
-        visibility: what the views may draw, where each had better be looked at with that; None: with all splats.
         scene: the uncompressed scene on the host; None: it is there only if ``drawable`` is.
+        progress, helpers: as of :class:`RemovalSweep`.
     """
+    cameras, options, visibility, numbers = wanted.cameras, wanted.options, wanted.visibility, wanted.numbers
     scene = drawable if isinstance(drawable, Scene) else scene
     memory = default_memory(device) if options.memory is None else options.memory
     meant = range(len(cameras)) if numbers is None else numbers
@@ -385,19 +347,20 @@ def planned_sweep(
         source: Rasterizer | SplatSource
         plan = None
         if visibility is not None and isinstance(drawable, SceneBuffers) and _can_name(device, options):
-            source = owned.enter_context(NamedSplats(drawable, visibility.groups.group_of, background))
+            source = owned.enter_context(NamedSplats(drawable, visibility.groups.group_of, wanted.background))
             plan = plans.by_view(visibility, cameras, meant, memory, 16 * drawable.stride)
         elif visibility is not None and scene is not None:
             clusters = visibility.clusters(numbers)
-            source = owned.enter_context(CopiedSplats(device, scene, drawable, background))
+            source = owned.enter_context(CopiedSplats(device, scene, drawable, wanted.background))
             if device.family == "cpu":
                 plan = plans.as_drawn(source, cameras, clusters, memory, progress)
                 progress = None  # that was most of it
             else:
                 plan = plans.by_cluster(clusters, memory, scene.nbytes // max(len(scene), 1))
         else:
-            source = owned.enter_context(Rasterizer(device, drawable, background=background))
-        yield owned.enter_context(RemovalSweep(source, cameras, options, progress, numbers, plan, spared, helpers))
+            source = owned.enter_context(Rasterizer(device, drawable, background=wanted.background))
+        sweep = RemovalSweep(source, cameras, options, progress, numbers, plan, helpers)
+        yield owned.enter_context(sweep)
 
 
 def _can_name(device: Device, options: SweepOptions) -> bool:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from typing import TypeVar
 
 import numpy as np
@@ -19,19 +20,21 @@ from numpy.typing import NDArray
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.stages.pruning.buffers import Ledger, PreparedSet, Survivors
-from potr_cl.stages.pruning.sweep import FixedPoint, SetKernels, SweepBuffers, SweepLauncher, SweepOptions, family_of
+from potr_cl.stages.pruning.sweep import FixedPoint, SetKernels, SweepOptions, TileLists, family_of
 from potr_cl.views.engine import ViewEngine
 
 T = TypeVar("T")
 
 Indices = NDArray[np.int64]
 
+#: Queues on which sets of single views are swept beside each other.
+_SINGLY = 8
+
 
 class Queues:
     """The device's own queue, or several others.
 
     Args:
-        device: that the work is for.
         most: queues to open, where the device takes more than its own.
     """
 
@@ -118,30 +121,31 @@ class ResidentSweep(Owner):
     """Keeps the resident views' part of all totals up to date.
 
     Args:
-        engine: of the views.
-        ledgers: of each resident set.
-        survivors: the splats that are left.
-        queues: on which sets are swept beside each other.
+        totals: (N, 2) int64 on the device, by the splats' numbers in the scene.
         options: which tiles are swept again. fixed_point: the totals' units.
 
     Attributes:
+        queues: on which sets are swept beside each other.
         device_lists: whether kernels list the tiles.
-        tiles_swept: so far.
     """
 
     def __init__(
         self,
         engine: ViewEngine[PreparedSet],
-        ledgers: Sequence[Ledger],
         survivors: Survivors,
-        queues: Queues,
+        totals: cl.Buffer,
         options: SweepOptions,
         fixed_point: FixedPoint,
     ) -> None:
-        self._engine, self._ledgers, self._survivors = engine, ledgers, survivors
-        self._queues, self._options, self._device = queues, options, engine.device
+        self._engine, self._survivors, self._totals = engine, survivors, totals
+        self._options, self._device = options, engine.device
         self._sets = sets = engine.resident
-        self.device_lists = family_of(self._device).lists_tiles and options.only_by_tolerance
+        family = family_of(self._device)
+        # Sets that share the memory of their projections have to be swept one after the other.
+        shares = any(ready.shares for ready in sets)
+        most = 1 if shares else min(_SINGLY if engine.plan.singly else family.most_queues, len(sets))
+        self.queues = Queues(self._device, most)
+        self.device_lists = family.lists_tiles and options.only_by_tolerance
         self.tiles_swept = self._measurements = 0
         self._firsts = np.cumsum([0, *(ready.views.tiles for ready in sets)]).tolist()
         self._counts: list[int] | None = None  # listed tiles of each set; None: the host has yet to choose
@@ -153,23 +157,31 @@ class ResidentSweep(Owner):
         ]  # fmt: skip
         self._schedule = TileSchedule(options, tiles)
         self._kernels: list[SetKernels] = []
-        self._memory = memory = Memory(self._device)
-        if sets:
-            with self._device.all_or_nothing():
+        with ExitStack() as owned:
+            memory = owned.enter_context(Memory(self._device))
+            subsets = {id(ready.subset): ready.subset for ready in sets}
+            ledgers = {key: owned.enter_context(Ledger(survivors, totals, subset)) for key, subset in subsets.items()}
+            self._ledgers = list(ledgers.values())
+            if sets:
                 self._tiles = memory.allocate(4 * self._firsts[-1], "the tiles to sweep")
                 self._stale = memory.allocate(4 * self._firsts[-1], "the tiles' staleness")
                 self._listed = memory.allocate(4 * len(sets), "the numbers of tiles to sweep")
-                launcher: SweepLauncher | None = None
-                for place, (ready, ledger) in enumerate(zip(sets, ledgers, strict=True)):
-                    if launcher is None or ready.subset is not sets[place - 1].subset:
-                        launcher = SweepLauncher(ready.subset.rasterizer, options, fixed_point)
+                lists = TileLists(self._tiles, self._stale, self._listed)
+                for place, ready in enumerate(sets):
                     ready.work.first_tile = self._firsts[place]
-                    buffers = SweepBuffers(
-                        ledger.marks, self._tiles, self._stale, self._listed, ledger.totals, ledger.numbers
-                    )
-                    bound = launcher.bind(ready.work, ready.geometry, buffers, first_time=True, place=place)
-                    self._kernels.append(bound)
-            self.list_everything()
+                    ledger = ledgers[id(ready.subset)]
+                    self._kernels.append(SetKernels(ready, ledger, lists, options, fixed_point, True, place))
+                self.list_everything()
+            self._owned = owned.pop_all()
+
+    def gather(self) -> bool:
+        """Where kernels add by places, make the totals anew of what they have added; whether that was done."""
+        local = [ledger for ledger in self._ledgers if ledger.is_local]
+        if local:
+            self._device.fill(self._totals, np.int64(0))
+            for ledger in local:
+                ledger.add_to(self._totals)
+        return bool(local)
 
     def list_stale(self) -> None:
         """List the tiles that the next measurement sweeps, unless the device has."""
@@ -193,10 +205,10 @@ class ResidentSweep(Owner):
         for part in parts:
             # The longest first, so that nothing long begins at the end.
             part.sort(key=lambda each: -each[0])
-            for (count, place), queue in self._queues.dealt(part):
+            for (count, place), queue in self.queues.dealt(part):
                 self._engine.project(self._sets[place])
                 self._kernels[place].sweep(self._firsts[place], count, queue)
-            self._queues.wait()
+            self.queues.wait()
             if self._engine.plan.copies_rest:
                 self._engine.source.rest(self._sets[part[0][1]].subset)
         self.tiles_swept += sum(counts)
@@ -229,16 +241,16 @@ class ResidentSweep(Owner):
             return
         if not self.device_lists:
             self._take_marks()
-            for kernels, queue in self._queues.dealt(self._kernels):
+            for kernels, queue in self.queues.dealt(self._kernels):
                 kernels.note_removal(queue)
             self._counts = None
             return
         self.sweep()
         above = self._options.tolerance if tolerance is None else tolerance
         self._device.fill(self._listed, np.uint32(0))
-        for kernels, queue in self._queues.dealt(self._kernels):
+        for kernels, queue in self.queues.dealt(self._kernels):
             kernels.note_removal(queue, list_above=above)
-        self._queues.wait()
+        self.queues.wait()
         self._counts = self._device.download(self._listed, (len(self._sets),), np.uint32).tolist()
 
     def list_everything(self) -> None:

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
-from potr_cl.model.order import ascending
+from potr_cl.model.order import ascending, least
 
 #: The effect of what must stay.
-_BEYOND = 1e30
+BEYOND = 1e30
 #: Candidates that are looked at to guess how far an iteration's budget reaches.
 _SAMPLE = 2048
 
@@ -175,10 +175,8 @@ def choose(delta_mse: F64, importance: F64, alive: Indices, remaining: int, opti
         wanted = effect < options.delta_mse_max
         limit = options.delta_mse_max
     else:
-        cheapest = ascending(effect)[: max(len(alive) - options.count, 0)]
-        wanted = np.zeros(len(alive), bool)
-        wanted[cheapest] = True
-        limit = float(effect[cheapest[-1]]) if len(cheapest) else 0.0
+        wanted = least(effect, max(len(alive) - options.count, 0))
+        limit = float(effect[wanted].max()) if wanted.any() else 0.0
     idle = np.flatnonzero(weight == 0)
     unseen = idle[wanted[idle] & (effect[idle] == 0)]
     wanted[unseen] = False
@@ -230,7 +228,6 @@ def prune(
         splats: N.
         options: thresholds and iterations.
         progress: called with the iterations done and the number of splats left.
-        after_iteration: called with the iteration.
         spared: (N,) splats that stay, whatever their effect, unless there are too many of them; None: none.
     """
     alive = np.arange(splats, dtype=np.int64)
@@ -244,7 +241,7 @@ def prune(
         newest, importance = effects.measure()
         delta_mse = smoothed.with_(newest)
         if spared is not None:
-            delta_mse = np.where(spared, _BEYOND, delta_mse)
+            delta_mse = np.where(spared, BEYOND, delta_mse)
         gone = choose(delta_mse, importance, alive, options.iterations - iteration, options)
         if len(gone) >= len(alive) and options.count is None:
             gone = gone[: len(alive) - 1]  # an empty scene is no scene

@@ -16,11 +16,10 @@ from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.ferry import Cargo, Ferry
 from potr_cl.opencl.memory import Memory, Owner, Scratch
 from potr_cl.stages.pruning.buffers import Ledger, PreparedSet, SplatState, Survivors, shared_kernel
-from potr_cl.stages.pruning.sweep import FixedPoint, SetKernels, SweepBuffers, SweepLauncher, SweepOptions
+from potr_cl.stages.pruning.sweep import FixedPoint, SetKernels, SweepOptions, TileLists
 from potr_cl.views.budget import target_bytes
 from potr_cl.views.engine import Ready, ViewEngine
 from potr_cl.views.subsets import Left, Subset
-from potr_cl.views.visibility import ViewGroup
 
 #: Splats that a work-group of the kernel `lost` looks at, and its work-items.
 _LOST_CHUNK, _GROUP = 4096, 64
@@ -31,14 +30,8 @@ _Set: TypeAlias = "tuple[int, ...]"
 class StreamedSweep(Owner):
     """Measures the views of which nothing stays but the pictures that they are compared with.
 
-    Args:
-        engine: of the views.
-        survivors: the splats that are left.
-        options, fixed_point: of the sweeps.
-
     Attributes:
         totals: (N, 2) int64, their part of the totals.
-        tiles_swept: so far.
         known: whether the totals are right but for what was removed since.
     """
 
@@ -55,8 +48,8 @@ class StreamedSweep(Owner):
         self._measured = False
         self._single = {number: group for group in engine.plan.groups for number in group.numbers}
         self._memory, self._ferry = Memory(device), Ferry(device)
-        self._scratch = [Scratch(device, what) for what in ("tiles", "staleness", "effects", "counters")]
-        self._tiles, self._stale, self._unwanted, self._listed = self._scratch
+        self._scratch = [Scratch(device, what) for what in ("tiles", "staleness", "counters")]
+        self._tiles, self._stale, self._listed = self._scratch
         if engine.streamed:
             with device.all_or_nothing():
                 self.totals = self._memory.allocate(16 * engine.source.stride, "the effects in streamed views")
@@ -74,18 +67,13 @@ class StreamedSweep(Owner):
                         self._on_device[numbers] = self._memory.allocate(nbytes, "the target images")
                         room -= nbytes
 
-    @property
-    def numbers(self) -> dict[int, ViewGroup]:
-        """The group of each view."""
-        return {number: group for group in self._engine.streamed for number in group.numbers}
-
     def forget(self) -> None:
         """Have the next measurement measure all of them."""
         self.known = False
 
     def are_stale(self) -> bool:
         """Whether they have lost more than they may since they were measured: a part of their area, on average."""
-        views = len(self.numbers)
+        views = sum(len(group.numbers) for group in self._engine.streamed)
         limit = self._engine.plan.patience * self._options.tolerance
         if not self.known or limit <= 0:
             return bool(views)
@@ -112,8 +100,7 @@ class StreamedSweep(Owner):
                             target, tiles = ready.work.target, ready.views.tiles
                             if numbers in self._on_host:
                                 self._ferry.to_device(target, [Cargo(self._on_host[numbers])])
-                            kernels = self._bound(ready, self._buffers(ready, ledger), not self._measured)
-                            kernels.sweep(0, tiles)
+                            self._sweep(ready, ledger, not self._measured)
                             device.finish()
                             if not self._measured and numbers not in self._on_device:
                                 kept = mapped.array((3 * ready.views.pixels,), np.float32, "target pictures")
@@ -133,9 +120,8 @@ class StreamedSweep(Owner):
             if subset is None:
                 yield None
                 return
-            with Ledger(self._survivors, self.totals, subset) as ledger, engine.prepared((number,), subset) as ready:
-                buffers = self._buffers(ready, ledger, wanted=False)
-                self._bound(ready, buffers, first_time=True).sweep(0, ready.views.tiles)
+            with Ledger(self._survivors, None, subset) as ledger, engine.prepared((number,), subset) as ready:
+                self._sweep(ready, ledger, first_time=True)
                 self._device.finish()
                 yield subset, ready.work
 
@@ -144,29 +130,18 @@ class StreamedSweep(Owner):
         mask = self._survivors.alive if self._engine.source.copies else None
         return Left(self._survivors.buffer, SplatState.ALIVE, mask)
 
-    def _bound(self, ready: Ready[PreparedSet], buffers: SweepBuffers, first_time: bool) -> SetKernels:
-        """A set's kernels, which find no removed splats in its lists."""
-        launcher = SweepLauncher(ready.subset.rasterizer, self._options, self._fixed_point)
-        kernels = launcher.bind(ready.work, ready.geometry, buffers, first_time=first_time)
-        if not self._engine.source.selects:
-            kernels.take_out()
-        return kernels
-
-    def _buffers(self, ready: Ready[PreparedSet], ledger: Ledger, wanted: bool = True) -> SweepBuffers:
-        """What the kernels of a set work on; not ``wanted``: its effects go nowhere."""
+    def _sweep(self, ready: Ready[PreparedSet], ledger: Ledger, first_time: bool) -> None:
+        """Enqueue the sweep of all tiles of a set, which finds no removed splats in its lists."""
         tiles = ready.views.tiles
         self._stale.reserve(4 * tiles)
         self._listed.reserve(4)
         if self._tiles.reserve(4 * tiles):  # all of them: nobody writes to it
             self._device.copy(self._tiles.buffer, np.arange(tiles, dtype=np.uint32))
-        totals, numbers = ledger.totals, ledger.numbers
-        if not wanted:
-            self._unwanted.reserve(16 * ready.subset.rasterizer.stride)
-            totals = self._unwanted.buffer
-            if self._engine.source.selects:
-                numbers = None
-        shared = (self._tiles.buffer, self._stale.buffer, self._listed.buffer)
-        return SweepBuffers(ledger.marks, *shared, totals, numbers)
+        lists = TileLists(self._tiles.buffer, self._stale.buffer, self._listed.buffer)
+        kernels = SetKernels(ready, ledger, lists, self._options, self._fixed_point, first_time)
+        if not self._engine.source.selects:
+            kernels.take_out()
+        kernels.sweep(0, tiles)
 
     def close(self) -> None:
         for owner in (*self._scratch, self._ferry, self._memory):

@@ -1,5 +1,5 @@
 """How views are swept: what may be traded for speed (:class:`SweepOptions`), the units of what is summed up
-(:class:`FixedPoint`), and the removal kernels of either family (:class:`SweepLauncher`).
+(:class:`FixedPoint`), and the removal kernels of either family (:class:`SetKernels`).
 
 CPUs (cl/prune/removal_cpu.cl) do one view a launch, one tile a work-item; GPUs (cl/prune/removal_gpu.cl) a set of views
 a launch, a tile a work-group.
@@ -20,10 +20,10 @@ from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.kernel import Kernel
-from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.sweep import padded_area, sweep_limits
 from potr_cl.raster.view_set import TILE, camera_struct
-from potr_cl.stages.pruning.buffers import PreparedSet
+from potr_cl.stages.pruning.buffers import Ledger, PreparedSet
+from potr_cl.views.engine import Ready
 
 F64 = NDArray[np.float64]
 
@@ -87,7 +87,6 @@ class FixedPoint:
             cut off.
         bound: a tile's sums in the largest view are cut at this, so that absurd colours do not overflow the totals.
         pixels: of the largest view.
-        views: number of views.
     """
 
     scale: float
@@ -148,32 +147,107 @@ def family_of(device: Device) -> Family:
 
 
 @dataclass(frozen=True)
-class SweepBuffers:
-    """What the kernels of a set work on besides the set's own buffers.
+class TileLists:
+    """Which tiles of several sets are swept, on the device.
 
     Attributes:
-        alive: (N,) uint8, :class:`~potr_cl.stages.pruning.buffers.SplatState`.
         tiles: uint32, the list of tiles to sweep, numbered within their set.
         stale: float32, staleness of the tiles, each set's from its first tile on.
         listed: uint32, how many tiles of each set the device has listed itself.
-        totals: (N, 2) int64, ΔMSE and I of each splat in the units of :class:`FixedPoint`.
-        numbers: for GPU kernels, (n,) uint32, the numbers among those N splats of the n that the set's views were
-            prepared with; None: they were prepared with all.
     """
 
-    alive: cl.Buffer
     tiles: cl.Buffer
     stale: cl.Buffer
     listed: cl.Buffer
-    totals: cl.Buffer
-    numbers: cl.Buffer | None = None
 
 
 class SetKernels:
-    """The kernels of one set of views, with all their arguments bound."""
+    """The removal kernels of one set of views; all arguments stay bound, because to bind them takes longer than a
+    launch.
 
-    def __init__(self, removal: Kernel, staleness: Kernel, tiles: int, family: Family) -> None:
-        self._removal, self._staleness, self._tiles, self._family = removal, staleness, tiles, family
+    Args:
+        lists: of its tiles, perhaps among those of other sets.
+        options: where pixels end. fixed_point: the totals' units.
+        first_time: whether a sweep stores the target instead of comparing with it.
+        place: of the set's counter in ``lists.listed``.
+    """
+
+    def __init__(
+        self,
+        ready: Ready[PreparedSet],
+        ledger: Ledger,
+        lists: TileLists,
+        options: SweepOptions,
+        fixed_point: FixedPoint,
+        first_time: bool,
+        place: int = 0,
+    ) -> None:
+        prepared, views, rasterizer = ready.work, ready.views, ready.subset.rasterizer
+        device, threshold = rasterizer.device, options.transmittance_threshold
+        (shapes, colours), (red, green, blue) = ready.geometry, rasterizer.background
+        macros: dict[str, float | int] = {
+            "ALPHA_CAP": float(rasterizer.rules.alpha_cap),
+            "TRANSMITTANCE_THRESHOLD": rasterizer.rules.transmittance_threshold if threshold is None else threshold,
+            **sweep_limits(device),
+        }
+        both: dict[str, Any] = {
+            "offsets": views.offsets,
+            "lengths": prepared.lengths,
+            "intersections": views.intersections,
+            "sums": prepared.sums,
+        }
+        swept: dict[str, Any]
+        noted: dict[str, Any] = {}
+        if device.family == "cpu":
+            (view,) = views.views
+            weight = fixed_point.weight(view.pixels)
+            swept = {
+                "alive": ledger.marks,
+                "view": camera_struct(view.camera),
+                "scale": fixed_point.scale * weight,
+                "bound": fixed_point.bound / weight,
+            }
+        else:
+            picked = ledger.numbers is not None
+            macros["PICKED"] = int(picked)
+            both |= {
+                "views": views.table,
+                "view_count": len(views.views),
+                "numbers": ledger.numbers if picked else views.table,  # which is not looked at
+            }
+            swept = {
+                "stride": rasterizer.stride,
+                "scale": fixed_point.scale,
+                "most_pixels": fixed_point.pixels,
+                "bound": fixed_point.bound,
+            }
+            noted = {
+                "subtiles": views.subtiles,
+                "tolerance": math.inf,
+                "tiles": lists.tiles,
+                "set": place,
+                "listed": lists.listed,
+            }
+        source = f"prune/removal_{device.family}.cl"
+        self._removal = device.kernel(source, "removal", **macros).bind(
+            start=0,
+            tiles=lists.tiles,
+            shapes=shapes,
+            colours=colours,
+            subtiles=views.subtiles,
+            red=red,
+            green=green,
+            blue=blue,
+            first_time=int(first_time),
+            target=prepared.target,
+            totals=ledger.totals,
+            **both,
+            **swept,
+        )
+        self._staleness = device.kernel(source, "staleness", **macros).bind(
+            alive=ledger.marks, first=prepared.first_tile, stale=lists.stale, **both, **noted
+        )
+        self._tiles, self._family = views.tiles, family_of(device)
         self._lists_above, self._start = math.inf, 0
 
     def sweep(self, start: int, count: int, queue: cl.CommandQueue | None = None) -> None:
@@ -213,113 +287,3 @@ class SetKernels:
     def _launch(self, kernel: Kernel, tiles: int, queue: cl.CommandQueue | None = None) -> None:
         group = self._family.group
         kernel.launch((tiles * group,), (group,), queue)
-
-
-class SweepLauncher:
-    """The removal kernels of a device's family, built for one rasterizer.
-
-    Args:
-        rasterizer: of the views.
-        options: where pixels end.
-        fixed_point: the totals' units.
-    """
-
-    def __init__(self, rasterizer: Rasterizer, options: SweepOptions, fixed_point: FixedPoint) -> None:
-        device, rules, threshold = rasterizer.device, rasterizer.rules, options.transmittance_threshold
-        self._rasterizer, self._device, self._fixed_point = rasterizer, device, fixed_point
-        self._source = f"prune/removal_{device.family}.cl"
-        self._macros: dict[str, float | int] = {
-            "ALPHA_CAP": float(rules.alpha_cap),
-            "TRANSMITTANCE_THRESHOLD": rules.transmittance_threshold if threshold is None else threshold,
-            **sweep_limits(device),
-        }
-
-    def bind(
-        self,
-        prepared: PreparedSet,
-        geometry: tuple[cl.Buffer, cl.Buffer],
-        buffers: SweepBuffers,
-        *,
-        first_time: bool,
-        place: int = 0,
-    ) -> SetKernels:
-        """Make the kernels of one set. Each set has its own, because binding arguments takes longer than a launch.
-
-        Args:
-            prepared: the set.
-            geometry: its shapes and colours.
-            buffers: what it shares with other sets.
-            first_time: whether a sweep stores the target instead of comparing with it.
-            place: of the set's counter in the buffer of listed tiles' numbers.
-        """
-        views, (shapes, colours) = prepared.views, geometry
-        red, green, blue = self._rasterizer.background
-        both: dict[str, Any] = {
-            "offsets": views.offsets,
-            "lengths": prepared.lengths,
-            "intersections": views.intersections,
-            "sums": prepared.sums,
-        }
-        if self._device.family == "gpu":
-            macros, swept, noted = self._of_set(prepared, buffers, place)
-        else:
-            macros, swept, noted = self._of_view(prepared, buffers)
-        removal = self._device.kernel(self._source, "removal", **macros).bind(
-            start=0,
-            tiles=buffers.tiles,
-            shapes=shapes,
-            colours=colours,
-            subtiles=views.subtiles,
-            red=red,
-            green=green,
-            blue=blue,
-            first_time=int(first_time),
-            target=prepared.target,
-            totals=buffers.totals,
-            **both,
-            **swept,
-        )
-        staleness = self._device.kernel(self._source, "staleness", **macros).bind(
-            alive=buffers.alive, first=prepared.first_tile, stale=buffers.stale, **both, **noted
-        )
-        return SetKernels(removal, staleness, views.tiles, family_of(self._device))
-
-    def _of_view(
-        self, prepared: PreparedSet, buffers: SweepBuffers
-    ) -> tuple[dict[str, float | int], dict[str, Any], dict[str, Any]]:
-        """Macros, and arguments of the two kernels that only CPUs' have."""
-        (view,) = prepared.views.views
-        fixed_point = self._fixed_point
-        weight = fixed_point.weight(view.pixels)
-        swept = {
-            "alive": buffers.alive,
-            "view": camera_struct(view.camera),
-            "scale": fixed_point.scale * weight,
-            "bound": fixed_point.bound / weight,
-        }
-        return self._macros, swept, {}
-
-    def _of_set(
-        self, prepared: PreparedSet, buffers: SweepBuffers, place: int
-    ) -> tuple[dict[str, float | int], dict[str, Any], dict[str, Any]]:
-        """The same that only GPUs' have."""
-        views, fixed_point, picked = prepared.views, self._fixed_point, buffers.numbers is not None
-        both = {
-            "views": views.table,
-            "view_count": len(views.views),
-            "numbers": buffers.numbers if picked else views.table,  # which is not looked at
-        }
-        swept = {
-            "stride": self._rasterizer.stride,
-            "scale": fixed_point.scale,
-            "most_pixels": fixed_point.pixels,
-            "bound": fixed_point.bound,
-        }
-        noted = {
-            "subtiles": views.subtiles,
-            "tolerance": math.inf,
-            "tiles": buffers.tiles,
-            "set": place,
-            "listed": buffers.listed,
-        }
-        return self._macros | {"PICKED": int(picked)}, both | swept, both | noted
