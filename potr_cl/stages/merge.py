@@ -33,11 +33,13 @@ _NEAR, _TURNED = 4, 0.7
 _COLOUR = 3.0
 #: A splat is merged if its removed neighbours make up this part of what views show of the group; or if views show no
 #: more than that part of what they usually show of as much matter. Pictures may become worse by that factor (1.5 dB).
-_MISSED, _HARDLY_SHOWN, _WORSE = 0.7, 0.1, 10**0.15
+_MISSED, _HARDLY_SHOWN, _WORSE = 0.7, 0.05, 10**0.15
 #: What a splat counts that no view shows, as a part of one of the same size and opacity that is shown as usual.
 _UNSEEN = 0.1
 #: The most that many faint splats become together.
 _OPACITY = 0.995
+#: Logarithms of scales are taken as no larger, and no smaller than minus this.
+_LARGEST = 40.0
 #: Splats that a thread works on at a time.
 _BLOCK = 1 << 15
 
@@ -120,8 +122,9 @@ def merged(scene: Scene, left: _Indices, importance: _F64, run: Run = map) -> Sc
         centres = scene.means[own].astype(np.float64)
         middle = mean(centres)
         off = centres - np.repeat(middle, counts[several], axis=0)
-        axes = rotation_matrices(scene.quaternions[own].astype(np.float64))
-        axes *= np.exp(scene.log_scales[own].astype(np.float64))[:, None]
+        quaternions = scene.quaternions[own].astype(np.float64)
+        axes = rotation_matrices(quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True))
+        axes *= np.exp(_bounded(scene.log_scales[own]))[:, None]
         variances, turned = np.linalg.eigh(mean(axes @ axes.transpose(0, 2, 1) + off[:, :, None] * off[:, None]))
         turned[np.linalg.det(turned) < 0, :, 0] *= -1
         found.means[several] = middle
@@ -149,7 +152,7 @@ def _groups(scene: Scene, left: _Indices, run: Run) -> _Indices:
 
     def measure(start: int) -> None:
         some = slice(start, start + _BLOCK)
-        sizes[some] = np.exp(2 * np.clip(scene.log_scales[some], -40, 40)).mean(axis=1)
+        sizes[some] = np.exp(2 * _bounded(scene.log_scales[some])).mean(axis=1)
 
     list(run(measure, range(0, len(scene), _BLOCK)))
     cos, sin = np.cos(_TURNED), np.sin(_TURNED)
@@ -184,5 +187,10 @@ def _opacities(logits: NDArray[np.floating]) -> _F64:
 
 def _area(log_scales: NDArray[np.floating]) -> _F64:
     """(n,) of ellipsoids where they are seen as large as can be, but for a factor."""
-    found: _F64 = np.exp(np.sort(log_scales.astype(np.float64), axis=1)[:, 1:].sum(axis=1))
+    found: _F64 = np.exp(np.sort(_bounded(log_scales), axis=1)[:, 1:].sum(axis=1))
     return found
+
+
+def _bounded(log_scales: NDArray[np.floating]) -> _F64:
+    """Scales whose squares are numbers; all that matter to a scene are far within."""
+    return np.clip(log_scales.astype(np.float64), -_LARGEST, _LARGEST)
