@@ -8,6 +8,7 @@ import numpy as np
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import SH_COEFFICIENTS, Scene
+from tests.reference.raster import rotation_matrices
 
 
 def random_scene(splats: int, degree: int = 3, seed: int = 0, extent: float = 1.0) -> Scene:
@@ -121,3 +122,10 @@ def plain_splats(means: object, sigma: object = 0.1, logit: object = 0.0, colour
         np.broadcast_to(np.asarray(logit, np.float32), (n,)).copy(),
         dc[:, None].astype(np.float32),
     )
+
+
+def covariances(scene: Scene) -> np.ndarray:
+    """(N, 3, 3) float64, of the splats."""
+    unit = scene.quaternions / np.linalg.norm(scene.quaternions, axis=1, keepdims=True)
+    axes = rotation_matrices(unit.astype(np.float64)) * np.exp(scene.log_scales.astype(np.float64))[:, None]
+    return axes @ axes.transpose(0, 2, 1)

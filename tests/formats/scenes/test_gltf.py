@@ -11,19 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from potr_cl import DataError, Scene, UsageError
+from potr_cl import DataError, UsageError
 from potr_cl.formats import load_scene, save_scene
 from potr_cl.formats.scenes.scene_files import related
 from potr_cl.host.inputs import FREE_SPLATS
 from tests.cases.gltf import PREFIX, Attributes, attributes, described, glb, gltf
-from tests.reference.raster import rotation_matrices, sh_basis
-from tests.reference.scenes import random_scene
-
-
-def covariances(scene: Scene) -> np.ndarray:
-    unit = scene.quaternions / np.linalg.norm(scene.quaternions, axis=1, keepdims=True)
-    axes = rotation_matrices(unit.astype(np.float64)) * np.exp(scene.log_scales.astype(np.float64))[:, None]
-    return axes @ axes.transpose(0, 2, 1)
+from tests.reference.raster import sh_basis
+from tests.reference.scenes import covariances, random_scene
 
 
 def written(path: Path, parts: Attributes, node: dict[str, Any] | None = None) -> Path:

@@ -1,0 +1,123 @@
+"""The stage "merge": what becomes of splats that take over removed ones (potr_cl/stages/merge.py)."""
+
+from __future__ import annotations
+
+import dataclasses
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from potr_cl.levels.encoding import coarser
+from potr_cl.model.camera import train_views
+from potr_cl.model.scene import Scene
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.quality.compare import mean_view
+from potr_cl.quality.judging import Judging, Looks
+from potr_cl.stages.merge import Merge, merged
+from potr_cl.stages.prune import Prune
+from potr_cl.stages.stage import State, Workbench
+from tests.reference.scenes import covariances, random_scene
+
+LEFT = np.array([0, 3])
+#: Two groups far from each other: splats 0 to 2, and 3 to 5.
+AT = np.array([[0, 0, 0], [0.01, 0, 0], [0, 0.02, 0], [9, 0, 0], [9, 0.01, 0], [9, 0, 0.03]], np.float32)
+
+
+def two_groups() -> Scene:
+    scene = random_scene(6, 1, seed=4)
+    return dataclasses.replace(scene, means=AT, log_scales=scene.log_scales + 1, sh=np.float32(0.1) * scene.sh)
+
+
+def test_a_splat_becomes_what_its_group_was_together():
+    scene = two_groups()
+    importance = np.array([0.5, 2.0, 1.5, 8.0, 1.0, 1.0])  # of the first group removed ones have most
+    found = merged(scene, LEFT, importance)
+    areas = np.exp(np.sort(scene.log_scales.astype(np.float64), axis=1)[:, 1:].sum(axis=1))
+    covered = areas / (1 + np.exp(-scene.opacity_logits.astype(np.float64)))
+    weights = importance + 0.1 * importance.sum() / covered.sum() * covered
+    weights = weights[:3] / weights[:3].sum()
+    middle = weights @ AT[:3].astype(np.float64)
+    off = AT[:3] - middle
+    covariance = np.einsum("i,ijk->jk", weights, covariances(scene)[:3] + off[:, :, None] * off[:, None])
+    assert np.allclose(found.means[0], middle, atol=1e-6)
+    assert np.allclose(covariances(found)[0], covariance, rtol=1e-5, atol=1e-9)
+    assert np.allclose(found.sh[0], np.einsum("i,ijk->jk", weights, scene.sh[:3]), atol=1e-6)
+    own = np.exp(np.sort(found.log_scales[0].astype(np.float64))[1:].sum())
+    assert np.isclose(1 / (1 + np.exp(-found.opacity_logits[0])), min(covered[:3].sum() / own, 0.995), rtol=1e-5)
+    for array, before in zip(found.arrays, scene.arrays, strict=True):
+        assert np.array_equal(array[1], before[3])  # its neighbours show less than a third of the group
+
+
+def test_where_views_show_little_all_are_merged():
+    scene = two_groups()
+    importance = np.array([1e-6, 1e-9, 1e-9, 8.0, 1.0, 1.0])
+    found = merged(scene, LEFT, importance)
+    assert not np.array_equal(found.means[0], AT[0])
+    assert np.array_equal(found.means[1], AT[3])
+
+
+def test_neither_threads_nor_the_length_of_quaternions_matter():
+    scene = random_scene(3000, 1, seed=2)
+    left = np.arange(0, len(scene), 3)
+    importance = np.random.default_rng(1).random(len(scene)) ** 4
+    found = merged(scene, left, importance)
+    with ThreadPoolExecutor(3) as pool:
+        again = merged(scene, left, importance, pool.map)
+    longer = merged(dataclasses.replace(scene, quaternions=4 * scene.quaternions), left, importance)
+    changed = (found.means != scene.means[left]).any(axis=1)
+    assert 0.2 < changed.mean() < 1
+    for one, two, three in zip(found.arrays, again.arrays, longer.arrays, strict=True):
+        assert np.array_equal(one, two)
+        assert np.array_equal(one[changed], three[changed])
+
+
+@pytest.mark.parametrize("log_scale", [-80.0, 80.0])
+def test_scales_of_any_size_leave_numbers(log_scale):
+    scene = two_groups()
+    scene.log_scales[1] = log_scale
+    scene.opacity_logits[2] = -120.0
+    found = merged(scene, LEFT, np.array([0.0, 1.0, 0.0, 0.0, 1.0, 1.0]))
+    assert all(np.isfinite(array).all() for array in found.arrays)
+
+
+def test_of_a_scene_that_nobody_sees_numbers_are_left():
+    found = merged(two_groups(), LEFT, np.zeros(6))
+    assert all(np.isfinite(array).all() for array in found.arrays)
+
+
+def pruned(scene, cameras, device):
+    bench = Workbench(EncodeOptions().parameters, device=device)
+    views = train_views(cameras)
+    return Prune(count=len(scene) // 8, iterations=8).run(State.of(scene, views), bench), bench
+
+
+def test_the_stage_brings_a_thinned_scene_nearer_to_its_pictures(usual_device, plush_excerpt, plush_excerpt_cameras):
+    before, bench = pruned(plush_excerpt, plush_excerpt_cameras, usual_device)
+    then = Merge(on=True).run(before, bench)
+    assert then is not before
+    assert len(then.scene) == len(before.scene)
+    with Judging(usual_device, plush_excerpt, before.views, Looks()) as judging:
+        was, now = (mean_view(judging.figures(each)).figures["b_against_a"].psnr for each in (before.scene, then.scene))
+    assert now > was + 0.5
+
+
+def test_where_pictures_become_much_worse_all_stay_as_they_were(
+    usual_device, plush_excerpt, plush_excerpt_cameras, monkeypatch
+):
+    before, bench = pruned(plush_excerpt, plush_excerpt_cameras, usual_device)
+    black = dataclasses.replace(before.scene, opacity_logits=before.scene.opacity_logits - 20)
+    monkeypatch.setattr("potr_cl.stages.merge.merged", lambda *_: black)
+    assert Merge(on=True).run(before, bench) is before
+
+
+def test_nothing_is_merged_where_nothing_was_removed(plush_excerpt, plush_excerpt_cameras):
+    state = State.of(plush_excerpt, train_views(plush_excerpt_cameras))
+    assert Merge(on=True).run(state, Workbench(EncodeOptions().parameters)) is state
+
+
+def test_only_coarser_levels_are_merged_and_none_of_preset_paper():
+    options = EncodeOptions()
+    assert not options.stage(Merge).on
+    assert coarser(options, 1, 100, "gpu").stage(Merge).on
+    assert not coarser(EncodeOptions(preset="paper"), 1, 100, "gpu").stage(Merge).on
