@@ -1,9 +1,9 @@
 """Scenes encoded with levels of detail: :func:`encode_levels`.
 
 A level is one run of the stages: with a number of splats to keep, and smaller views. It keeps some of the splats that
-the next finer level has kept, as they are in the full scene, and their colours are re-fitted to the full scene's
-pictures. Levels are made one after the other, so no more memory is taken than by one of them; what is kept of each is
-the file that it became.
+the next finer level has kept, begins with them as they are in the full scene, and is fitted and re-fitted to the full
+scene's pictures. Levels are made one after the other, and what is kept of each is the file that it became; while these
+become one, the scenes that they hold are kept, too: together no more than twice the finest.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from potr_cl.host.threads import Run, thread_pool
 from potr_cl.model.order import ascending, morton_codes
-from potr_cl.model.scene import Scene
+from potr_cl.model.scene import Scene, opacities_of
 from potr_cl.model.spherical_harmonics import quaternions_of, rotation_matrices
 from potr_cl.stages.fitting.fit import Sight, held_out_error
 from potr_cl.stages.pruning.helpers import measurement
@@ -40,6 +40,9 @@ _UNSEEN = 0.1
 _OPACITY = 0.995
 #: Logarithms of scales are taken as no larger, and no smaller than minus this.
 _LARGEST = 40.0
+#: The least opacity that is drawn: what is fainter is no matter. And how far from a splat one may be that it takes
+#: over, in parts of both's sizes.
+_DRAWN, _FAR = 1 / 255, 30.0
 #: Splats that a thread works on at a time.
 _BLOCK = 1 << 15
 
@@ -59,14 +62,14 @@ class Merge(Stage):
 
     def run(self, state: State, bench: Workbench) -> State:
         """The state with merged splats, or as it was."""
-        if len(state.scene) == len(state.source) or len(state.views) - state.added < 2:
+        if len(state.scene) == len(state.source) or len(state.views) - state.added < 2 or state.results.unresolved:
             return state
         bench.progress("merge", 0.0)
         whole = replace(state, scene=state.source, survivors=np.arange(len(state.source)), cut=None)
         with measurement(whole, bench, SweepOptions(memory=bench.memory), state.visibility) as removal:
             _, importance = removal.measure()
         with thread_pool(bench.threads) as pool:
-            scene = merged(state.source, state.survivors, importance, pool.map)
+            scene = merged(state.source, state.survivors, importance, pool.map, state.scene)
         bench.progress("merge", 0.5)
         looked_at = bench.opened, bench.drawable(state.source), state.views, bench.background, state.visibility
         with targets_of(*looked_at) as targets:
@@ -76,7 +79,7 @@ class Merge(Stage):
         return replace(state, scene=scene, geometry=None) if errors[1] < _WORSE * errors[0] else state
 
 
-def merged(scene: Scene, left: _Indices, importance: _F64, run: Run = map) -> Scene:
+def merged(scene: Scene, left: _Indices, importance: _F64, run: Run = map, become: Scene | None = None) -> Scene:
     """Splats that are left, each with what it and the removed ones nearest to it were together.
 
     Of each group the centre, the covariance, and the coefficients are the weighted means; the opacity is such that it
@@ -87,27 +90,29 @@ def merged(scene: Scene, left: _Indices, importance: _F64, run: Run = map) -> Sc
         left: (n,) numbers of those that are left, ascending.
         importance: (N,) what pictures show of each, in any unit.
         run: in place of :func:`map`, to work with several threads.
+        become: the splats that are left as they are by now, which those stay that are not merged; None: as they were.
     """
     group = _groups(scene, left, run)
     members = ascending(group, run)
-    counts = np.bincount(group, minlength=len(left))
+    counts = np.bincount(group, minlength=len(left) + 1)[:-1]
     starts = np.cumsum(counts) - counts
     covered = np.empty(len(scene))
 
     def cover(start: int) -> None:
         some = slice(start, start + _BLOCK)
-        covered[some] = _opacities(scene.opacity_logits[some]) * _area(scene.log_scales[some])
+        opacities = opacities_of(scene.opacity_logits[some])
+        covered[some] = np.where(opacities < _DRAWN, 0, opacities * _area(scene.log_scales[some]))
 
     list(run(cover, range(0, len(scene), _BLOCK)))
     usual = importance.sum() / max(float(covered.sum()), 1e-300) or 1.0
-    shown = np.bincount(group, importance, len(left))
+    shown = np.bincount(group, importance, len(left) + 1)[:-1]
     wanted = shown - importance[left] > _MISSED * shown
-    wanted |= shown < _HARDLY_SHOWN * usual * np.bincount(group, covered, len(left))
+    wanted |= shown < _HARDLY_SHOWN * usual * np.bincount(group, covered, len(left) + 1)[:-1]
     wanted &= counts > 1
-    found = scene.subset(left)
+    found = scene.subset(left) if become is None else become.subset(np.arange(len(become)))
 
-    def merge(start: int) -> None:
-        several = start + np.flatnonzero(wanted[start : start + _BLOCK])
+    def merge(some: slice) -> None:
+        several = some.start + np.flatnonzero(wanted[some])
         if not len(several):
             return
         ends = np.cumsum(counts[several])
@@ -135,12 +140,15 @@ def merged(scene: Scene, left: _Indices, importance: _F64, run: Run = map) -> Sc
         opacity = np.clip(opacity, 1 / 255, _OPACITY)
         found.opacity_logits[several] = np.log(opacity / (1 - opacity))
 
-    list(run(merge, range(0, len(left), _BLOCK)))
+    # So many members at a time, however few splats are left.
+    ends = np.searchsorted(np.cumsum(counts), np.arange(_BLOCK, counts.sum(), _BLOCK))
+    cuts = np.unique([0, *ends, len(left)]).tolist()
+    list(run(merge, map(slice, cuts[:-1], cuts[1:])))
     return found
 
 
 def _groups(scene: Scene, left: _Indices, run: Run) -> _Indices:
-    """(N,) for each splat the place in ``left`` of the one that takes it over; of those that are left, their own.
+    """(N,) for each splat the place in ``left`` of the one that takes it over, or its own there; n if none does.
 
     The best of the neighbours along two Morton curves, one of which is turned, by distance, size and colour.
     """
@@ -167,22 +175,17 @@ def _groups(scene: Scene, left: _Indices, run: Run) -> _Indices:
             own, place = gone[some], places[some]
             for step in range(-_NEAR, _NEAR):
                 other = order[np.clip(place + step, 0, len(order) - 1)]
-                apart = np.square(scene.means[own] - scene.means[other]).sum(axis=1, dtype=np.float64)
+                apart = np.square(scene.means[own].astype(np.float64) - scene.means[other]).sum(axis=1)
                 cost = apart / (sizes[own] + sizes[other])
-                cost += _COLOUR * np.square(scene.sh[own, 0] - scene.sh[other, 0]).sum(axis=1)
+                cost[cost > _FAR**2] = np.inf
+                cost += _COLOUR * np.square(scene.sh[own, 0].astype(np.float64) - scene.sh[other, 0]).sum(axis=1)
                 better = cost < least[some]
                 least[some][better] = cost[better]
                 group[own[better]] = group[other[better]]
 
         list(run(look, range(0, len(gone), _BLOCK)))
-    lost = gone[group[gone] < 0]  # of numbers too large to compare
-    group[lost] = 0
+    group[group < 0] = len(left)
     return group
-
-
-def _opacities(logits: NDArray[np.floating]) -> _F64:
-    found: _F64 = 1 / (1 + np.exp(-logits.astype(np.float64)))
-    return found
 
 
 def _area(log_scales: NDArray[np.floating]) -> _F64:

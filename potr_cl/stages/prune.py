@@ -233,7 +233,8 @@ class Prune(Stage):
         dealt = None
         if visibility is not None and bench.pool is not None and not bench.all_here:
             dealt = _dealt(state, seen, bench.pool, visibility)
-            state = state.with_results(shares=dealt)
+            if state.scene is state.source:  # else pictures of the source would lack what is gone already
+                state = state.with_results(shares=dealt)
         unresolved = state.results.unresolved
         stays = hidden if seen is None else None
         if unresolved is not None:
@@ -294,7 +295,7 @@ def part_of_time(iterations: float, stays: bool) -> float:
 
 
 def _dealt(state: State, seen: NDArray[np.int64] | None, pool: Pool, visibility: Visibility) -> ViewShares:
-    """The views for a pool's workers, and which of the source's splats each gets, for this stage and others."""
+    """The views for a pool's workers, and which of the splats each gets."""
     workers = pool.workers()
     source, numbers = (state.source, state.survivors) if state.is_cut else (state.scene, np.arange(len(state.scene)))
     names = [worker.name for worker in workers]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import closing, nullcontext
+
 import numpy as np
 import pytest
 
@@ -11,12 +13,17 @@ from potr_cl.codec.decoder import open_file
 from potr_cl.codec.levels import splats_of_levels
 from potr_cl.levels import encoding
 from potr_cl.levels.plan import views_of_level
+from potr_cl.model import splat_groups
 from potr_cl.model.camera import test_views as held_out
 from potr_cl.opencl.discovery import choose_device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.stages.fit import STEPS
+from potr_cl.views import visibility
+from potr_cl.workers.host import HostPool
+from tests.cases.elsewhere import ElsewherePool
 from tests.cases.judging import mean_error
+from tests.cases.streets import street
 from tests.devices import shared_device
 
 QUICK = {"iterations": 6, "views_between": 0, "refit": 2}
@@ -136,3 +143,22 @@ def test_what_is_left_of_some_splats_shows_the_whole_scene(plush_excerpt, plush_
         for scene in (potr_cl.decode(found.data), plush_excerpt.subset(among))
     )
     assert error < 0.7 * plain
+
+
+@pytest.mark.slow
+@pytest.mark.one_family
+def test_levels_are_the_same_on_workers_that_have_what_their_views_see(monkeypatch):
+    monkeypatch.setattr(visibility, "LEAST_SPLATS", 10)
+    monkeypatch.setattr(splat_groups, "LARGEST", 16)
+    scene, cameras = street(houses=6, splats=300)
+    options = EncodeOptions.for_preset(
+        "best", prune={"iterations": 4, "keep": 0.6}, between={"views": 0}, refit={"steps": 2}, levels=3
+    )
+    found = []
+    for workers in (None, HostPool, ElsewherePool):
+        devices = [shared_device("cpu", number) for number in range(3)]
+        with nullcontext() if workers is None else closing(workers(devices)) as pool:
+            found.append(
+                encoding.encode_levels(scene, cameras, options, None, devices[0], pool=pool, in_frame=True).data
+            )
+    assert found[0] == found[1] == found[2]

@@ -121,3 +121,21 @@ def test_only_coarser_levels_are_merged_and_none_of_preset_paper():
     assert not options.stage(Merge).on
     assert coarser(options, 1, 100, "gpu").stage(Merge).on
     assert not coarser(EncodeOptions(preset="paper"), 1, 100, "gpu").stage(Merge).on
+
+
+def test_what_is_far_or_never_drawn_is_taken_over_by_nobody():
+    scene = two_groups()
+    scene.means[1] = 1e30
+    scene.log_scales[2], scene.opacity_logits[2] = 9, -20
+    found = merged(scene, LEFT, np.array([0.5, 2.0, 1e-9, 8.0, 1.0, 1.0]))
+    assert np.allclose(found.means[0], AT[0], atol=1e-6)
+    assert np.allclose(found.log_scales[0].max(), scene.log_scales[0].max(), atol=1e-3)
+
+
+def test_colours_stay_as_stages_before_have_left_them():
+    scene = two_groups()
+    by_now = dataclasses.replace(scene.subset(LEFT), sh=np.full((2, 4, 3), 0.25, np.float32))
+    found = merged(scene, LEFT, np.array([0.5, 2.0, 1.5, 8.0, 1.0, 1.0]), become=by_now)
+    assert (found.sh[1] == 0.25).all()
+    assert (found.sh[0] != 0.25).any()
+    assert (by_now.sh == 0.25).all()
