@@ -127,8 +127,8 @@ def test_a_level_keeps_some_of_the_splats_of_the_next_finer_one_the_same_each_ti
 def test_coarser_levels_are_fitted_where_nobody_asks_for_it(preset, steps):
     given = EncodeOptions(preset=preset)
     assert given.fit.steps == 0
-    assert encoding.coarser(given, 100, "cpu").fit.steps == steps
-    assert encoding.coarser(given.changed(fit={"steps": 7}), 100, "cpu").fit.steps == 7
+    assert encoding.coarser(given, 1, 100, "cpu").fit.steps == steps
+    assert encoding.coarser(given.changed(fit={"steps": 7}), 1, 100, "cpu").fit.steps == 7
 
 
 def test_what_is_left_of_some_splats_shows_the_whole_scene(plush_excerpt, plush_excerpt_cameras, device):
