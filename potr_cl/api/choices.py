@@ -60,8 +60,9 @@ class CompactChoices(TypedDict, total=False):
 
 
 class FitChoices(TypedDict, total=False):
-    """Options of the stages "fit" and "between", the extra views that stages look at."""
+    """Options of the stages "fit", "merge" before it, and "between", the extra views that stages look at."""
 
+    merge: bool | Mapping[str, Any] | None
     fit: bool | int | Literal["auto", "off"] | Mapping[str, Any] | None
     views_between: float | Literal["auto", "off"] | None
     between: Mapping[str, Any] | None
