@@ -46,6 +46,6 @@ def test_help_fits_a_screen_and_leads_to_all_options():
     assert len(said.splitlines()) + 2 <= 50
     assert "EncodeChoices" in said
     listed = inspect.getdoc(EncodeChoices)
-    for name in EncodeChoices.__annotations__.keys() - {"between", "code"}:
+    for name in EncodeChoices.__annotations__.keys() - {"between", "code", "merge"}:
         assert f"{name}:" in listed or f"{name}," in listed, name
     assert stage_keywords().keys() <= EncodeChoices.__annotations__.keys()
