@@ -45,8 +45,8 @@ _FITTED = 0.25
 #: take three times as long in all; and the most.
 _BATCH: dict[Family, float] = {"cpu": math.sqrt(2), "gpu": 2.0}
 _MOST_BATCH = 32
-#: How much holds colours to their start: from 0.1 on views that nobody has given look better. Little is left of a scene
-#: whose splats have grown.
+#: How strongly the re-fit holds colours to the fit's. With the usual 0.1 a small city's levels lose 2 to 4 dB in views
+#: that nobody gave, with this next to nothing, and given ones 0.4 dB (docs/benchmarks/levels.md).
 _PRIOR = 3.0
 #: The most iterations of the pruning before it, which makes up for what fewer of them do worse.
 _ITERATIONS = 16
@@ -132,8 +132,8 @@ def encode_levels(
 def coarser(options: EncodeOptions, level: int, count: int, family: Family | None) -> EncodeOptions:
     """The options of a level of so many splats: those of photographs' size are not looked at.
 
-    It is fitted in any case, if only for a while: few splats in small pictures have to be wider and more opaque than
-    those of the full scene, which colours alone cannot make up for. But not with preset paper.
+    Gaps are closed, and it is fitted in any case, if only for a while: few splats in small pictures have to be wider
+    and more opaque than those of the full scene, which colours alone cannot make up for. But not with preset paper.
 
     Args:
         options: of the finest level.

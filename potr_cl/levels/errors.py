@@ -212,7 +212,7 @@ class SharedOut:
             def compare(channel: int, own: FloatArray, difference: FloatArray, picture: FloatArray) -> None:
                 difference[:, :, channel] = np.square(picture.clip(0, 1) - own).mean(axis=2)
 
-            def targets_of(covered: FloatArray, difference: FloatArray) -> FloatArray:
+            def darkened(covered: FloatArray, difference: FloatArray) -> FloatArray:
                 # Of a grey scene in front of black; what the picture should show is darker where the error is larger.
                 dark: FloatArray = covered - difference / np.maximum(difference.max(axis=(0, 1)), np.float32(1e-30))
                 return dark
@@ -227,7 +227,7 @@ class SharedOut:
                 ]
                 for each in compared:
                     each.result()
-                targets = pool.map(targets_of, self._covered, differences)
+                targets = pool.map(darkened, self._covered, differences)
                 views = (
                     (difference, self._of_splats(number, target))
                     for number, (difference, target) in enumerate(zip(differences, targets, strict=True))

@@ -31,8 +31,8 @@ _F64 = NDArray[np.float64]
 _NEAR, _TURNED = 4, 0.7
 #: What a squared difference of constant coefficients counts against a squared distance in parts of the splats' sizes.
 _COLOUR = 3.0
-#: A splat is merged if its removed neighbours make up this part of what views show of the group; or if views show no
-#: more than that part of what they usually show of as much matter. Pictures may become worse by that factor (1.5 dB).
+#: A splat is merged if its removed neighbours make up this part of what views show of the group; or if views show less
+#: than that part of what they usually show of as much matter. Pictures may become worse by that factor (1.5 dB).
 _MISSED, _HARDLY_SHOWN, _WORSE = 0.7, 0.05, 10**0.15
 #: What a splat counts that no view shows, as a part of one of the same size and opacity that is shown as usual.
 _UNSEEN = 0.1
@@ -61,8 +61,9 @@ class Merge(Stage):
     on: bool = option(False)
 
     def run(self, state: State, bench: Workbench) -> State:
-        """The state with merged splats, or as it was."""
-        if len(state.scene) == len(state.source) or len(state.views) - state.added < 2 or state.results.unresolved:
+        """The state with merged splats; as it was where pictures become much worse, and where nobody can tell."""
+        none_held_out = len(state.views) - state.added < 2
+        if len(state.scene) == len(state.source) or none_held_out or state.results.unresolved is not None:
             return state
         bench.progress("merge", 0.0)
         whole = replace(state, scene=state.source, survivors=np.arange(len(state.source)), cut=None)

@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
+from potr_cl.errors import UsageError
 from potr_cl.levels.encoding import coarser
 from potr_cl.model.camera import train_views
 from potr_cl.model.scene import Scene
@@ -139,3 +140,9 @@ def test_colours_stay_as_stages_before_have_left_them():
     assert (found.sh[1] == 0.25).all()
     assert (found.sh[0] != 0.25).any()
     assert (by_now.sh == 0.25).all()
+
+
+@pytest.mark.parametrize("changes", [{"refit": {"prior": -1.0}}, {"refit": {"prior": np.nan}}, {"fit": {"batch": 0}}])
+def test_what_levels_choose_is_refused_where_it_is_out_of_range(changes):
+    with pytest.raises(UsageError):
+        EncodeOptions().changed(**changes)
