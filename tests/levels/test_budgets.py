@@ -27,6 +27,7 @@ from potr_cl.outputs.potr import Potr
 from potr_cl.outputs.sog import Sog
 from potr_cl.outputs.streamed_sog import StreamedSog
 from potr_cl.raster.rasterizer import Rasterizer
+from tests.cases.scenes import rows_of
 from tests.cases.web import WEB
 from tests.cli.calls import fails, run
 
@@ -180,6 +181,24 @@ def test_files_are_read_as_they_are_shown(files: tuple[Path, Path]) -> None:
     assert len(coarse.shown(np.full(len(coarse.counts), 2))) == LEVELS[2]
     with pytest.raises(DataError, match="has no splats"):
         coarse.shown(np.full(len(coarse.counts), -1))
+
+
+def test_an_environment_is_shown_besides_what_the_budget_is_for(
+    files: tuple[Path, Path], plush_excerpt: Scene, plush_excerpt_cameras: list[Camera], tmp_path: Path
+) -> None:
+    """As in PlayCanvas' engine."""
+    path, views = tmp_path / "sky" / "lod-meta.json", plush_excerpt_cameras[:2]
+    shutil.copytree(files[0].parent, path.parent, ignore=shutil.ignore_patterns("*.potr"))
+    shutil.copytree(path.parent / "2_0", path.parent / "env")
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"environment": "env/meta.json"}))
+    streamed = StreamedScene(path)
+    sky = potr_cl.load_scene(path.parent / "env")
+    assert rows_of(streamed.shown(np.full(len(streamed.counts), -1))) == rows_of(sky)
+    both = rows_of(streamed.shown(np.zeros(len(streamed.counts), np.int64)))
+    assert both == rows_of(potr_cl.load_scene(f"{files[0]}#0")) | rows_of(sky)
+    alone, around = (potr_cl.compare_budgets(plush_excerpt, each, 900, views).shown for each in (files[0], path))
+    for before, after in zip(alone, around, strict=True):
+        assert after.splats == [splats + len(sky) for splats in before.splats]
 
 
 @pytest.mark.parametrize(
