@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import dataclasses
 import io
+import json
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -25,6 +26,7 @@ from PIL import Image
 import potr_cl
 from potr_cl.formats.scenes import page as pages
 from potr_cl.model.camera import Camera
+from potr_cl.model.scene import Scene, joined
 from potr_cl.outputs.potr import Page
 from potr_cl.pipeline.options import EncodeOptions
 from tests.cases.web import GOLDEN, WEB, judged
@@ -188,17 +190,43 @@ def test_engines_draw_what_our_renderer_does(
     check_alike(ours, picture(tab), least)
 
 
-@pytest.fixture(scope="module")
-def streamed(plush_excerpt: Any, plush_excerpt_cameras: list[Camera], server: Server, tmp_path_factory: Any) -> Path:
-    """Levels of detail, as streamed SOG; in the browser below /streamed."""
+def with_sky(scene: Scene, view: Camera) -> Scene:
+    """With a tenth of it once more, large and far behind it."""
+    part = scene.subset(np.arange(0, len(scene), 10))
+    away, larger = view.centre + 80 * view.rotation[2], 150.0
+    sky = dataclasses.replace(
+        part,
+        means=(away + larger * (part.means - np.median(part.means, axis=0))).astype(np.float32),
+        log_scales=part.log_scales + np.float32(np.log(1.5 * larger)),
+    )
+    return joined([scene, sky])
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["without_sky", "with_sky"])
+def streamed(
+    request: Any, plush_excerpt: Scene, plush_excerpt_cameras: list[Camera], server: Server, tmp_path_factory: Any
+) -> Path:
+    """Levels of detail, as streamed SOG, whose environment is the sky; in the browser below their folder's name."""
     path: Path = tmp_path_factory.mktemp("streamed") / "lod-meta.json"
+    scene = with_sky(plush_excerpt, plush_excerpt_cameras[0]) if request.param else plush_excerpt
     potr_cl.encode(
-        plush_excerpt, plush_excerpt_cameras, output=path, levels=3, lod_chunk_count=1, iterations=2, refit=2,
-        views_between=0,
-    )  # fmt: skip
+        scene, plush_excerpt_cameras, output=path, levels=3, lod_chunk_count=1, iterations=2, refit=2, views_between=0
+    )
+    assert (path.parent / "env").exists() is request.param
     for file in filter(Path.is_file, path.parent.rglob("*")):
-        server.files[f"/streamed/{file.relative_to(path.parent)}"] = file.read_bytes()
+        server.files[f"/{file.relative_to(path.parents[1])}"] = file.read_bytes()
     return path
+
+
+def url_of(streamed: Path) -> str:
+    return f"/{streamed.parent.name}/{streamed.name}"
+
+
+def splats_of(streamed: Path, level: int) -> int:
+    """Of a level and the environment, as the descriptions say."""
+    around = streamed.parent / "env" / "meta.json"
+    counts = json.loads(streamed.read_text())["counts"]
+    return int(counts[level] + (json.loads(around.read_text())["count"] if around.exists() else 0))
 
 
 @contextmanager
@@ -218,20 +246,33 @@ def without_complaints(tab: Any) -> Iterator[None]:
     assert said == []
 
 
-@pytest.mark.parametrize("level", [0, 2])
-def test_playcanvas_streams_levels_of_detail(
-    level: int, tab: Any, server: Server, streamed: Path, plush_excerpt_cameras: list[Camera]
-) -> None:
-    camera, view = stage_view(plush_excerpt_cameras[0])
+def check_playcanvas_streams(streamed: Path, level: int, looking: Camera, tab: Any, server: Server) -> None:
+    camera, view = stage_view(looking)
     scene = potr_cl.load_scene(f"{streamed}#{level}")
     with without_complaints(tab):
         on_stage(tab, server)
         budget = 10**6 if level == 0 else 1
-        shown = tab.evaluate(
-            "([view, budget]) => potr.streamed('/streamed/lod-meta.json', view, budget)", [view, budget]
-        )
-    assert shown == len(scene)
+        shown = tab.evaluate("(given) => potr.streamed(...given)", [url_of(streamed), view, budget])
+    assert shown == len(scene) == splats_of(streamed, level)
     check_alike(np.clip(potr_cl.render(scene, camera).image, 0, 1), picture(tab), 30)
+
+
+@pytest.mark.parametrize("level", [0, 2])
+def test_playcanvas_streams_levels_of_detail(
+    level: int, tab: Any, server: Server, streamed: Path, plush_excerpt_cameras: list[Camera]
+) -> None:
+    check_playcanvas_streams(streamed, level, plush_excerpt_cameras[0], tab, server)
+
+
+@pytest.mark.parametrize("streamed", [True], indirect=True, ids=["with_sky"])
+def test_playcanvas_shows_the_sky_where_it_sees_nothing_else(
+    tab: Any, server: Server, streamed: Path, plush_excerpt: Scene, plush_excerpt_cameras: list[Camera]
+) -> None:
+    first, a = plush_excerpt_cameras[0], np.radians(14)
+    aside = np.array([[np.cos(a), 0, -np.sin(a)], [0, 1, 0], [np.sin(a), 0, np.cos(a)]]) @ first.rotation
+    camera = dataclasses.replace(first, rotation=aside, translation=-aside @ first.centre)
+    assert not potr_cl.render(plush_excerpt, stage_view(camera)[0]).image.any()
+    check_playcanvas_streams(streamed, 0, camera, tab, server)
 
 
 @pytest.mark.skipif(
@@ -245,8 +286,8 @@ def test_supersplat_streams_levels_of_detail(tab: Any, server: Server, streamed:
     view = {"position": (target + np.array([0.1, 0.15, -0.6])).tolist(), "target": target.tolist(), "fov": 50}
     with without_complaints(tab):
         on_stage(tab, server)
-        found = tab.evaluate("([view, budget]) => potr.supersplat('/streamed/lod-meta.json', view, budget)", [view, 1])
-    assert found["splats"] == len(scene)
+        found = tab.evaluate("(given) => potr.supersplat(...given)", [url_of(streamed), view, 1])
+    assert found["splats"] == len(scene) == splats_of(streamed, 0)
     to_world = np.array(found["matrix"]).reshape(4, 4).T
     rotation, centre = np.diag([1.0, -1.0, -1.0]) @ to_world[:3, :3].T @ turned, turned @ to_world[:3, 3]
     focal = WIDTH / 2 / np.tan(np.radians(found["fov"] / 2))
