@@ -43,7 +43,7 @@ _MOST_ADDED, _MOST_ADDED_ON_CPU = 5.0, 2.0
 #: are a part of the training views, and some more where an encode does much besides looking at views, as on GPUs.
 _SHARE = 0.45
 #: Where fewer views than this show parts of the scene, what lies between is matched many decibels worse than they are.
-#: There a GPU may take up to 2.2 times as long.
+#: There an encode may take up to 2.2 times as long.
 _FEW, _SHARE_OF_FEW = 10, 1.0
 _BESIDES, _BESIDES_ON_CPU = 45, 4
 
@@ -55,8 +55,7 @@ def needed(shown_by: float, views: int, slow: bool) -> float:
         shown_by: how many training views show the scene where few do, as :func:`views_where_few` finds it.
         slow: whether a CPU has to look at them.
     """
-    few = shown_by < _FEW and not slow
-    each = min(_ENOUGH / max(shown_by, 1.0) - 1, most_needed(views, slow, few))
+    each = min(_ENOUGH / max(shown_by, 1.0) - 1, most_needed(views, slow, shown_by < _FEW))
     return each if each >= _LEAST else 0.0
 
 
@@ -80,11 +79,7 @@ def most_needed(views: int, slow: bool, few: bool = False) -> float:
 _SPLAT, _PIXEL = 500, 200
 #: Views whose memory is measured.
 _SAMPLE = 3
-#: Bytes of a view that is looked at by itself, for each splat that it may draw and each pixel.
-_DRAWN, _TARGET = 104, 12
-#: So many are added there for each given one, whether they fit or not.
-_ANYWAY = 1 / 2
-#: By how much the others may take more; and how much more, where views of a part share its splats.
+#: By how much others may take more than those measured; and how much more, where views of a part share its splats.
 _MARGIN, _MARGIN_OF_PARTS = 1.1, 1.6
 
 
@@ -92,8 +87,8 @@ def room_for(added: Sequence[Camera], state: State, bench: Workbench) -> int:
     """How many of some views fit the memory, on the average, beside those of a state.
 
     A view that does not fit is made again for each measurement. So added views that take the room of others cost many
-    times what they should, and only as many are added as there is room for. Where views are made again in batches, each
-    with what it may draw (:func:`potr_cl.views.plan.by_view`), they cost less: half as many as were given are added.
+    times what they should, and only as many are added as there is room for. But where views are made again in batches,
+    each with what it may draw (:func:`potr_cl.views.plan.by_view`), an added one costs no more than a given one.
 
     Args:
         added: the views that might be added.
@@ -108,10 +103,9 @@ def room_for(added: Sequence[Camera], state: State, bench: Workbench) -> int:
         return len(added)
     sampled = spread_evenly(state.views, _SAMPLE), spread_evenly(added, _SAMPLE)
     if seen_part(state.source, state.views) <= MOST_SEEN:
-        if _by_view(state, bench):
-            own, more = (_nbytes_by_view(state, views) for views in (state.views, added))
-            room = int(max((budget - own * len(state.views)) // more, _ANYWAY * len(state.views)))
-            return min(room, len(added))
+        device = bench.opened
+        if bench.all_here and device.family == "gpu" and fits_whole(device, bench.drawable(state.source)):
+            return len(added)
         own, more = (_nbytes_of_parts(state, bench, views) for views in sampled)
         # Views in hand take room too, and parts are larger than what a view sees of them.
         left, margin = budget - min(SCENES * budget, state.source.nbytes) - 2 * max(own, more), _MARGIN_OF_PARTS
@@ -120,18 +114,6 @@ def room_for(added: Sequence[Camera], state: State, bench: Workbench) -> int:
         left, margin = budget, _MARGIN
     left -= margin * own * len(state.views)
     return int(min(max(left // (margin * more), 0), len(added)))
-
-
-def _by_view(state: State, bench: Workbench) -> bool:
-    """Whether views that do not fit are made again in batches."""
-    device = bench.opened
-    return bench.all_here and device.family == "gpu" and fits_whole(device, bench.drawable(state.source))
-
-
-def _nbytes_by_view(state: State, views: Sequence[Camera]) -> float:
-    """Bytes that is kept of a view where each is looked at by itself: about the mean."""
-    pixels = sum(view.width * view.height for view in views) / len(views)
-    return _DRAWN * seen_part(state.source, views) * len(state.source) + _TARGET * pixels
 
 
 def _nbytes_of_parts(state: State, bench: Workbench, views: Sequence[Camera]) -> float:
