@@ -2,9 +2,7 @@
 
 A level is one run of the stages: with a number of splats to keep, and smaller views. It keeps some of the splats that
 the next finer level has kept, begins with them as they are in the full scene, and is fitted and re-fitted to the full
-scene's pictures. Of the finer one (:class:`potr_cl.pipeline.encoded.Encoded`) it takes three arrays: ``order``, which
-splats that has; ``importance``, what views have shown of each splat of the scene; and ``heirs``, who has taken over
-whom, so that merging looks no further than for heirs of splats that this level removes.
+scene's pictures. What views show of each splat of the scene the finest one has measured for all.
 
 Levels are made one after the other, and what is kept of each is the file that it became; while these become one, the
 scenes that they hold are kept, too: together no more than twice the finest.

@@ -81,7 +81,7 @@ def encode(
         run = Run(options, watch, device, kept, pool)
         start = State.of(scene, train_views(cameras) if cameras else [])
         if finer is not None:
-            start = start.keeping(np.sort(finer.order)).with_results(importance=finer.importance, heirs=finer.heirs)
+            start = start.keeping(np.sort(finer.order)).with_results(importance=finer.importance)
         encoded = run.finished(run.stages(start))
     tell_left_out(scene, encoded)
     return encoded

@@ -287,7 +287,6 @@ class Run:
             parameters=priced(as_done(self._options, state).parameters, state),
             left_out=0 if coded.sh_degree is None else state.scene.sh_degree - coded.sh_degree,
             importance=state.results.importance,
-            heirs=state.results.heirs,
         )
 
 

@@ -10,28 +10,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.host.threads import Run, in_background, thread_pool
+from potr_cl.host.threads import Run, thread_pool
 from potr_cl.model.order import morton_order, over_ranges
 from potr_cl.model.scene import Scene, opacities_of
 from potr_cl.model.spherical_harmonics import quaternions_of, rotation_matrices
 from potr_cl.stages.fitting.fit import Sight, held_out_error
-from potr_cl.stages.pruning.helpers import measurement
-from potr_cl.stages.pruning.removal import RemovalSweep
-from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.stages.stage import Stage, State, Workbench, option
 from potr_cl.views.targets import targets_of
 
 _Indices = NDArray[np.int64]
 _F64 = NDArray[np.float64]
 _F32 = NDArray[np.float32]
-#: (N,) numbers of splats, see :func:`heirs_of`.
-Heirs = NDArray[np.int32]
 
 #: Neighbours of a removed splat that may take it over, on either side of it along a curve.
 _NEAR = 4
@@ -52,8 +46,6 @@ _LARGEST = 40.0
 #: The least opacity that is drawn: what is fainter is no matter. And how far from a splat one may be that it takes
 #: over, in parts of both's sizes.
 _DRAWN, _FAR = 1 / 255, 30.0
-#: From so many views on, every other one is measured.
-_MANY = 64
 #: Splats that a thread works on at a time.
 _BLOCK = 1 << 15
 
@@ -72,32 +64,14 @@ class Merge(Stage):
     on: bool = option(False)
 
     def run(self, state: State, bench: Workbench) -> State:
-        """The state with merged splats; as it was where pictures become much worse, and where nobody can tell.
-
-        What pruning of the finest level has measured is good enough for the first level that merges. Views of those
-        after it are much smaller, and what is measured in them counts as much as all before.
-        """
-        none_held_out = len(state.views) - state.added < 2
-        if len(state.scene) == len(state.source) or none_held_out or state.results.unresolved is not None:
+        """The state with merged splats; as it was where pictures become much worse, and where nobody can tell."""
+        importance = state.results.importance
+        none_held_out = len(state.views) - state.added < 2 or state.results.unresolved is not None
+        if len(state.scene) == len(state.source) or none_held_out or importance is None:
             return state
         bench.progress("merge", 0.0)
         with thread_pool(bench.threads) as pool:
-            heirs = in_background(heirs_of, state.source, state.survivors, state.results.heirs, pool.map)
-
-            def made(importance: _F32) -> Scene:
-                return merged(state.source, state.survivors, heirs.result(), importance, pool.map, state.scene)
-
-            importance = state.results.importance
-            if importance is not None and state.results.heirs is None:
-                scene = made(importance)
-            else:
-                with _measurement(state, bench) as removal:
-                    here = removal.measure()[1].astype(np.float32)
-                    importance = here if importance is None else np.mean([importance, here], axis=0)
-                    # While drivers give the measurement's memory back.
-                    begun = in_background(made, importance)
-                scene = begun.result()
-        state = state.with_results(heirs=heirs.result(), importance=importance)
+            scene = merged(state.source, state.survivors, importance, pool.map, state.scene)
         bench.progress("merge", 0.5)
         looked_at = bench.opened, bench.drawable(state.source), state.views, bench.background, state.visibility
         with targets_of(*looked_at) as targets:
@@ -107,95 +81,8 @@ class Merge(Stage):
         return replace(state, scene=scene, geometry=None) if errors[1] < _WORSE * errors[0] else state
 
 
-def _measurement(state: State, bench: Workbench) -> AbstractContextManager[RemovalSweep]:
-    """Of all splats of the source, in half of the views where there are many."""
-    step = 2 if len(state.views) >= _MANY else 1
-    visibility = state.visibility and replace(state.visibility, seen=state.visibility.seen[::step])
-    every = np.arange(len(state.source))
-    whole = replace(state, scene=state.source, survivors=every, cut=None, views=state.views[::step])
-    return measurement(whole, bench, SweepOptions(memory=bench.memory), visibility)
-
-
-def heirs_of(scene: Scene, left: _Indices, before: Heirs | None = None, run: Run = map) -> Heirs:
-    """Which of the splats that are left takes each one over.
-
-    The best of the neighbours along two Morton curves, one of which is turned, by distance, size and colour.
-
-    Args:
-        scene: N splats.
-        left: (n,) numbers of those that are left, ascending.
-        before: the same when more splats were left, whose heirs pass on what they have taken over; None: all were.
-        run: in place of :func:`map`, to work with several threads.
-
-    Returns:
-        (N,) int32, the number of that splat, its own where it is left; N where there is none.
-    """
-    count = len(scene)
-    numbers = np.arange(count, dtype=np.int32)
-    there = numbers if before is None else np.flatnonzero(before == numbers)
-    is_left = np.zeros(count, bool)
-    is_left[left] = True
-    is_left = is_left[there]
-    # By splat: what neighbours are compared by, in one place of memory.
-    looks = np.empty((len(there), 8), np.float32)
-    turned = np.empty((len(there), 3), np.float32)
-
-    def note(some: slice) -> None:
-        own = there[some]
-        looks[some, :3] = scene.means.take(own, axis=0)
-        looks[some, 3:6] = scene.sh[own, 0]
-        x, y, z = np.exp(2 * _bounded(scene.log_scales.take(own, axis=0))).T
-        looks[some, 6] = (x + y + z) / 3
-        np.einsum("ij,jk->ik", looks[some, :3], _TURN, out=turned[some])
-
-    _in_blocks(run, note, len(there))
-    least = np.full(len(there), np.inf, np.float32)
-    heir = np.full(len(there), count, np.int32)
-    for means in (looks[:, :3], turned):
-        order = morton_order(means, run)
-        stays = is_left[order]
-        curve, gone, places = order[stays], order[~stays], np.cumsum(stays)[~stays]
-
-        def look(some: slice, curve: _Indices = curve, gone: _Indices = gone, places: _Indices = places) -> None:
-            own, place = gone[some], places[some]
-            first = max(int(place[0]) - _NEAR, 0)
-            near = curve[first : int(place[-1]) + _NEAR]
-            others = np.ascontiguousarray(looks.take(near, axis=0).T)
-            mine = np.ascontiguousarray(looks.take(own, axis=0).T)
-            steps = place - first + np.arange(-_NEAR, _NEAR)[:, None]
-
-            def squares(coordinates: range) -> NDArray[np.float32]:
-                found = np.zeros(steps.shape, np.float32)
-                for each in coordinates:
-                    apart = others[each].take(steps, mode="clip")
-                    apart -= mine[each]
-                    apart *= apart
-                    found += apart
-                return found
-
-            with np.errstate(over="ignore"):
-                cost = squares(range(3))
-                cost /= others[6].take(steps, mode="clip") + mine[6]
-                cost[cost > _FAR**2] = np.inf
-                cost += _COLOUR * squares(range(3, 6))
-            best = cost.argmin(axis=0), np.arange(len(own))
-            better = cost[best] < least[own]
-            least[own[better]] = cost[best][better]
-            heir[own[better]] = there[near.take(steps[best][better], mode="clip")]
-
-        _in_blocks(run, look, len(gone))
-    heir[is_left] = there[is_left]
-    if before is None:
-        return heir
-    found = np.full(count + 1, count, np.int32)
-    found[there] = heir
-    return found.take(before)
-
-
-def merged(
-    scene: Scene, left: _Indices, heirs: Heirs, importance: _F32, run: Run = map, become: Scene | None = None
-) -> Scene:
-    """Splats that are left, each with what it and those that it takes over were together.
+def merged(scene: Scene, left: _Indices, importance: _F32, run: Run = map, become: Scene | None = None) -> Scene:
+    """Splats that are left, each with what it and the removed ones nearest to it were together.
 
     Of each group the centre, the covariance, and the coefficients are the weighted means; the opacity is such that it
     covers as much as before. Only those are merged that the module's text names.
@@ -203,14 +90,11 @@ def merged(
     Args:
         scene: N splats.
         left: (n,) numbers of those that are left, ascending.
-        heirs: (N,) who takes over whom (:func:`heirs_of`).
         importance: (N,) float32, what pictures show of each, in any unit.
         run: in place of :func:`map`, to work with several threads.
         become: the splats that are left as they are by now, which those stay that are not merged; None: as they were.
     """
-    places = np.full(len(scene) + 1, len(left), np.int32)
-    places[left] = np.arange(len(left), dtype=np.int32)
-    group = places.take(heirs)
+    group = _groups(scene, left, run)
     covered = np.empty(len(scene), np.float32)
 
     def cover(some: slice) -> None:
@@ -271,6 +155,63 @@ def merged(
         first += number
     list(run(merge, blocks))
     return found
+
+
+def _groups(scene: Scene, left: _Indices, run: Run) -> NDArray[np.int32]:
+    """(N,) for each splat the place in ``left`` of the one that takes it over, or its own there; n if none does.
+
+    The best of the neighbours along two Morton curves, one of which is turned, by distance, size and colour.
+    """
+    group = np.full(len(scene), len(left), np.int32)
+    group[left] = np.arange(len(left), dtype=np.int32)
+    is_left = group < len(left)
+    # By splat: what neighbours are compared by, in one place of memory.
+    looks = np.empty((len(scene), 8), np.float32)
+    turned = np.empty((len(scene), 3), np.float32)
+
+    def note(some: slice) -> None:
+        looks[some, :3] = scene.means[some]
+        looks[some, 3:6] = scene.sh[some, 0]
+        x, y, z = np.exp(2 * _bounded(scene.log_scales[some])).T
+        looks[some, 6] = (x + y + z) / 3
+        np.einsum("ij,jk->ik", looks[some, :3], _TURN, out=turned[some])
+
+    _in_blocks(run, note, len(scene))
+    least = np.full(len(scene), np.inf, np.float32)
+    for means in (looks[:, :3], turned):
+        order = morton_order(means, run)
+        stays = is_left[order]
+        curve, gone, places = order[stays], order[~stays], np.cumsum(stays)[~stays]
+
+        def look(some: slice, curve: _Indices = curve, gone: _Indices = gone, places: _Indices = places) -> None:
+            own, place = gone[some], places[some]
+            first = max(int(place[0]) - _NEAR, 0)
+            near = curve[first : int(place[-1]) + _NEAR]
+            others = np.ascontiguousarray(looks.take(near, axis=0).T)
+            mine = np.ascontiguousarray(looks.take(own, axis=0).T)
+            steps = place - first + np.arange(-_NEAR, _NEAR)[:, None]
+
+            def squares(coordinates: range) -> NDArray[np.float32]:
+                found = np.zeros(steps.shape, np.float32)
+                for each in coordinates:
+                    apart = others[each].take(steps, mode="clip")
+                    apart -= mine[each]
+                    apart *= apart
+                    found += apart
+                return found
+
+            with np.errstate(over="ignore"):
+                cost = squares(range(3))
+                cost /= others[6].take(steps, mode="clip") + mine[6]
+                cost[cost > _FAR**2] = np.inf
+                cost += _COLOUR * squares(range(3, 6))
+            best = cost.argmin(axis=0), np.arange(len(own))
+            better = cost[best] < least[own]
+            least[own[better]] = cost[best][better]
+            group[own[better]] = group[near.take(steps[best][better], mode="clip")]
+
+        _in_blocks(run, look, len(gone))
+    return group
 
 
 def _in_blocks(run: Run, work: Callable[[slice], None], count: int) -> None:

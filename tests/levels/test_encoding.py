@@ -124,8 +124,6 @@ def test_a_level_keeps_some_of_the_splats_of_the_next_finer_one_the_same_each_ti
     assert np.isin(coarser.order, finer.order).all()
     assert len(finer.importance) == len(plush_excerpt)
     assert coarser.importance is finer.importance
-    assert finer.heirs is None
-    assert np.isin(coarser.heirs, [*coarser.order, len(plush_excerpt)]).all()
 
 
 @pytest.mark.parametrize(("preset", "steps"), [("fast", STEPS["cpu"] // 4), ("paper", 0)])
@@ -140,7 +138,7 @@ def test_what_is_left_of_some_splats_shows_the_whole_scene(plush_excerpt, plush_
     """Its colours make up for those that could not be kept."""
     among = np.arange(0, len(plush_excerpt), 3)
     options = EncodeOptions().changed(prune={"count": len(among)}, between={"views": 0.0})
-    finer = SimpleNamespace(order=among[::-1], importance=None, heirs=None)
+    finer = SimpleNamespace(order=among[::-1], importance=None)
     found = encode(plush_excerpt, plush_excerpt_cameras, options, device=device, finer=finer)
     assert np.array_equal(np.sort(found.order), among)
     views = held_out(plush_excerpt_cameras)
@@ -156,7 +154,6 @@ def test_what_is_left_of_some_splats_shows_the_whole_scene(plush_excerpt, plush_
 def test_levels_are_the_same_on_workers_that_have_what_their_views_see(monkeypatch):
     monkeypatch.setattr(visibility, "LEAST_SPLATS", 10)
     monkeypatch.setattr(splat_groups, "LARGEST", 16)
-    monkeypatch.setattr("potr_cl.stages.merge._MANY", 1)
     scene, cameras = street(houses=6, splats=300)
     options = EncodeOptions.for_preset(
         "best", prune={"iterations": 4, "keep": 0.6}, between={"views": 0}, refit={"steps": 2}, levels=3
