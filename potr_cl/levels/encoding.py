@@ -2,8 +2,10 @@
 
 A level is one run of the stages: with a number of splats to keep, and smaller views. It keeps some of the splats that
 the next finer level has kept, begins with them as they are in the full scene, and is fitted and re-fitted to the full
-scene's pictures. Levels are made one after the other, and what is kept of each is the file that it became; while these
-become one, the scenes that they hold are kept, too: together no more than twice the finest.
+scene's pictures. What views show of each splat of the scene the finest one has measured for all.
+
+Levels are made one after the other, and what is kept of each is the file that it became; while these become one, the
+scenes that they hold are kept, too: together no more than twice the finest.
 """
 
 from __future__ import annotations
@@ -14,8 +16,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from typing import Any
-
-import numpy as np
 
 from potr_cl.errors import UsageError
 from potr_cl.levels.errors import MeasuredErrors, measuring_views
@@ -85,7 +85,7 @@ def encode_levels(
     def one(views: Sequence[Camera] | None, how: EncodeOptions, finer: Encoded | None = None) -> Encoded:
         return encode(
             scene, views, how, progress, device, kept=kept, in_frame=in_frame or finer is not None, pool=pool,
-            tell=tell, among=None if finer is None else np.sort(finer.order),
+            tell=tell, finer=finer,
         )  # fmt: skip
 
     first = made = one(cameras, single)

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 
 import numpy as np
-from numpy.typing import NDArray
 
 from potr_cl.host.mapped import bounded
 from potr_cl.host.threads import in_background
@@ -40,7 +39,7 @@ def encode(
     in_frame: bool = False,
     pool: Pool | None = None,
     tell: Callable[[str], None] | None = None,
-    among: NDArray[np.int64] | None = None,
+    finer: Encoded | None = None,
 ) -> Encoded:
     """Encode a scene.
 
@@ -57,8 +56,8 @@ def encode(
         in_frame: whether :func:`check_frame` has found the cameras to be in the scene's frame.
         pool: workers that views are shared out to, of which ``device`` is the first; None: the device does all.
         tell: told a line for every round of a fit.
-        among: (n,) the numbers, ascending, of the splats that may be kept, whose colours are re-fitted to the whole
-            scene's pictures all the same; None: all.
+        finer: the next finer level of detail, where this is to be a coarser one: only splats that it has may be kept,
+            but colours are re-fitted to the whole scene's pictures all the same. None: all may be kept.
 
     Raises:
         UsageError: options out of range, cameras without a training view, or cameras that are probably not in the
@@ -81,7 +80,9 @@ def encode(
                 kept = stack.enter_context(ResidentScene(device, scene, options.memory, others))
         run = Run(options, watch, device, kept, pool)
         start = State.of(scene, train_views(cameras) if cameras else [])
-        encoded = run.finished(run.stages(start if among is None else start.keeping(among)))
+        if finer is not None:
+            start = start.keeping(np.sort(finer.order)).with_results(importance=finer.importance)
+        encoded = run.finished(run.stages(start))
     tell_left_out(scene, encoded)
     return encoded
 

@@ -67,6 +67,7 @@ class Encoded:
         parameters: the hyper-parameters that the stages took.
         shared: who did the work, where views were shared out.
         left_out: how many of the scene's SH degrees, the highest ones, the file's format has left out.
+        importance: of the source's splats, for a coarser level (:class:`potr_cl.stages.stage.Results`).
         levels: of detail, the finest first, where there are several; splats, order and stages are of that one.
         report: of :func:`potr_cl.encode`, ready for JSON; printed, it is what the command ``encode`` prints.
     """
@@ -87,6 +88,7 @@ class Encoded:
     parameters: HyperParameters
     shared: SharedOut | None = None
     left_out: int = 0
+    importance: NDArray[np.float32] | None = None
     levels: tuple[LevelMade, ...] = ()
     report: dict[str, Any] = field(default_factory=dict)
 

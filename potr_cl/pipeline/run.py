@@ -286,6 +286,7 @@ class Run:
             shared=None if self._pool is None else SharedOut.by(self._pool, self._before),
             parameters=priced(as_done(self._options, state).parameters, state),
             left_out=0 if coded.sh_degree is None else state.scene.sh_degree - coded.sh_degree,
+            importance=state.results.importance,
         )
 
 

@@ -8,27 +8,30 @@ was that of removed ones, or where views show little; and all stay as they were 
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.host.threads import Run, thread_pool
-from potr_cl.model.order import ascending, morton_codes
+from potr_cl.model.order import morton_order, over_ranges
 from potr_cl.model.scene import Scene, opacities_of
 from potr_cl.model.spherical_harmonics import quaternions_of, rotation_matrices
 from potr_cl.stages.fitting.fit import Sight, held_out_error
-from potr_cl.stages.pruning.helpers import measurement
-from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.stages.stage import Stage, State, Workbench, option
 from potr_cl.views.targets import targets_of
 
 _Indices = NDArray[np.int64]
 _F64 = NDArray[np.float64]
+_F32 = NDArray[np.float32]
 
-#: Neighbours of a removed splat that may take it over, on either side of it along a curve; and by how much the second
-#: curve is turned, in radians: what is far apart on one is mostly near on the other.
-_NEAR, _TURNED = 4, 0.7
+#: Neighbours of a removed splat that may take it over, on either side of it along a curve.
+_NEAR = 4
+#: By which the second curve is turned, about two axes: what is far apart on one is mostly near on the other.
+_COS, _SIN = math.cos(0.7), math.sin(0.7)
+_TURN = np.array([[_COS, -_SIN, 0], [_COS * _SIN, _COS * _COS, -_SIN], [_SIN * _SIN, _SIN * _COS, _COS]], np.float32)
 #: What a squared difference of constant coefficients counts against a squared distance in parts of the splats' sizes.
 _COLOUR = 3.0
 #: A splat is merged if its removed neighbours make up this part of what views show of the group; or if views show less
@@ -62,13 +65,11 @@ class Merge(Stage):
 
     def run(self, state: State, bench: Workbench) -> State:
         """The state with merged splats; as it was where pictures become much worse, and where nobody can tell."""
-        none_held_out = len(state.views) - state.added < 2
-        if len(state.scene) == len(state.source) or none_held_out or state.results.unresolved is not None:
+        importance = state.results.importance
+        none_held_out = len(state.views) - state.added < 2 or state.results.unresolved is not None
+        if len(state.scene) == len(state.source) or none_held_out or importance is None:
             return state
         bench.progress("merge", 0.0)
-        whole = replace(state, scene=state.source, survivors=np.arange(len(state.source)), cut=None)
-        with measurement(whole, bench, SweepOptions(memory=bench.memory), state.visibility) as removal:
-            _, importance = removal.measure()
         with thread_pool(bench.threads) as pool:
             scene = merged(state.source, state.survivors, importance, pool.map, state.scene)
         bench.progress("merge", 0.5)
@@ -80,7 +81,7 @@ class Merge(Stage):
         return replace(state, scene=scene, geometry=None) if errors[1] < _WORSE * errors[0] else state
 
 
-def merged(scene: Scene, left: _Indices, importance: _F64, run: Run = map, become: Scene | None = None) -> Scene:
+def merged(scene: Scene, left: _Indices, importance: _F32, run: Run = map, become: Scene | None = None) -> Scene:
     """Splats that are left, each with what it and the removed ones nearest to it were together.
 
     Of each group the centre, the covariance, and the coefficients are the weighted means; the opacity is such that it
@@ -89,109 +90,138 @@ def merged(scene: Scene, left: _Indices, importance: _F64, run: Run = map, becom
     Args:
         scene: N splats.
         left: (n,) numbers of those that are left, ascending.
-        importance: (N,) what pictures show of each, in any unit.
+        importance: (N,) float32, what pictures show of each, in any unit.
         run: in place of :func:`map`, to work with several threads.
         become: the splats that are left as they are by now, which those stay that are not merged; None: as they were.
     """
     group = _groups(scene, left, run)
-    members = ascending(group, run)
-    counts = np.bincount(group, minlength=len(left) + 1)[:-1]
-    starts = np.cumsum(counts) - counts
-    covered = np.empty(len(scene))
+    covered = np.empty(len(scene), np.float32)
 
-    def cover(start: int) -> None:
-        some = slice(start, start + _BLOCK)
+    def cover(some: slice) -> None:
         opacities = opacities_of(scene.opacity_logits[some])
         covered[some] = np.where(opacities < _DRAWN, 0, opacities * _area(scene.log_scales[some]))
 
-    list(run(cover, range(0, len(scene), _BLOCK)))
-    usual = importance.sum() / max(float(covered.sum()), 1e-300) or 1.0
-    shown = np.bincount(group, importance, len(left) + 1)[:-1]
-    wanted = shown - importance[left] > _MISSED * shown
-    wanted |= shown < _HARDLY_SHOWN * usual * np.bincount(group, covered, len(left) + 1)[:-1]
-    wanted &= counts > 1
+    def in_groups(members: _Indices, _: int) -> None:
+        members[:] = members[np.argsort(group[members], kind="stable")]
+
+    _in_blocks(run, cover, len(scene))
+    members = over_ranges(group, in_groups, run)
+    counts = np.bincount(group, minlength=len(left) + 1)[:-1]
+    starts = np.cumsum(counts) - counts
+    usual = float(importance.sum(dtype=np.float64)) / max(float(covered.sum(dtype=np.float64)), 1e-300) or 1.0
     found = scene.subset(left) if become is None else become.subset(np.arange(len(become)))
+    coefficients = scene.sh.reshape(len(scene), -1)
 
-    def merge(some: slice) -> None:
-        several = some.start + np.flatnonzero(wanted[some])
-        if not len(several):
-            return
-        ends = np.cumsum(counts[several])
-        firsts = ends - counts[several]
-        own = members[np.repeat(starts[several] - firsts, counts[several]) + np.arange(ends[-1])]
-        weights = importance[own] + _UNSEEN * usual * covered[own]
-        weights /= np.repeat(np.maximum(np.add.reduceat(weights, firsts), 1e-300), counts[several])
+    def merge(several: _Indices) -> None:
+        """Groups of the same size, by their places among those that are left."""
+        own = members.take(starts[several, None] + np.arange(counts[several[0]]))
+        shows, covers = (values.take(own).astype(np.float64) for values in (importance, covered))
+        shown, cover = shows.sum(axis=1), covers.sum(axis=1)
+        wanted = shown - importance[left[several]] > _MISSED * shown
+        wanted |= shown < _HARDLY_SHOWN * usual * cover
+        several, own, cover = several[wanted], own[wanted], cover[wanted]
+        weights = shows[wanted] + _UNSEEN * usual * covers[wanted]
+        weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
 
-        def mean(values: NDArray[np.floating]) -> _F64:
-            return np.add.reduceat(weights.reshape(-1, *[1] * (values.ndim - 1)) * values, firsts)
+        def mean(values: NDArray[np.floating]) -> NDArray[np.floating]:
+            """Of (groups, members, k) values."""
+            found: NDArray[np.floating] = np.einsum("gm,gmk->gk", weights.astype(values.dtype), values)
+            return found
 
-        centres = scene.means[own].astype(np.float64)
+        centres = scene.means.take(own, axis=0).astype(np.float64)
         middle = mean(centres)
-        off = centres - np.repeat(middle, counts[several], axis=0)
-        quaternions = scene.quaternions[own].astype(np.float64)
+        off = centres - middle[:, None]
+        quaternions = scene.quaternions.take(own.ravel(), axis=0).astype(np.float64)
         axes = rotation_matrices(quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True))
-        axes *= np.exp(_bounded(scene.log_scales[own]))[:, None]
-        variances, turned = np.linalg.eigh(mean(axes @ axes.transpose(0, 2, 1) + off[:, :, None] * off[:, None]))
+        axes *= np.exp(_bounded(scene.log_scales.take(own.ravel(), axis=0)))[:, None]
+        covariances = (axes @ axes.transpose(0, 2, 1)).reshape(*own.shape, 9)
+        covariances += (off[..., None] * off[..., None, :]).reshape(covariances.shape)
+        variances, turned = np.linalg.eigh(mean(covariances).reshape(-1, 3, 3))
         turned[np.linalg.det(turned) < 0, :, 0] *= -1
         found.means[several] = middle
         found.log_scales[several] = 0.5 * np.log(np.maximum(variances, 1e-30))
         found.quaternions[several] = quaternions_of(turned)
-        found.sh[several] = mean(scene.sh[own])
-        opacity = np.add.reduceat(covered[own], firsts) / _area(found.log_scales[several])
-        opacity = np.clip(opacity, 1 / 255, _OPACITY)
+        found.sh[several] = mean(coefficients.take(own, axis=0)).reshape(-1, *scene.sh.shape[1:])
+        opacity = np.clip(cover / _area(found.log_scales[several]), 1 / 255, _OPACITY)
         found.opacity_logits[several] = np.log(opacity / (1 - opacity))
 
-    # So many members at a time, however few splats are left.
-    ends = np.searchsorted(np.cumsum(counts), np.arange(_BLOCK, counts.sum(), _BLOCK))
-    cuts = np.unique([0, *ends, len(left)]).tolist()
-    list(run(merge, map(slice, cuts[:-1], cuts[1:])))
+    # So many members at a time.
+    by_size = np.flatnonzero(counts > 1)
+    sizes = counts[by_size]
+    by_size = by_size[np.argsort(sizes.astype(np.min_scalar_type(counts.max())), kind="stable")]
+    blocks, first = list[_Indices](), 0
+    for size, number in zip(*(found.tolist() for found in np.unique_counts(sizes)), strict=True):
+        blocks += np.array_split(by_size[first : first + number], min(-(-number * size // _BLOCK), number))
+        first += number
+    list(run(merge, blocks))
     return found
 
 
-def _groups(scene: Scene, left: _Indices, run: Run) -> _Indices:
+def _groups(scene: Scene, left: _Indices, run: Run) -> NDArray[np.int32]:
     """(N,) for each splat the place in ``left`` of the one that takes it over, or its own there; n if none does.
 
     The best of the neighbours along two Morton curves, one of which is turned, by distance, size and colour.
     """
-    group = np.full(len(scene), -1, np.int64)
-    group[left] = np.arange(len(left))
-    gone = np.flatnonzero(group < 0)
-    least = np.full(len(gone), np.inf)
-    sizes = np.empty(len(scene), np.float32)
+    group = np.full(len(scene), len(left), np.int32)
+    group[left] = np.arange(len(left), dtype=np.int32)
+    is_left = group < len(left)
+    # By splat: what neighbours are compared by, in one place of memory.
+    looks = np.empty((len(scene), 8), np.float32)
+    turned = np.empty((len(scene), 3), np.float32)
 
-    def measure(start: int) -> None:
-        some = slice(start, start + _BLOCK)
-        sizes[some] = np.exp(2 * _bounded(scene.log_scales[some])).mean(axis=1)
+    def note(some: slice) -> None:
+        looks[some, :3] = scene.means[some]
+        looks[some, 3:6] = scene.sh[some, 0]
+        x, y, z = np.exp(2 * _bounded(scene.log_scales[some])).T
+        looks[some, 6] = (x + y + z) / 3
+        np.einsum("ij,jk->ik", looks[some, :3], _TURN, out=turned[some])
 
-    list(run(measure, range(0, len(scene), _BLOCK)))
-    cos, sin = np.cos(_TURNED), np.sin(_TURNED)
-    turned = np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]]) @ np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
-    for means in (scene.means, scene.means @ turned.astype(np.float32)):
-        codes = morton_codes(means, run)
-        order = left[ascending(codes[left], run)]
-        places = np.searchsorted(codes[order], codes[gone])
+    _in_blocks(run, note, len(scene))
+    least = np.full(len(scene), np.inf, np.float32)
+    for means in (looks[:, :3], turned):
+        order = morton_order(means, run)
+        stays = is_left[order]
+        curve, gone, places = order[stays], order[~stays], np.cumsum(stays)[~stays]
 
-        def look(start: int, order: _Indices = order, places: _Indices = places) -> None:
-            some = slice(start, start + _BLOCK)
+        def look(some: slice, curve: _Indices = curve, gone: _Indices = gone, places: _Indices = places) -> None:
             own, place = gone[some], places[some]
-            for step in range(-_NEAR, _NEAR):
-                other = order[np.clip(place + step, 0, len(order) - 1)]
-                apart = np.square(scene.means[own].astype(np.float64) - scene.means[other]).sum(axis=1)
-                cost = apart / (sizes[own] + sizes[other])
-                cost[cost > _FAR**2] = np.inf
-                cost += _COLOUR * np.square(scene.sh[own, 0].astype(np.float64) - scene.sh[other, 0]).sum(axis=1)
-                better = cost < least[some]
-                least[some][better] = cost[better]
-                group[own[better]] = group[other[better]]
+            first = max(int(place[0]) - _NEAR, 0)
+            near = curve[first : int(place[-1]) + _NEAR]
+            others = np.ascontiguousarray(looks.take(near, axis=0).T)
+            mine = np.ascontiguousarray(looks.take(own, axis=0).T)
+            steps = place - first + np.arange(-_NEAR, _NEAR)[:, None]
 
-        list(run(look, range(0, len(gone), _BLOCK)))
-    group[group < 0] = len(left)
+            def squares(coordinates: range) -> NDArray[np.float32]:
+                found = np.zeros(steps.shape, np.float32)
+                for each in coordinates:
+                    apart = others[each].take(steps, mode="clip")
+                    apart -= mine[each]
+                    apart *= apart
+                    found += apart
+                return found
+
+            with np.errstate(over="ignore"):
+                cost = squares(range(3))
+                cost /= others[6].take(steps, mode="clip") + mine[6]
+                cost[cost > _FAR**2] = np.inf
+                cost += _COLOUR * squares(range(3, 6))
+            best = cost.argmin(axis=0), np.arange(len(own))
+            better = cost[best] < least[own]
+            least[own[better]] = cost[best][better]
+            group[own[better]] = group[near.take(steps[best][better], mode="clip")]
+
+        _in_blocks(run, look, len(gone))
     return group
+
+
+def _in_blocks(run: Run, work: Callable[[slice], None], count: int) -> None:
+    list(run(work, (slice(start, start + _BLOCK) for start in range(0, count, _BLOCK))))
 
 
 def _area(log_scales: NDArray[np.floating]) -> _F64:
     """(n,) of ellipsoids where they are seen as large as can be, but for a factor."""
-    found: _F64 = np.exp(np.sort(_bounded(log_scales), axis=1)[:, 1:].sum(axis=1))
+    x, y, z = _bounded(log_scales).T
+    found: _F64 = np.exp(x + y + z - np.minimum(np.minimum(x, y), z))
     return found
 
 

@@ -146,8 +146,8 @@ class Prune(Stage):
     def run(self, state: State, bench: Workbench) -> State:
         """Remove splats, and leave a :class:`potr_cl.stages.pruning.schedule.Pruned` in ``results``.
 
-        And what no view sees; the price of a splat, where the number of splats is not given; and the shares, where
-        workers elsewhere get what their views see.
+        And what no view sees; the price of a splat, where the number of splats is not given; what views show of each
+        splat, where none had gone before; and the shares, where workers elsewhere get what their views see.
         """
         if state.results.unresolved is not None:
             return self._guarded(state, bench, state.results.unresolved)
@@ -174,9 +174,8 @@ class Prune(Stage):
         seen = np.flatnonzero(~hidden)
         if not len(seen):
             everything = np.arange(splats)
-            return told.with_results(
-                pruned=Pruned(splats, np.full(splats, -1, np.int32), 0, lambda: Course(everything))
-            )
+            nothing = np.zeros(splats, np.float32)
+            return _knowing(told, Pruned(splats, np.full(splats, -1, np.int32), 0, nothing, lambda: Course(everything)))
         if visibility is not None:
             visibility = visibility_of_large(state.scene.uncoloured().subset(seen), state.views)
         return self._pruned(told, bench, visibility, seen, hidden)
@@ -273,7 +272,7 @@ class Prune(Stage):
         """The state after pruning; ``seen`` and ``hidden`` as of :meth:`_pruned`."""
         survivors = pruned.survivors
         if hidden is None or seen is None:
-            left = course.left(survivors).with_results(pruned=pruned)
+            left = _knowing(course.left(survivors), pruned)
             return left if hidden is None else without_directions(left, hidden[survivors])
         of_whole = in_background(as_of_whole, seen, hidden, pruned)
         kept = hidden.copy()
@@ -281,7 +280,7 @@ class Prune(Stage):
         numbers = np.flatnonzero(kept)
         # Nobody looked at the hidden ones from any direction.
         left = without_directions(course.having(numbers), hidden[numbers])
-        return left.with_results(pruned=of_whole.result())
+        return _knowing(left, of_whole.result())
 
 
 def part_of_time(iterations: float, stays: bool) -> float:
@@ -292,6 +291,12 @@ def part_of_time(iterations: float, stays: bool) -> float:
         stays: whether views stay prepared.
     """
     return _FIRST + (1 - _FIRST) * (1 - (1 - iterations) ** _FEWER) if stays else iterations
+
+
+def _knowing(state: State, pruned: Pruned) -> State:
+    """The state that knows what pruning did, and what it has measured, if that was the whole source."""
+    whole = len(pruned.importance) == len(state.source)
+    return state.with_results(pruned=pruned, importance=pruned.importance if whole else state.results.importance)
 
 
 def _dealt(state: State, seen: NDArray[np.int64] | None, pool: Pool, visibility: Visibility) -> ViewShares:

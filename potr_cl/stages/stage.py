@@ -62,6 +62,7 @@ class Results:
         price: ΔMSE below which a splat has gone.
         shares: who of the workers elsewhere does which views, with what these see.
         pruned: the order in which splats went.
+        importance: (N,) float32, I_k of each splat of the source before any went, in the finest level's views.
         fitted: the fit, or why there is none.
         chosen: the parameters that a fit chose coefficients with.
         compacted: whether colours are sparse already.
@@ -77,6 +78,7 @@ class Results:
     price: float | None = None
     shares: ViewShares | None = None
     pruned: Pruned | None = None
+    importance: NDArray[np.float32] | None = None
     fitted: Fitted | LeftOut | None = None
     chosen: HyperParameters | None = None
     compacted: bool = False

@@ -197,6 +197,8 @@ def as_of_whole(seen: NDArray[np.int64], hidden: NDArray[np.bool_], pruned: Prun
     removed = len(seen) - pruned.kept
     iteration_of = np.full(len(unseen) + len(seen), -1, np.int32)
     iteration_of[seen] = pruned.iteration_of
+    importance = np.zeros(len(iteration_of), np.float32)
+    importance[seen] = pruned.importance
 
     def course() -> Course:
         order = seen[pruned.order]
@@ -205,4 +207,5 @@ def as_of_whole(seen: NDArray[np.int64], hidden: NDArray[np.bool_], pruned: Prun
             tuple(dataclasses.replace(each, left=each.left + len(unseen)) for each in pruned.history),
         )
 
-    return Pruned(pruned.kept + len(unseen), iteration_of, pruned.iterations, lru_cache(maxsize=1)(course))
+    kept = pruned.kept + len(unseen)
+    return Pruned(kept, iteration_of, pruned.iterations, importance, lru_cache(maxsize=1)(course))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing, nullcontext
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -121,6 +122,8 @@ def test_a_level_keeps_some_of_the_splats_of_the_next_finer_one_the_same_each_ti
     assert [len(level.order) for level in made] == [200, 100] * 2
     finer, coarser = made[:2]
     assert np.isin(coarser.order, finer.order).all()
+    assert len(finer.importance) == len(plush_excerpt)
+    assert coarser.importance is finer.importance
 
 
 @pytest.mark.parametrize(("preset", "steps"), [("fast", STEPS["cpu"] // 4), ("paper", 0)])
@@ -135,7 +138,8 @@ def test_what_is_left_of_some_splats_shows_the_whole_scene(plush_excerpt, plush_
     """Its colours make up for those that could not be kept."""
     among = np.arange(0, len(plush_excerpt), 3)
     options = EncodeOptions().changed(prune={"count": len(among)}, between={"views": 0.0})
-    found = encode(plush_excerpt, plush_excerpt_cameras, options, device=device, among=among)
+    finer = SimpleNamespace(order=among[::-1], importance=None)
+    found = encode(plush_excerpt, plush_excerpt_cameras, options, device=device, finer=finer)
     assert np.array_equal(np.sort(found.order), among)
     views = held_out(plush_excerpt_cameras)
     error, plain = (

@@ -15,7 +15,7 @@ from potr_cl.model.scene import Scene
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.compare import mean_view
 from potr_cl.quality.judging import Judging, Looks
-from potr_cl.stages.merge import Merge, merged
+from potr_cl.stages.merge import Merge, _groups, merged
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.stage import State, Workbench
 from tests.reference.scenes import covariances, random_scene
@@ -27,13 +27,17 @@ AT = np.array([[0, 0, 0], [0.01, 0, 0], [0, 0.02, 0], [9, 0, 0], [9, 0.01, 0], [
 
 def two_groups() -> Scene:
     scene = random_scene(6, 1, seed=4)
-    return dataclasses.replace(scene, means=AT, log_scales=scene.log_scales + 1, sh=np.float32(0.1) * scene.sh)
+    return dataclasses.replace(scene, means=AT.copy(), log_scales=scene.log_scales + 1, sh=np.float32(0.1) * scene.sh)
+
+
+def merge(scene, left, importance, run=map, become=None):
+    return merged(scene, left, np.asarray(importance, np.float32), run, become)
 
 
 def test_a_splat_becomes_what_its_group_was_together():
     scene = two_groups()
     importance = np.array([0.5, 2.0, 1.5, 8.0, 1.0, 1.0])  # of the first group removed ones have most
-    found = merged(scene, LEFT, importance)
+    found = merge(scene, LEFT, importance)
     areas = np.exp(np.sort(scene.log_scales.astype(np.float64), axis=1)[:, 1:].sum(axis=1))
     covered = areas / (1 + np.exp(-scene.opacity_logits.astype(np.float64)))
     weights = importance + 0.1 * importance.sum() / covered.sum() * covered
@@ -53,7 +57,7 @@ def test_a_splat_becomes_what_its_group_was_together():
 def test_where_views_show_little_all_are_merged():
     scene = two_groups()
     importance = np.array([1e-6, 1e-9, 1e-9, 8.0, 1.0, 1.0])
-    found = merged(scene, LEFT, importance)
+    found = merge(scene, LEFT, importance)
     assert not np.array_equal(found.means[0], AT[0])
     assert np.array_equal(found.means[1], AT[3])
 
@@ -62,10 +66,10 @@ def test_neither_threads_nor_the_length_of_quaternions_matter():
     scene = random_scene(3000, 1, seed=2)
     left = np.arange(0, len(scene), 3)
     importance = np.random.default_rng(1).random(len(scene)) ** 4
-    found = merged(scene, left, importance)
+    found = merge(scene, left, importance)
     with ThreadPoolExecutor(3) as pool:
-        again = merged(scene, left, importance, pool.map)
-    longer = merged(dataclasses.replace(scene, quaternions=4 * scene.quaternions), left, importance)
+        again = merge(scene, left, importance, pool.map)
+    longer = merge(dataclasses.replace(scene, quaternions=4 * scene.quaternions), left, importance)
     changed = (found.means != scene.means[left]).any(axis=1)
     assert 0.2 < changed.mean() < 1
     for one, two, three in zip(found.arrays, again.arrays, longer.arrays, strict=True):
@@ -78,13 +82,36 @@ def test_scales_of_any_size_leave_numbers(log_scale):
     scene = two_groups()
     scene.log_scales[1] = log_scale
     scene.opacity_logits[2] = -120.0
-    found = merged(scene, LEFT, np.array([0.0, 1.0, 0.0, 0.0, 1.0, 1.0]))
+    found = merge(scene, LEFT, np.array([0.0, 1.0, 0.0, 0.0, 1.0, 1.0]))
     assert all(np.isfinite(array).all() for array in found.arrays)
 
 
 def test_of_a_scene_that_nobody_sees_numbers_are_left():
-    found = merged(two_groups(), LEFT, np.zeros(6))
+    found = merge(two_groups(), LEFT, np.zeros(6))
     assert all(np.isfinite(array).all() for array in found.arrays)
+
+
+def test_removed_ones_are_taken_over_by_near_ones_that_are_left():
+    scene = random_scene(3000, 1, seed=2)
+    left = np.arange(0, len(scene), 3)
+    group = _groups(scene, left, map)
+    assert np.array_equal(group[left], np.arange(len(left)))
+    taken = np.flatnonzero(group < len(left))
+    assert len(taken) > 0.9 * len(scene)
+    others = np.random.default_rng(3).permutation(group[taken])
+    near, far = (
+        np.linalg.norm(scene.means[taken] - scene.means[left[places]], axis=1) for places in (group[taken], others)
+    )
+    assert np.median(near) < 0.3 * np.median(far)
+    with ThreadPoolExecutor(3) as pool:
+        assert np.array_equal(_groups(scene, left, pool.map), group)
+
+
+def test_groups_of_many_are_merged():
+    scene = random_scene(40_000, 0, seed=5)
+    scene = dataclasses.replace(scene, means=0.01 * scene.means)
+    found = merge(scene, np.array([7]), np.ones(len(scene)))
+    assert np.allclose(found.means[0], scene.means.mean(axis=0), atol=0.1 * scene.means.std())
 
 
 def pruned(scene, cameras, device):
@@ -95,6 +122,7 @@ def pruned(scene, cameras, device):
 
 def test_the_stage_brings_a_thinned_scene_nearer_to_its_pictures(usual_device, plush_excerpt, plush_excerpt_cameras):
     before, bench = pruned(plush_excerpt, plush_excerpt_cameras, usual_device)
+    assert Merge(on=True).run(before.with_results(importance=None), bench).scene is before.scene
     then = Merge(on=True).run(before, bench)
     assert then is not before
     assert len(then.scene) == len(before.scene)
@@ -109,7 +137,7 @@ def test_where_pictures_become_much_worse_all_stay_as_they_were(
     before, bench = pruned(plush_excerpt, plush_excerpt_cameras, usual_device)
     black = dataclasses.replace(before.scene, opacity_logits=before.scene.opacity_logits - 20)
     monkeypatch.setattr("potr_cl.stages.merge.merged", lambda *_: black)
-    assert Merge(on=True).run(before, bench) is before
+    assert Merge(on=True).run(before, bench).scene is before.scene
 
 
 def test_nothing_is_merged_where_nothing_was_removed(plush_excerpt, plush_excerpt_cameras):
@@ -128,7 +156,7 @@ def test_what_is_far_or_never_drawn_is_taken_over_by_nobody():
     scene = two_groups()
     scene.means[1] = 1e30
     scene.log_scales[2], scene.opacity_logits[2] = 9, -20
-    found = merged(scene, LEFT, np.array([0.5, 2.0, 1e-9, 8.0, 1.0, 1.0]))
+    found = merge(scene, LEFT, np.array([0.5, 2.0, 1e-9, 8.0, 1.0, 1.0]))
     assert np.allclose(found.means[0], AT[0], atol=1e-6)
     assert np.allclose(found.log_scales[0].max(), scene.log_scales[0].max(), atol=1e-3)
 
@@ -136,7 +164,7 @@ def test_what_is_far_or_never_drawn_is_taken_over_by_nobody():
 def test_colours_stay_as_stages_before_have_left_them():
     scene = two_groups()
     by_now = dataclasses.replace(scene.subset(LEFT), sh=np.full((2, 4, 3), 0.25, np.float32))
-    found = merged(scene, LEFT, np.array([0.5, 2.0, 1.5, 8.0, 1.0, 1.0]), become=by_now)
+    found = merge(scene, LEFT, np.array([0.5, 2.0, 1.5, 8.0, 1.0, 1.0]), become=by_now)
     assert (found.sh[1] == 0.25).all()
     assert (found.sh[0] != 0.25).any()
     assert (by_now.sh == 0.25).all()

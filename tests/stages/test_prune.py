@@ -52,6 +52,7 @@ def test_the_seen_ones_are_pruned_as_without_the_others(family_device, both, plu
     assert sorted(both.order[both.order < len(plush_excerpt)]) == sorted(alone.order)
     assert both.pruned.kept == alone.pruned.kept + 300
     assert sorted(both.pruned.order) == list(range(1800))
+    assert np.array_equal(both.importance, [*alone.importance, *[0] * 300])
     np.testing.assert_array_equal(both.pruned.survivors, np.sort(both.order))
     assert both.pruned.history[-1].left == both.pruned.kept
     assert alone.unseen.splats == 0

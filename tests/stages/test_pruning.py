@@ -78,6 +78,7 @@ def test_removes_all_candidates_and_nothing_else():
     assert sorted(pruned.order) == list(range(400))
     assert (pruned.iteration_of[pruned.survivors] == -1).all()
     assert np.concatenate(effects.removed).tolist() == pruned.order[: 400 - pruned.kept].tolist()
+    assert np.array_equal(pruned.importance, np.float32(IMPORTANCES))
     # Every iteration takes about the same share of the importance.
     shares = [IMPORTANCES[gone].sum() for gone in effects.removed]
     assert max(shares) < 1.4 * min(shares)

@@ -51,6 +51,7 @@ def test_the_same_splats_go_as_in_numpy(gpu, plush_excerpt, cameras, decay):
     # Rounding may send one splat more or less at the end of a budget.
     assert abs(found.kept - expected.kept) <= 3
     assert len(np.setxor1d(found.survivors, expected.survivors)) <= 6
+    assert np.array_equal(found.importance, expected.importance)
     assert (np.abs(found.iteration_of - expected.iteration_of) > 0).mean() < 0.01
     assert sweeps == pytest.approx(expected_sweeps, rel=0.02)
     for one, other in zip(found.history, expected.history, strict=True):
@@ -81,6 +82,7 @@ def test_each_iteration_spends_its_budget(gpu, usual, plush_excerpt, cameras):
 @pytest.mark.one_runtime
 def test_order_and_history_fit_the_iterations(usual):
     assert np.sort(usual.order).tolist() == list(range(1500))
+    assert usual.importance.shape == (1500,)
     removed = usual.order[: 1500 - usual.kept]
     assert (np.diff(usual.iteration_of[removed]) >= 0).all()
     assert (usual.iteration_of[usual.survivors] == -1).all()

@@ -69,7 +69,10 @@ class _Controller(Owner):
         removal, options = self._removal, self._options
         left, done, weight = self._splats, 0, 0.0
         for iteration in range(options.iterations):
-            removal.measure_on_device()
+            if iteration == 0:
+                importance = (removal.measure_totals()[:, 1] * removal.fixed_point.units[1]).astype(np.float32)
+            else:
+                removal.measure_on_device()
             weight = options.decay * weight + 1
             gone = self._choose(iteration, weight)
             done = iteration + 1
@@ -81,7 +84,7 @@ class _Controller(Owner):
                 progress(done, max(left, 1))
             if after_iteration is not None:
                 after_iteration(iteration)
-        return self._pruned(done)
+        return self._pruned(done, importance)
 
     def _choose(self, iteration: int, weight: float) -> int:
         """Mark the splats that go in an iteration, and return their number."""
@@ -123,7 +126,7 @@ class _Controller(Owner):
         groups = -(-self._splats // _DIGIT)
         kernel.launch((groups * _DIGIT,), (_DIGIT,))
 
-    def _pruned(self, done: int) -> Pruned:
+    def _pruned(self, done: int, importance: NDArray[np.float32]) -> Pruned:
         device, n = self._device, self._splats
         alive = self._removal.alive.copy()
         smoothed = device.download(self._smoothed, (n,), np.float32)
@@ -138,7 +141,7 @@ class _Controller(Owner):
         left = np.flatnonzero(alive)
         # Others go on with what is left meanwhile.
         course = in_background(self._course, done, iteration, removed, left, smoothed)
-        return Pruned(len(left), iteration, done, course.result)
+        return Pruned(len(left), iteration, done, importance, course.result)
 
     def _course(
         self, done: int, iteration: NDArray[np.int32], removed: np.ndarray, left: Indices, smoothed: NDArray[np.float32]

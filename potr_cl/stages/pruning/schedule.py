@@ -103,12 +103,14 @@ class Pruned:
         kept: number of splats that were kept.
         iteration_of: (N,) int32, the iteration (from 0) in which each splat went; -1 for the kept ones.
         iterations: rounds that were run: fewer than asked for when nothing was left to decide.
+        importance: (N,) float32, I_k of each splat before any went.
         course: gives the course of the run, which takes long to find of millions of splats, and few ask for.
     """
 
     kept: int
     iteration_of: NDArray[np.int32]
     iterations: int
+    importance: NDArray[np.float32]
     course: Callable[[], Course]
 
     @property
@@ -239,6 +241,8 @@ def prune(
     smoothed = Smoothed(options.decay)
     for iteration in range(options.iterations):
         newest, importance = effects.measure()
+        if iteration == 0:
+            at_first = importance.astype(np.float32)
         delta_mse = smoothed.with_(newest)
         if spared is not None:
             delta_mse = np.where(spared, BEYOND, delta_mse)
@@ -260,4 +264,4 @@ def prune(
             after_iteration(iteration)
     kept = alive[ascending(delta_mse[alive])]
     course = Course(np.concatenate([*removed, kept]), tuple(history))
-    return Pruned(len(kept), iteration_of, done, lambda: course)
+    return Pruned(len(kept), iteration_of, done, at_first, lambda: course)
