@@ -181,7 +181,8 @@ def _groups(scene: Scene, left: _Indices, run: Run) -> NDArray[np.int32]:
     for means in (looks[:, :3], turned):
         order = morton_order(means, run)
         stays = is_left[order]
-        curve, gone, places = order[stays], order[~stays], np.cumsum(stays)[~stays]
+        curve, gone = order[stays], order[~stays]
+        places: _Indices = np.cumsum(stays)[~stays]
 
         def look(some: slice, curve: _Indices = curve, gone: _Indices = gone, places: _Indices = places) -> None:
             own, place = gone[some], places[some]
