@@ -134,10 +134,12 @@ def merged(scene: Scene, left: _Indices, importance: _F32, run: Run = map, becom
         quaternions = scene.quaternions.take(own.ravel(), axis=0).astype(np.float64)
         axes = rotation_matrices(quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True))
         axes *= np.exp(_bounded(scene.log_scales.take(own.ravel(), axis=0)))[:, None]
-        covariances = (axes @ axes.transpose(0, 2, 1)).reshape(*own.shape, 9)
+        # Not by BLAS, whose calls for so small matrices wait for each other's threads.
+        covariances = np.einsum("nij,nkj->nik", axes, axes).reshape(*own.shape, 9)
         covariances += (off[..., None] * off[..., None, :]).reshape(covariances.shape)
         variances, turned = np.linalg.eigh(mean(covariances).reshape(-1, 3, 3))
-        turned[np.linalg.det(turned) < 0, :, 0] *= -1
+        first, second, third = turned.transpose(2, 0, 1)
+        turned[(np.cross(first, second) * third).sum(axis=1) < 0, :, 0] *= -1
         found.means[several] = middle
         found.log_scales[several] = 0.5 * np.log(np.maximum(variances, 1e-30))
         found.quaternions[several] = quaternions_of(turned)
