@@ -57,7 +57,7 @@ def rows_of_centres(centres: FloatArray) -> FloatArray:
     """
     count, groups, coordinates = centres.shape
     rows = np.zeros((count, width_of(groups, coordinates)), np.float32)
-    rows[:, :groups] = np.square(centres.astype(np.float64)).sum(axis=2)
+    rows[:, :groups] = np.einsum("kgc,kgc->kg", centres, centres, dtype=np.float64)
     rows[:, groups : groups * (1 + coordinates)] = centres.reshape(count, -1)
     return rows
 

@@ -103,8 +103,8 @@ class Sog(Output):
 
         def arrange(start: int) -> None:
             some = slice(start, start + _BLOCK)
-            points[some] = sh.take(order[some], axis=0)[:, 1:]
-            weights[some] = bits.take(order[some], axis=0)[:, 1:]
+            points[some] = sh[order[some], 1:]  # take() would make a copy of all: each coefficient is contiguous
+            weights[some] = bits[order[some], 1:]
 
         with thread_pool(request.threads) as pool:
             list(pool.map(arrange, range(0, len(sh), _BLOCK)))
