@@ -74,8 +74,8 @@ def sweep(kernels, grouping="whole", tolerance=0.0, residency="all", workers="on
     options = SweepOptions(tolerance, memory=RESIDENCY[residency])
     visibility = None if grouping == "whole" else Visibility.of(scene, cameras)
     with ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
-        if grouping == "by view":  # as a GPU with memory of its own does
-            patch.setattr(resident, "fits_whole", lambda device, scene: True)
+        # A GPU with memory of its own looks at each view by itself.
+        patch.setattr(resident, "fits_whole", lambda device, scene: grouping == "by view")
         pool = None
         if count > 1:
             pool = stack.enter_context((ElsewherePool if elsewhere else HostPool)(devices))

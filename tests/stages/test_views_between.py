@@ -66,7 +66,7 @@ def added(device, scene, views, between: Between | None = None, **changes) -> tu
 def test_a_scene_of_which_parts_are_seen_by_few_views_gets_more(usual_device, plush_excerpt, plush_excerpt_cameras):
     given = train_views(plush_excerpt_cameras)
     count, state = added(usual_device, plush_excerpt, given)
-    assert 0 < count <= 2 * len(given)
+    assert 0 < count <= 5 * len(given)
     assert state.views[: len(given)] == tuple(given)
     assert len(state.views) == len(given) + count
     assert all(is_between(camera) for camera in state.views[len(given) :])
@@ -96,18 +96,19 @@ def test_dense_views_get_none(usual_device, plush_excerpt, plush_excerpt_cameras
 def test_only_as_many_are_added_as_fit_the_memory(usual_device, plush_excerpt, plush_excerpt_cameras):
     given = train_views(plush_excerpt_cameras)
     wanted, _ = added(usual_device, plush_excerpt, given)
-    counts = [added(usual_device, plush_excerpt, given, memory=step * 1_000_000)[0] for step in range(16)]
+    memories = range(0, 32_000_000, 2_000_000)
+    counts = [added(usual_device, plush_excerpt, given, memory=memory)[0] for memory in memories]
     assert counts[0] == 0
     assert counts[-1] == wanted
     assert counts == sorted(counts)
-    some = counts.index(next(count for count in counts if 0 < count < wanted))
+    some = memories[counts.index(next(count for count in counts if 0 < count < wanted))]
     # What pruning keeps of views with that budget is within it, and no view is made again for each measurement.
-    _, state = added(usual_device, plush_excerpt, given, memory=some * 1_000_000)
+    _, state = added(usual_device, plush_excerpt, given, memory=some)
     with Rasterizer(usual_device, plush_excerpt) as rasterizer:
         before = usual_device.allocated
-        with RemovalSweep(rasterizer, state.views, SweepOptions(memory=some * 1_000_000)) as sweep:
+        with RemovalSweep(rasterizer, state.views, SweepOptions(memory=some)) as sweep:
             assert sweep.ready_views == len(state.views)
-            assert usual_device.allocated - before < (some + 1) * 1_000_000
+            assert usual_device.allocated - before < some + 1_000_000
     assert usual_device.allocated == 0
 
 

@@ -86,7 +86,7 @@ def test_fewer_together_where_the_device_has_no_room(gpu, monkeypatch):
 def test_a_refit_takes_them_and_the_bytes_stay(gpu, monkeypatch):
     scene, cameras = street(5, 300)
     options = EncodeOptions.for_preset("best", cameras_anyway=True)
-    options = options.changed(prune={"iterations": 2}, refit={"steps": 2})
+    options = options.changed(prune={"iterations": 2}, refit={"steps": 2}, between={"views": 0.0})
     wanted = encode(scene, cameras, options, device=gpu)
     monkeypatch.setattr(visibility, "LEAST_SPLATS", 1)
     made = noted(monkeypatch, targets, "SeenRasterizer")
