@@ -184,7 +184,7 @@ def _groups(scene: Scene, left: _Indices, run: Run) -> NDArray[np.int32]:
         order = morton_order(means, run)
         stays = is_left[order]
         curve, gone = order[stays], order[~stays]
-        places: _Indices = np.cumsum(stays)[~stays]
+        places = np.cumsum(stays, dtype=np.int64)[~stays]
 
         def look(some: slice, curve: _Indices = curve, gone: _Indices = gone, places: _Indices = places) -> None:
             own, place = gone[some], places[some]
