@@ -99,6 +99,10 @@ class Linearised:
         self._refit.colour_map.normal(x, result, self._at, Ridge(0.0, 0.0, 0.0), every=every)
         return as_rows(vectors, result)
 
+    def activate(self, active: NDArray[np.bool_]) -> None:
+        """(N, M, 3) in Y, Co, Cg: the coefficients that may change."""
+        self._refit.coefficients.activate(active)
+
     def error_alone(self, targets: Targets) -> float:
         """|pictures - targets|^2 by W, without a gradient."""
         return self._refit.colour_map.error(self._at, targets)

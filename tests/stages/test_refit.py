@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import threading
+from functools import partial
 
 import numpy as np
 import pytest
@@ -15,10 +16,11 @@ from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.colour_refit import ColourRefit
 from potr_cl.stages.refitting.refit import active_coefficients, refit_colours
 from potr_cl.stages.refitting.refit_options import ComingScene, RefitOptions
+from potr_cl.stages.refitting.sliced_arrays import Ridge
 from tests.cases.memory import taken_of
 from tests.cases.scenes import antialiased
 from tests.reference.refit import LENGTHS, selection, to_rgb, to_ycocg
-from tests.reference.refit_cases import Case, Linearised, Pictures
+from tests.reference.refit_cases import Case, Linearised, Pictures, as_rows
 from tests.reference.rounding import grid_of
 from tests.reference.scenes import ring_of_cameras, tilted_camera, visible_scene
 
@@ -28,10 +30,18 @@ def relative(a, b) -> float:
 
 
 def crowd() -> Scene:
-    """More splats in a tile than CPU kernels take at a time, 1024."""
-    scene = visible_scene(1400, 1)
+    """More splats in a tile than CPU kernels take at a time, 1536."""
+    scene = visible_scene(2000, 1)
     scene.log_scales[:] = -4.5
     scene.opacity_logits[:] = -3.5
+    return scene
+
+
+def hiding() -> Scene:
+    """Most splats lie behind where all pixels of a tile have ended."""
+    scene = visible_scene(90, 1)
+    scene.log_scales[:] = -0.5
+    scene.opacity_logits[:] = 2.0
     return scene
 
 
@@ -52,6 +62,7 @@ def dim(degree: int) -> Scene:
         pytest.param(lambda: dim(3), 0.3, id="dim, degree 3"),
         pytest.param(lambda: antialiased(visible_scene(40, 3, seed=1)), 0, id="antialiased"),
         pytest.param(lambda: antialiased(visible_scene(40, 3, seed=1), MIP_SPLATTING_LOW_PASS), 0, id="a small filter"),
+        pytest.param(hiding, 0, id="most are hidden"),
         pytest.param(crowd, 0, id="long lists", marks=pytest.mark.slow),
     ],
 )
@@ -79,6 +90,77 @@ def test_the_map_and_its_transpose(device, make, least_cut):
         assert np.abs(linear.blocks - wanted).max() < 1e-5 * wanted.max()
         cut = 1 - np.mean([free.mean() for free in reference.free])
         assert least_cut <= cut < (0.95 if least_cut else 0.3)
+
+
+def products(case: Case, weights: bool) -> tuple[np.ndarray, int]:
+    """That of a random direction after a gradient, perhaps with weights; and how many sub-tiles the lists name."""
+    with ColourRefit(case.device, case.scene, case.cameras) as refit:
+        vectors, own = refit.coefficients, refit.colour_map.own
+        x, direction, result = (vectors.vector() for _ in range(3))
+        vectors.write_sh(x, case.scene.sh)
+        vectors.zero(result)
+        refit.colour_map.gradient(x, case.targets, result, refit.solver.blocks if weights else None)
+        values = np.random.default_rng(0).normal(size=(vectors.layout.columns, len(case.scene)))
+        vectors.write(direction, values)
+        refit.colour_map.normal(direction, result, x, Ridge(0.0, 0.0, 0.0))
+        named = 0
+        for each in own._launches if case.device.family == "cpu" else ():
+            views = each.launch.resident.views
+            found = case.device.download(views.subtiles, (views.read_counts()[0],), np.uint32)
+            named += int(np.bitwise_count(found).sum())
+        return vectors.read(result), named
+
+
+def test_lists_lose_what_lies_behind_the_ends_and_no_bit_changes(device):
+    with Case(device, hiding(), hiding(), ring_of_cameras(3, size=40)) as case:
+        (whole, all_named), (trimmed, named) = (products(case, weights) for weights in (False, True))
+    assert np.array_equal(whole, trimmed)
+    assert named < 0.7 * all_named or device.family == "gpu"
+
+
+def test_coefficients_that_no_splat_nearby_may_change_are_left_out_and_no_bit_changes(device):
+    """Of the first splats all may change, of the others fewer and fewer."""
+    scene = visible_scene(90, 3)
+    active = np.random.default_rng(0).random(scene.sh.shape) * 60 > np.arange(90)[:, None, None] - 20
+    active[:, 0] = True
+    active[60:, 1:] = False
+    directions = np.random.default_rng(1).normal(size=scene.sh.shape) * active
+    with Case(device, scene, scene, ring_of_cameras(5, size=40)) as case, Linearised(case) as linear:
+        whole = linear.normal(directions)
+        linear.activate(active)
+        some = linear.normal(directions)
+    assert np.array_equal(some, whole * active)
+
+
+def test_shares_of_pixels(device):
+    """What a splat has of its pixels when all change alike, by the definition; the preconditioner goes by it."""
+    scene, nothing = visible_scene(60, 2), Ridge(0.0, 0.0, 0.0)
+    same = np.zeros(scene.sh.shape)
+    same[:, 0, 0] = 1
+    residual = np.random.default_rng(0).normal(size=scene.sh.shape)
+    with Case(device, scene, scene, ring_of_cameras(4, size=40)) as case:
+        with ColourRefit(device, scene, case.cameras) as refit:
+            vectors, blocks = refit.coefficients, refit.solver.blocks
+            x, direction, result = (vectors.vector() for _ in range(3))
+            vectors.write_sh(x, scene.sh)
+            vectors.zero(result)
+            refit.colour_map.gradient(x, case.targets, result, blocks)
+            blocks.share(partial(refit.colour_map.normal, at=x, ridge=nothing, constant=True), direction, result)
+            vectors.write(direction, residual.transpose(1, 2, 0).reshape(-1, len(scene)))
+            blocks.precondition(direction, result, Ridge(0.0, 0.0, 1.0))
+            found = as_rows(vectors, result)
+        reference = case.reference()
+        gram = reference.gram()
+        everybody = reference.transposed(reference.forward(same))[:, 0, 0]
+    seen = gram[:, 0, 0] > 0
+    shares = np.ones(len(scene))
+    shares[seen] = np.minimum(3 * gram[seen, 0, 0] / everybody[seen], 1) ** 0.25
+    assert shares.min() < 0.7
+    ones = np.eye(scene.sh.shape[1])
+    for c, length in enumerate(LENGTHS):
+        damping = 1e-5 * length * np.trace(gram, axis1=1, axis2=2)[:, None, None] / len(ones)
+        wanted = np.linalg.solve(length * gram + (1 + damping) * ones, residual[:, :, c : c + 1])[..., 0]
+        assert relative(found[:, :, c], shares[:, None] * wanted) < 1e-3
 
 
 @pytest.mark.parametrize(

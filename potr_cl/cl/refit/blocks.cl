@@ -23,11 +23,12 @@
 #endif
 
 /* result = the inverse of each splat's own block of the normal equations, restricted to the active coefficients, times
-   residual: a Cholesky factorisation a channel, which is the second dimension. The squared lengths of Y, Co and Cg in R, G, B are 3, 2 and 3. */
+   residual and the splat's share: a Cholesky factorisation a channel, which is the second dimension. The squared lengths of Y, Co and Cg in R, G, B are 3, 2 and 3. */
 kernel NARROW void precondition(
     global const float *residual,
     global const float *blocks,
     global const uint *active,
+    global const float *shares,
     ulong stride,
     float lambda_luma,
     float lambda_chroma,
@@ -81,8 +82,27 @@ kernel NARROW void precondition(
         for (int k = j + 1; k < SH_COUNT; ++k)
             y[OWN(j)] = FUSED(-factor[OWN(AT(j, k))], y[OWN(k)], y[OWN(j)]);
         y[OWN(j)] *= factor[OWN(AT(j, j))];
-        VSTORE(y[OWN(j)], index, result + (3 * j + c) * stride);
+        VSTORE(y[OWN(j)] * VLOAD(index, shares), index, result + (3 * j + c) * stride);
     }
+}
+
+/* direction = 1 in the constant coefficients of Y that may change, 0 in all others. */
+kernel void same_for_all(global const uint *active, ulong stride, global float *direction)
+{
+    const size_t index = get_global_id(0);
+    VSTORE(active_lanes(active, stride, index, 0), index, direction);
+    for (int column = 1; column < 3 * SH_COUNT; ++column)
+        VSTORE((vfloat)(0.0f), index, direction + column * stride);
+}
+
+/* From the product of the normal equations with that: the fourth root of the part that each splat has itself of what
+   its pixels take in when all splats change alike; 1 where nothing is known. */
+kernel void set_shares(global const float *product, global const float *blocks, ulong stride, global float *shares)
+{
+    const size_t index = get_global_id(0);
+    const vfloat own = 3.0f * VLOAD(index, blocks), all = VLOAD(index, product);
+    const vint others = own > 0.0f && all > own && all < 1e30f;
+    VSTORE(others ? sqrt(sqrt(own / all)) : (vfloat)(1.0f), index, shares);
 }
 
 /* Where select_active keeps a splat's block, which it indexes while it runs: local memory where a work-item does one splat.

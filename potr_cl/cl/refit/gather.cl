@@ -116,12 +116,14 @@ inline void add_blocks(
 #endif
 
 /* The totals of some of a set's views, times the view's scale, onto the coefficients: result += basis x (Y, Co, Cg) of
-   the free channels' sums, view by view. What views have lies `apart`. With WEIGHTS also blocks += the sum of
+   the free channels' sums, view by view; on CPUs not for those that none of LANES splats may change, whose sums nobody
+   looks at. What views have lies `apart`. With WEIGHTS also blocks += the sum of
    w^2 x basis x basis, for `block_stride` splats from number `first_block` on. Both are columns of integers; the scales
    say what is 1. Leaves the totals zero. */
 kernel void gather(
     global long *totals,
     global const float *means,
+    global const uint *active,
     ulong stride,
     ulong apart,
     global const uint *numbers,
@@ -153,6 +155,9 @@ kernel void gather(
     vlong results[3 * SH_COUNT];
     int any_view = 0;
 #endif
+#if LANES > 1
+    Changing changing;
+#endif
 #if WEIGHTS && !PICKED
     const size_t block = index - first_block / LANES;
     const int has_block = !SOME_BLOCKS || (index >= first_block / LANES && block < block_stride / LANES);
@@ -167,9 +172,18 @@ kernel void gather(
         if (!any_sum)
             continue;
 #if !ONE_VIEW
+#if LANES > 1
+        if (!any_view) {
+            changing_coefficients(active, stride, splat, &changing);
+            for (int c = 0; c < 3; ++c)
+                for (uint k = 0; k < changing.counts[c]; ++k)
+                    results[c * SH_COUNT + k] = LOAD_SUMS(splat, result + (3 * changing.rows[c][k] + c) * stride);
+        }
+#else
         if (!any_view)
             for (int i = 0; i < 3 * SH_COUNT; ++i)
                 results[i] = LOAD_SUMS(splat, result + i * stride);
+#endif
         any_view = 1;
 #endif
         VREAL basis[SH_COUNT];
@@ -188,6 +202,10 @@ kernel void gather(
                 result[splat + (first + i) * stride] =
                     some[i] + to_fixed_lanes(basis[(first + i) / 3] * channels[(first + i) % 3]);
         }
+#elif LANES > 1
+        for (int c = 0; c < 3; ++c)
+            for (uint k = 0; k < changing.counts[c]; ++k)
+                results[c * SH_COUNT + k] += to_fixed_lanes(basis[changing.rows[c][k]] * channels[c]);
 #else
         for (int m = 0; m < SH_COUNT; ++m)
             for (int c = 0; c < 3; ++c)
@@ -221,7 +239,12 @@ kernel void gather(
     if (has_block && views_of_block)
         add_blocks(views_of_block, weights, bases, block, block_stride, blocks);
 #endif
-#if !ONE_VIEW
+#if LANES > 1
+    if (any_view)
+        for (int c = 0; c < 3; ++c)
+            for (uint k = 0; k < changing.counts[c]; ++k)
+                STORE_SUMS(results[c * SH_COUNT + k], splat, result + (3 * changing.rows[c][k] + c) * stride);
+#elif !ONE_VIEW
     if (any_view)
         for (int i = 0; i < 3 * SH_COUNT; ++i)
             STORE_SUMS(results[i], splat, result + i * stride);

@@ -6,6 +6,10 @@
    these it then finds for each splat the sum of w_k v over the pixels, in three channels, and with WEIGHTS that of
    w_k^2. A tile's sums go to exact totals (totals.clh). Lists of more than SEGMENT splats are walked twice.
 
+   Weights depend on geometry and opacities alone. So with WEIGHTS, and `trim`, lists and masks lose what lies behind the
+   ends of all pixels: what is left comes first, and masks behind it are 0. Views that stay are walked less far then, and
+   no bit of any sum changes.
+
    Macros:
        LANES                               8 or 16, see lanes.clh;
        ALPHA_CAP, TRANSMITTANCE_THRESHOLD  see subtile_vectors.clh;
@@ -60,8 +64,8 @@ kernel void refit_sweep(
     global const float4 *shapes,
     global const float4 *colours,
     global const uint *offsets,
-    global const uint *intersections,
-    global const uint *subtiles,
+    global uint *intersections,
+    global uint *subtiles,
     View view,
     float red,
     float green,
@@ -73,12 +77,16 @@ kernel void refit_sweep(
     uint first_number,
     uint every,
     int back,
+    int trim,
     global float *errors,
     volatile global uint *totals)
 {
     const int tile = get_global_id(0);
     const int2 origin = (int2)(tile % view.columns, tile / view.columns) * TILE;
-    const uint begin = offsets[tile], end = offsets[tile + 1];
+    const uint begin = offsets[tile];
+    uint end = offsets[tile + 1];
+    while (end > begin && !subtiles[end - 1])
+        --end;
 
     const uint some = sampled_subtiles(every, numbers[first_number]);
     Splat splats[SEGMENT];
@@ -90,6 +98,9 @@ kernel void refit_sweep(
     vfloat t[SUBTILES], rgb[SUBTILES][3];
     float values[SUBTILES][3][LANES];
     float error = 0.0f;
+#if WEIGHTS
+    uint seen[SEGMENT], left = begin;
+#endif
     const int first_pass = end - begin > SEGMENT ? 0 : 1, last_pass = back ? 1 : first_pass;
     for (int pass = first_pass; pass <= last_pass; ++pass) {
         for (int i = 0; i < SUBTILES; ++i) {
@@ -103,6 +114,10 @@ kernel void refit_sweep(
                     shapes, colours, intersections, subtiles, from, end, some, splats, places, lists, lengths) : 0;
             for (uint k = 0; k < count; ++k)
                 sums[k] = (float4)(0.0f);
+#if WEIGHTS
+            for (uint k = 0; k < count; ++k)
+                seen[k] = 0;
+#endif
             for (int i = 0; i < SUBTILES; ++i) {
                 if (!(some >> i & 1))
                     continue;
@@ -121,6 +136,10 @@ kernel void refit_sweep(
                 }
                 if (pass == 1 && back)
                     sum_pairs(lists[i], walked, weights, values[i], sums);
+#if WEIGHTS
+                for (uint j = 0; j < walked; ++j)
+                    seen[lists[i][j]] |= 1u << i;
+#endif
             }
             if (pass == 1 && back)
                 for (uint k = 0; k < count; ++k) {
@@ -128,9 +147,20 @@ kernel void refit_sweep(
                         PREFETCH_TO_WRITE(totals + 2 * TOTALS * intersections[places[k + SUMS_AHEAD]]);
                     add_sums(totals, intersections[places[k]], sums[k], scale);
                 }
+#if WEIGHTS
+            for (uint k = 0; trim && pass == 1 && k < count; ++k)
+                if (seen[k]) {
+                    intersections[left] = intersections[places[k]];
+                    subtiles[left++] = seen[k];
+                }
+#endif
             if (is_last)
                 break;
         }
     }
+#if WEIGHTS
+    for (; trim && left < end; ++left)
+        subtiles[left] = 0;
+#endif
     errors[tile] = error;
 }

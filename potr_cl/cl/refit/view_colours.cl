@@ -7,6 +7,13 @@
 
 #include "refit/view_colours.clh"
 
+inline void to_rgb(const vfloat sums[3], vfloat *red, vfloat *green, vfloat *blue)
+{
+    *red = sums[0] + sums[1] - sums[2];
+    *green = sums[0] + sums[2];
+    *blue = sums[0] - sums[1] - sums[2];
+}
+
 /* R, G, B of what coefficients, or a direction, are in a view. */
 inline void in_view(const vfloat *values, const VREAL *basis, vfloat *red, vfloat *green, vfloat *blue)
 {
@@ -14,10 +21,29 @@ inline void in_view(const vfloat *values, const VREAL *basis, vfloat *red, vfloa
     for (int m = 0; m < SH_COUNT; ++m)
         for (int c = 0; c < 3; ++c)
             sums[c] = MAD(basis[m], values[3 * m + c], sums[c]);
-    *red = sums[0] + sums[1] - sums[2];
-    *green = sums[0] + sums[2];
-    *blue = sums[0] - sums[1] - sums[2];
+    to_rgb(sums, red, green, blue);
 }
+
+#if LANES > 1
+/* The same of a direction, whose other coefficients are 0: values[c][k] is that of the k-th one that may change. */
+inline void change_in_view(
+    const vfloat values[3][SH_COUNT],
+    const Changing *changing,
+    const VREAL *basis,
+    vfloat *red,
+    vfloat *green,
+    vfloat *blue)
+{
+    vfloat sums[3];
+    for (int c = 0; c < 3; ++c) {
+        vfloat sum = (vfloat)(0.0f);
+        for (uint k = 0; k < changing->counts[c]; ++k)
+            sum = MAD(basis[changing->rows[c][k]], values[c][k], sum);
+        sums[c] = sum;
+    }
+    to_rgb(sums, red, green, blue);
+}
+#endif
 
 inline void store_colour(
     vfloat red, vfloat green, vfloat blue, vfloat channels, size_t place, global float4 *colours)
@@ -122,6 +148,7 @@ kernel void view_colours(
 kernel void colour_changes(
     global const float *coefficients,
     global const float *means,
+    global const uint *active,
     ulong stride,
     ulong apart,
     global const SetView *views,
@@ -134,14 +161,17 @@ kernel void colour_changes(
     global float4 *colours)
 {
     const size_t splat = get_global_id(0);
-    vfloat values[3 * SH_COUNT];
-    for (int i = 0; i < 3 * SH_COUNT; ++i)
-        values[i] = VLOAD(splat, coefficients + i * stride);
+    Changing changing;
+    changing_coefficients(active, stride, splat, &changing);
+    vfloat values[3][SH_COUNT];
+    for (int c = 0; c < 3; ++c)
+        for (uint k = 0; k < changing.counts[c]; ++k)
+            values[c][k] = VLOAD(splat, coefficients + (3 * changing.rows[c][k] + c) * stride);
     for (uint number = 0; number < view_count; ++number) {
         VREAL basis[SH_COUNT];
         basis_towards(means, stride, splat, &views[number].view, basis);
         vfloat red, green, blue;
-        in_view(values, basis, &red, &green, &blue);
+        change_in_view(values, &changing, basis, &red, &green, &blue);
         global const float4 *free =
             number == 0 ? first_free : number == 1 ? second_free : number == 2 ? third_free : fourth_free;
         const vint kept = free_channels(free, splat);

@@ -7,6 +7,7 @@ channel of unit length in R, G, B; Y, Co and Cg have the squared lengths 3, 2 an
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,10 +51,12 @@ class SplatBlocks:
     def __init__(self, coefficients: Coefficients, splats: int | None = None) -> None:
         self._coefficients = coefficients
         device, layout = coefficients.device, coefficients.layout
-        self._precondition, self._select_active = (
-            device.shared_kernel(_SOURCE, name, **layout.macros) for name in ("precondition", "select_active")
+        self._precondition, self._select_active, self._same_for_all, self._set_shares = (
+            device.shared_kernel(_SOURCE, name, **layout.macros)
+            for name in ("precondition", "select_active", "same_for_all", "set_shares")
         )
         self.array = coefficients.array(layout.triangle, "the splats' normal equations")
+        self._shares = coefficients.array(1, "the splats' shares of pixels")
         some = layout.stride
         if splats is not None and not coefficients.whole:
             some = min(max(splats // SPLAT_GROUP, 1) * SPLAT_GROUP, some)
@@ -89,14 +92,40 @@ class SplatBlocks:
         row: FloatArray = self._coefficients.read(self.array, range(number, number + 1))[0]
         return row
 
+    def share(self, product: Callable[[Vector, Vector], None], direction: Vector, result: Vector) -> None:
+        """Find each splat's share of its pixels, which :meth:`precondition` goes by from then on.
+
+        A splat's own block says how far to go if no other moves. But where many faint ones lie behind each other, all
+        see the same error, and together they go many times too far. How many that is, the product with a direction
+        tells in which all splats change alike: over the block's own part, it is what the others would take away if
+        each went as far as it wants to. To divide by it would be right for what all of a pixel's splats have in common,
+        and far too little for the rest: its fourth root is between.
+
+        Args:
+            product: of a direction in which only constant coefficients change, result = H direction.
+            direction, result: vectors, which are used up.
+        """
+        coefficients = self._coefficients
+        active = coefficients.active
+        for part in coefficients.slices((active,), (direction,)):
+            self._same_for_all.bind(active=part[active], stride=part.stride, direction=part[direction])
+            part.run(self._same_for_all)
+        product(direction, result)
+        for part in coefficients.slices((result, self.array), (self._shares,)):
+            self._set_shares.bind(
+                product=part[result], blocks=part[self.array], stride=part.stride, shares=part[self._shares]
+            )
+            part.run(self._set_shares)
+
     def precondition(self, residual: Vector, result: Vector, ridge: Ridge) -> None:
-        """result = (block + ridge)⁻¹ residual on each splat's active coefficients, 0 on the others."""
+        """result = share (block + ridge)⁻¹ residual on each splat's active coefficients, 0 on the others."""
         active = self._coefficients.active
-        for part in self._coefficients.slices((residual, active, self.array), (result,)):
+        for part in self._coefficients.slices((residual, active, self.array, self._shares), (result,)):
             self._precondition.bind(
                 residual=part[residual],
                 blocks=part[self.array],
                 active=part[active],
+                shares=part[self._shares],
                 stride=part.stride,
                 result=part[result],
                 **ridge.scalars,

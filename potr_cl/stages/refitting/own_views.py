@@ -190,7 +190,7 @@ class OwnViews(Owner):
             self._numbers = self._memory.upload(numbers_of, "the views' numbers")
             ratios = [self.one * weights[each] / self._fixed_points[each] for some in sets for each in some]
             scales = self._memory.upload(np.array(ratios, np.float32), "the views' scales")
-            self._kernels = ViewKernels(device, layout, rasterizer.parameters.means, scales)
+            self._kernels = ViewKernels(device, layout, rasterizer.parameters.means, coefficients.active, scales)
             self._targets = owned.enter_context(TargetPictures(device, cameras, self._cache, sets=sets))
             self._owned = owned.pop_all()
 
@@ -230,7 +230,17 @@ class OwnViews(Owner):
                     weights = look.blocks is not None
                     sampled = (self._numbers, own.views.start, look.every, look.back)
                     self._sweep.run(
-                        views, shapes, swept, background, target, scale, *sampled, errors, slot.totals, weights
+                        views,
+                        shapes,
+                        swept,
+                        background,
+                        target,
+                        scale,
+                        *sampled,
+                        errors,
+                        slot.totals,
+                        weights,
+                        own.launch.resident is not None,
                     )
                     if targets is not None:
                         if look.drawn is not None:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.coefficients import Coefficients, Vector
 from potr_cl.stages.refitting.colour_map import ColourMap
-from potr_cl.stages.refitting.refit_options import Descent, Selection
+from potr_cl.stages.refitting.refit_options import QUARTER, Descent, Selection
 from potr_cl.stages.refitting.sliced_arrays import Ridge
 from potr_cl.views.targets import Targets
 
@@ -201,6 +201,8 @@ class ColourSolver:
         first_ridge = selection.descent.ridge if selection else ridge
         state = first = self._linearise(problem, first_ridge, None if constant else self.blocks)
         after_start()
+        if not constant:
+            self._share(problem)
         steps, residual = 0, self._residual
         if selection is not None:
             how, chosen_from = selection.descent, vectors.save_flags()
@@ -286,6 +288,12 @@ class ColourSolver:
         normal = problem.colour_map.normal
         product = partial(normal, at=self._start, ridge=how.ridge, constant=problem.constant, every=how.every)
         return System(product, partial(self.blocks.precondition, ridge=how.ridge))
+
+    def _share(self, problem: _Problem) -> None:
+        """Find the splats' shares of pixels, as at the start, by a quarter of these."""
+        normal, nothing = problem.colour_map.normal, Ridge(0.0, 0.0, 0.0)
+        product = partial(normal, at=self._start, ridge=nothing, constant=True, every=QUARTER)
+        self.blocks.share(product, self._gradients.direction, self._gradients.product)
 
     def _choose(
         self, problem: _Problem, first: _State, chosen_from: NDArray[np.uint32], steps: int, least: float, ridge: Ridge

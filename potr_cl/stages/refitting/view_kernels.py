@@ -43,6 +43,9 @@ def gathered_scale(cameras: Sequence[Camera], weights: Sequence[float]) -> float
 #: On CPUs, launches that are given colours, and whose sums are gathered, together: coefficients, which take much more
 #: than what is a view's, go through the memory once for so many views.
 TOGETHER = 4
+#: On CPUs, splats of a tile that are done together. What they leave behind still fits the second cache; a longer list
+#: is walked twice. With 1024, that would be a third of lego's.
+_SEGMENT = 1536
 
 
 class RefitSweep:
@@ -58,8 +61,12 @@ class RefitSweep:
     """
 
     def __init__(self, device: Device) -> None:
+        self._gpu = device.family == "gpu"
+        of_family = {} if self._gpu else {"SEGMENT": _SEGMENT}
         self._sweeps = [
-            TileSweep(device, INRIA, "refit/refit", "refit_sweep", LARGEST_VALUE=LARGEST_VALUE, WEIGHTS=weights)
+            TileSweep(
+                device, INRIA, "refit/refit", "refit_sweep", LARGEST_VALUE=LARGEST_VALUE, WEIGHTS=weights, **of_family
+            )
             for weights in (0, 1)
         ]
         self.lanes, self.most_views = self._sweeps[0].lanes, self._sweeps[0].most_views
@@ -92,6 +99,7 @@ class RefitSweep:
         errors: cl.Buffer,
         totals: cl.Buffer,
         weights: bool,
+        stay: bool,
     ) -> None:
         """Enqueue it.
 
@@ -106,6 +114,8 @@ class RefitSweep:
             errors: (tiles,) float32, becomes each tile's sum of squared pixel values.
             totals: (views, stride, 4) int64: weight times value, three channels, and the squared weights are added.
             weights: sum up the squared weights too.
+            stay: whether the views will be looked at again as they are: with the weights known, lists lose on CPUs
+                what lies behind the ends of all pixels.
         """
         self._sweeps[weights].run(
             views,
@@ -121,6 +131,7 @@ class RefitSweep:
             back=back,
             errors=errors,
             totals=totals,
+            **({} if self._gpu else {"trim": weights and stay}),
         )
 
 
@@ -171,11 +182,13 @@ class ViewKernels:
         device: to compute on.
         layout: of the coefficients.
         means: (3, stride) float32, the splats' centres on the device.
+        active: (2, stride) uint32, the flags of the coefficients that may change, there: on CPUs, where none of some
+            neighbours may, sums for it stay 0, and nobody looks for it in a direction.
         scales: float32, by what each view's sums are multiplied on their way to the coefficients.
     """
 
-    def __init__(self, device: Device, layout: Layout, means: cl.Buffer, scales: cl.Buffer) -> None:
-        self._device, self._layout, self._means, self._scales = device, layout, means, scales
+    def __init__(self, device: Device, layout: Layout, means: cl.Buffer, active: cl.Buffer, scales: cl.Buffer) -> None:
+        self._device, self._layout, self._means, self._active, self._scales = device, layout, means, active, scales
 
     def colour(
         self,
@@ -239,6 +252,7 @@ class ViewKernels:
         kernel.bind(
             coefficients=x,
             means=self._means,
+            active=self._active,
             stride=self._layout.stride,
             apart=stride,
             views=tables,
@@ -293,7 +307,7 @@ class ViewKernels:
         kernel = self._kernel("gather", found, WEIGHTS=weights, SOME_BLOCKS=some, **layout.some(constant))
         items = layout.items(found.stride)
         for arguments in self._arguments(found):
-            kernel.bind(**arguments, **own, free=found.free, result=sums).launch(*items)
+            kernel.bind(**arguments, **own, active=self._active, free=found.free, result=sums).launch(*items)
 
     def _gather_blocks(self, found: SweptSums, blocks: dict[str, Any]) -> None:
         kernel = self._kernel("gather_blocks", found, WEIGHTS=0, SOME_BLOCKS=0, **self._layout.macros)
