@@ -81,7 +81,7 @@ def test_time_is_told_only_of_a_fit_that_was_asked_for(device, plush_excerpt, pl
 @pytest.mark.slow
 def test_what_makes_up_for_splats_rounds_finer(device, plush_excerpt, plush_excerpt_cameras, half):
     options = EncodeOptions(q=0.3).changed(
-        prune={"delta_mse_max": 1e-7}, fit={"steps": 80, "further": 0.2, "cycles": 1}
+        prune={"delta_mse_max": 1e-7}, between={"views": 0.5}, fit={"steps": 80, "further": 0.2, "cycles": 1}
     )
     encoded = encode(plush_excerpt, plush_excerpt_cameras, options, device=device)
     assert encoded.fitted.spared > 0
