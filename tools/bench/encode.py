@@ -189,7 +189,7 @@ def refit_rows(load: Workload) -> Iterator[Row]:
         device = Device(load.info, family=family)
         with Rasterizer(device, load.scene) as rasterizer:
             targets = RenderedTargets(rasterizer, views)
-            for steps in (0, 1, 2, 4, 8, 16) if load.quick else (0, 1, 2, 4, 8, 16, 32, 64):
+            for steps in (0, 1, 2, 4, 6, 16) if load.quick else (0, 1, 2, 4, 6, 8, 16, 32, 64):
                 errors: list[float] = []
 
                 def work(device: Device = device, targets: RenderedTargets = targets, steps: int = steps) -> None:

@@ -31,6 +31,9 @@ from potr_cl.views.targets import Targets
 #: Steps end where the residual's square, as the preconditioner measures it, has shrunk by this: single precision has no
 #: more digits, and what is left of them leads astray.
 _CONVERGED = 1e-14
+#: Steps that take off more than there is, by this part of the objective at the start, go by rounding alone: so it ends
+#: where equations say nothing of some coefficients, and nobody stops it in time.
+_IMPOSSIBLE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -82,11 +85,11 @@ class ConjugateGradients:
             after_step: called with the number of steps done.
 
         Returns:
-            The number of steps done.
+            The number of steps done; -1 if rounding has led x astray.
         """
         vectors, direction, product, preconditioned = self._vectors, self.direction, self.product, self.preconditioned
         vectors.zero(direction)
-        slope, least = 0.0, 0.0
+        slope, least, lost = 0.0, 0.0, -_IMPOSSIBLE * objective
         for step in range(steps):
             system.precondition(residual, preconditioned)
             new_slope = vectors.dot(preconditioned, residual)
@@ -104,6 +107,8 @@ class ConjugateGradients:
             vectors.combine(1.0, residual, -length, product)
             gained = length * slope
             objective -= gained
+            if objective < lost:
+                return -1
             after_step(step + 1)
             if gained < gain * objective:
                 return step + 1
@@ -218,6 +223,9 @@ class ColourSolver:
             descent.gain,
             lambda done: after_step(steps + done),
         )
+        if more < 0:
+            vectors.copy(self.x, self._start)
+            more = 0
         start = state.error / whole
         if not check:
             return Solved((first.error / whole, math.nan), steps + more, start)
