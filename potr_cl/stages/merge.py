@@ -66,8 +66,10 @@ class Merge(Stage):
     def run(self, state: State, bench: Workbench) -> State:
         """The state with merged splats; as it was where pictures become much worse, and where nobody can tell."""
         importance = state.results.importance
-        none_held_out = len(state.views) - state.added < 2 or state.results.unresolved is not None
-        if len(state.scene) == len(state.source) or none_held_out or importance is None:
+        none_held_out = len(state.views) - state.added < 2
+        if importance is None or none_held_out or state.results.unresolved is not None:
+            return state
+        if len(state.scene) == len(state.source):
             return state
         bench.progress("merge", 0.0)
         with thread_pool(bench.threads) as pool:
@@ -147,14 +149,10 @@ def merged(scene: Scene, left: _Indices, importance: _F32, run: Run = map, becom
         opacity = np.clip(cover / _area(found.log_scales[several]), 1 / 255, _OPACITY)
         found.opacity_logits[several] = np.log(opacity / (1 - opacity))
 
-    # So many members at a time.
-    by_size = np.flatnonzero(counts > 1)
-    sizes = counts[by_size]
-    by_size = by_size[np.argsort(sizes.astype(np.min_scalar_type(counts.max())), kind="stable")]
-    blocks, first = list[_Indices](), 0
-    for size, number in zip(*(found.tolist() for found in np.unique_counts(sizes)), strict=True):
-        blocks += np.array_split(by_size[first : first + number], min(-(-number * size // _BLOCK), number))
-        first += number
+    blocks = list[_Indices]()
+    for size in np.unique(counts[counts > 1]).tolist():
+        groups = np.flatnonzero(counts == size)
+        blocks += np.array_split(groups, min(-(-len(groups) * size // _BLOCK), len(groups)))  # so many members each
     list(run(merge, blocks))
     return found
 

@@ -3,7 +3,7 @@
     minimise over x: sum over views s of w_s |A_s x - target_s|^2 + lambda |x_AC|^2 + prior |x - start|^2
     (lambda threefold on chroma)
 
-It uses conjugate gradients on the normal equations, preconditioned by each splat's own block. Colours that are cut at 0
+It uses conjugate gradients on the normal equations, preconditioned by each splat's own block and share. Colours that are cut at 0
 count as constant while it looks for a solution. Then it measures the true error of the result, and keeps the start if
 that was better.
 
@@ -201,31 +201,19 @@ class ColourSolver:
             after_start: called when the blocks are those of the start.
         """
         problem = _Problem(colour_map, targets, constant)
-        vectors, gradients, ridge, whole = self._coefficients, self._gradients, descent.ridge, colour_map.total_weight
+        vectors, ridge, whole = self._coefficients, descent.ridge, colour_map.total_weight
         vectors.copy(self._start, self.x)
         first_ridge = selection.descent.ridge if selection else ridge
         state = first = self._linearise(problem, first_ridge, None if constant else self.blocks)
         after_start()
         if not constant:
             self._share(problem)
-        steps, residual = 0, self._residual
+        steps = 0
         if selection is not None:
-            how, chosen_from = selection.descent, vectors.save_flags()
-            system = self._system(problem, how)
-            steps = gradients.descend(system, self.x, residual, first.objective, how.steps, how.gain, after_step)
+            chosen_from = vectors.save_flags()
+            steps = self._descend(problem, selection.descent, first.objective, after_step)
             state, steps = self._choose(problem, first, chosen_from, steps, selection.least * whole, ridge)
-        more = gradients.descend(
-            self._system(problem, descent),
-            self.x,
-            residual,
-            state.objective,
-            descent.steps,
-            descent.gain,
-            lambda done: after_step(steps + done),
-        )
-        if more < 0:
-            vectors.copy(self.x, self._start)
-            more = 0
+        more = self._descend(problem, descent, state.objective, lambda done: after_step(steps + done))
         start = state.error / whole
         if not check:
             return Solved((first.error / whole, math.nan), steps + more, start)
@@ -254,15 +242,7 @@ class ColourSolver:
         problem = _Problem(colour_map, targets, constant=False)
         self._coefficients.copy(self._start, self.x)
         state = self._linearise(problem, descent.ridge)
-        steps = self._gradients.descend(
-            self._system(problem, descent),
-            self.x,
-            self._residual,
-            state.objective,
-            descent.steps,
-            descent.gain,
-            lambda done: None,
-        )
+        steps = self._descend(problem, descent, state.objective, lambda done: None)
         start = state.error / colour_map.total_weight
         return Solved((start, math.nan), steps, start)
 
@@ -290,6 +270,14 @@ class ColourSolver:
         vectors.copy(change, self.x)
         vectors.combine(1.0, change, -1.0, self._start)
         return penalty + ridge.prior * vectors.dot(change, change), change
+
+    def _descend(self, problem: _Problem, how: Descent, objective: float, after_step: Callable[[int], None]) -> int:
+        """Steps from x, and how many; back at the start, and 0, where rounding has led astray."""
+        system = self._system(problem, how)
+        steps = self._gradients.descend(system, self.x, self._residual, objective, how.steps, how.gain, after_step)
+        if steps < 0:
+            self._coefficients.copy(self.x, self._start)
+        return max(steps, 0)
 
     def _system(self, problem: _Problem, how: Descent) -> System:
         """Aᵀ W A + ridge; colours are cut at 0 as they are at the start."""
