@@ -3,9 +3,9 @@
     minimise over x: sum over views s of w_s |A_s x - target_s|^2 + lambda |x_AC|^2 + prior |x - start|^2
     (lambda threefold on chroma)
 
-It uses conjugate gradients on the normal equations, preconditioned by each splat's own block and share. Colours that are cut at 0
-count as constant while it looks for a solution. Then it measures the true error of the result, and keeps the start if
-that was better.
+It uses conjugate gradients on the normal equations, preconditioned by each splat's own block and share of its pixels.
+Colours that are cut at 0 count as constant while it looks for a solution. Then it measures the true error of the
+result, and keeps the start if that was better.
 
 It also chooses which AC coefficients are worth their bytes: after a few steps it gives up those whose loss would cost
 less than a given squared error, and solves again for the rest.
