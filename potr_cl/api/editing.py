@@ -42,9 +42,9 @@ from potr_cl.model.scene import Scene
 from potr_cl.model.views_between import views_between as place_between
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.encode import check_frame
 from potr_cl.pipeline.fallback import with_fallback
 from potr_cl.pipeline.forecast import log_forecast
+from potr_cl.pipeline.frame import check_frame
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.run import Run, Stopwatch
 from potr_cl.pipeline.target import as_bytes

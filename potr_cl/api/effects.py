@@ -20,8 +20,8 @@ from potr_cl.api.inputs import (
 from potr_cl.api.views import views_or_placed
 from potr_cl.model.camera import train_views
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.encode import check_frame
 from potr_cl.pipeline.fallback import with_fallback
+from potr_cl.pipeline.frame import check_frame
 from potr_cl.pipeline.target import as_bytes
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.removal import RemovalSweep

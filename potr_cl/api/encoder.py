@@ -28,10 +28,11 @@ from potr_cl.levels.encoding import encode_levels
 from potr_cl.model.camera import Camera, within_photographs
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.encode import cameras_or_virtual, frame_checked_beside
+from potr_cl.pipeline.encode import cameras_or_virtual
 from potr_cl.pipeline.encode import encode as run_stages
 from potr_cl.pipeline.encoded import Encoded, Proved, SharedOut, proved
 from potr_cl.pipeline.forecast import log_forecast
+from potr_cl.pipeline.frame import FrameCheck
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.run import Stopwatch, added_up
 from potr_cl.pipeline.search import encode_to_target
@@ -60,6 +61,7 @@ class _Job:
         options: with the size of its file.
         scene: uncompressed.
         cameras: given or virtual.
+        frame: the check of the cameras, which goes on.
         judging: the views to judge by; None: nothing is judged.
         workers: what computes; None where no stage looks at views.
         kept: the scene on the devices.
@@ -69,6 +71,7 @@ class _Job:
     options: EncodeOptions
     scene: Scene
     cameras: Sequence[Camera] | None
+    frame: FrameCheck
     judging: EvaluationViews | None
     workers: Workers | None
     kept: ResidentScene | None
@@ -86,17 +89,19 @@ class _Job:
         run: Callable[..., Encoded] = run_stages
         if self.options.wanted_levels != 1:
             run = partial(encode_levels, judge=self.judging is not None)
-        return run(
-            self.scene, self.cameras, self.options, progress, self.device, kept=self.kept, in_frame=True,
-            tell=_log.info, pool=self.pool,
-        )  # fmt: skip
+        with self.frame.beside(progress) as watched:
+            return run(
+                self.scene, self.cameras, self.options, watched, self.device, kept=self.kept, in_frame=True,
+                tell=_log.info, pool=self.pool,
+            )  # fmt: skip
 
     def searched(self, target: Target, progress: Progress | None) -> tuple[Encoded, dict[str, Any]]:
         """The encode that meets a target, and the report of the search."""
-        found = encode_to_target(
-            self.scene, self.cameras, target, self.options, progress, self.device, _log.info, in_frame=True,
-            pool=self.pool,
-        )  # fmt: skip
+        with self.frame.beside(progress) as watched:
+            found = encode_to_target(
+                self.scene, self.cameras, target, self.options, watched, self.device, _log.info, in_frame=True,
+                pool=self.pool,
+            )  # fmt: skip
         return replace(found.encoded, options=found.options), search_report(target, found)
 
 
@@ -200,7 +205,8 @@ class Encoder:
             scene = scene_of(source, self._trust, self._antialiased)
             looks = options.look_at_views(scene)
             kept = None
-            with frame_checked_beside(scene, cameras, options.cameras_anyway):
+            frame = FrameCheck(scene, cameras, options.cameras_anyway)
+            with frame.before_errors():
                 workers = self.workers if looks else None
                 if workers is not None and self._target is None:
                     others = () if workers.pool is None else workers.pool.devices
@@ -211,7 +217,7 @@ class Encoder:
                 if cameras is not None:
                     log_forecast(workers.device, scene, cameras, options, kept)
             judging = EvaluationViews.of(cameras) if cameras is not None and self._judge else None
-            yield _Job(options, scene, cameras, judging, workers, kept, watch.seconds)
+            yield _Job(options, scene, cameras, frame, judging, workers, kept, watch.seconds)
 
     def _placed(
         self, source: SceneSource, scene: Scene, options: EncodeOptions, watch: Stopwatch, device: Device

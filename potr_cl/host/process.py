@@ -39,6 +39,7 @@ PATIENCE = 5.0
 #: What the first Ctrl-C is answered by work that can end early.
 _ENDS_EARLY = b"potr-cl: interrupted: finishing with the result so far; press Ctrl-C again to abort\n"
 
+_main = _thread.get_ident()
 _received: int | None = None
 _unwinds = False
 _asked: Asked | None = None
@@ -92,12 +93,16 @@ def first_interrupt_asks() -> Iterator[Asked]:
     """Have the first Ctrl-C (SIGINT) in the block do no more than ask the work to end early, and the second one end it.
 
     Any other signal ends the work at once. Without :func:`end_cleanly_on_signals` this does nothing: nobody asks, and
-    signals do what they did before. A block within another one is asked, and the other is not.
+    signals do what they did before. A block within another one is asked, and the other is not. In other
+    threads than the main one nobody asks.
 
     Yields:
         To be looked at now and then: whether the work was asked to end.
     """
     global _asked
+    if _thread.get_ident() != _main:
+        yield Asked()
+        return
     before, _asked = _asked, Asked()
     try:
         yield _asked

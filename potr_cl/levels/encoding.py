@@ -4,8 +4,8 @@ A level is one run of the stages: with a number of splats to keep, and smaller v
 the next finer level has kept, begins with them as they are in the full scene, and is fitted and re-fitted to the full
 scene's pictures. What views show of each splat of the scene the finest one has measured for all.
 
-Levels are made one after the other, and what is kept of each is the file that it became; while these become one, the
-scenes that they hold are kept, too: together no more than twice the finest.
+What is kept of each level is the file that it became; while these become one, the scenes that they hold are kept, too:
+together no more than twice the finest.
 """
 
 from __future__ import annotations
@@ -13,19 +13,23 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
+
+import numpy as np
 
 from potr_cl.errors import UsageError
 from potr_cl.levels.errors import MeasuredErrors, measuring_views
-from potr_cl.levels.plan import counts_of_levels, scaled, views_of_level
+from potr_cl.levels.lanes import Lane, lanes, side_by_side
+from potr_cl.levels.plan import MOST_BY_ITSELF, counts_of_levels, scaled, views_of_level
 from potr_cl.levels.seams import scales_shown
 from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import Family
-from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.encode import Kept, encode
 from potr_cl.pipeline.encoded import Encoded, LevelMade
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.run import Stopwatch, added_up
@@ -34,7 +38,7 @@ from potr_cl.raster.resident import ResidentScene
 from potr_cl.stages.fit import STEPS, Fit
 from potr_cl.stages.fitting.fit import FitOptions
 from potr_cl.stages.prune import Prune
-from potr_cl.stages.stage import Progress
+from potr_cl.stages.stage import Progress, Stage, State
 from potr_cl.workers.pool import Pool
 
 _log = logging.getLogger("potr_cl")
@@ -79,27 +83,18 @@ def encode_levels(
         As :func:`potr_cl.pipeline.encode.encode`.
         UsageError: there are no views to make coarser levels by.
     """
-    output, wanted = options.output, options.wanted_levels
+    output = options.output
     single = options.changed(output=output.of_level(), levels=1)
-
-    def one(views: Sequence[Camera] | None, how: EncodeOptions, finer: Encoded | None = None) -> Encoded:
-        return encode(
-            scene, views, how, progress, device, kept=kept, in_frame=in_frame or finer is not None, pool=pool,
-            tell=tell, finer=finer,
-        )  # fmt: skip
-
-    first = made = one(cameras, single)
-    counts = counts_of_levels(len(first.order), wanted)
-    if len(counts) > 1 and (cameras is None or not options.stage(Prune).on):
-        raise UsageError("coarser levels of detail are pruned: leave out --no-prune, or give --levels 1")
-    files, seconds = [first.data], dict(first.seconds)
-    for level, count in enumerate(counts[1:], 1):
-        assert cameras is not None
-        _log.info("level %d of %d: %s splats", level, len(counts) - 1, f"{count:,}")
-        family = None if made.device is None else made.device.family
-        made = one(views_of_level(cameras, level), coarser(single, level, count, family), made)
-        files.append(made.data)
-        seconds = added_up(seconds, made.seconds)
+    makers = _Levels(scene, cameras, single, options.wanted_levels, kept, in_frame, tell)
+    with lanes(device, pool, scene.nbytes, options) as found:
+        if kept is not None:
+            for lane in found[1:]:
+                assert lane.device is not None
+                kept.bring_to(lane.device)
+        side_by_side(makers.make, found, progress)
+    made = [makers.made[level] for level in range(len(makers.made))]
+    first, files, counts = made[0], [each.data for each in made], makers.counts()
+    seconds = added_up(*(each.seconds for each in made))
     watch = Stopwatch(progress)
     watch("levels", 0.0)
     opened = first.device or device
@@ -127,6 +122,84 @@ def encode_levels(
         first, pieces=pieces, nbytes=output.size(pieces), options=options, levels=tuple(levels),
         seconds=added_up(seconds, watch.seconds),
     )  # fmt: skip
+
+
+class _Levels:
+    """The levels of a scene, each of which can be made as soon as it is known which splats the next finer one keeps.
+
+    Args:
+        single: options of a file of one level. wanted: levels.
+        scene, cameras, kept, in_frame, tell: as of :func:`encode_levels`.
+
+    Attributes:
+        made: by level.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        cameras: Sequence[Camera] | None,
+        single: EncodeOptions,
+        wanted: int | str,
+        kept: ResidentScene | None,
+        in_frame: bool,
+        tell: Callable[[str], None] | None,
+    ) -> None:
+        self._scene, self._cameras, self._single, self._wanted = scene, cameras, single, wanted
+        self._kept, self._in_frame, self._tell = kept, in_frame, tell or _log.debug
+        most = MOST_BY_ITSELF if isinstance(wanted, str) else wanted
+        self._left: list[Future[Kept]] = [Future() for _ in range(most)]
+        self.made: dict[int, Encoded] = {}
+
+    def counts(self) -> list[int]:
+        """How many splats each level has, once the finest has all that it keeps."""
+        found = counts_of_levels(len(self._left[0].result().splats), self._wanted)
+        if len(found) > 1 and (self._cameras is None or not self._single.stage(Prune).on):
+            raise UsageError("coarser levels of detail are pruned: leave out --no-prune, or give --levels 1")
+        return found
+
+    def make(self, level: int, lane: Lane, progress: Progress) -> bool:
+        """Make a level; whether there is one of that number."""
+        if level >= len(self._left):
+            return False
+        try:
+            return self._made(level, lane, progress)
+        except BaseException as error:
+            if not self._left[level].done():
+                self._left[level].set_exception(error)  # who waits for it ends, too
+            raise
+
+    def _made(self, level: int, lane: Lane, progress: Progress) -> bool:
+        how, cameras, finer, tell = self._single, self._cameras, None, self._tell
+        if level:
+            counts = self.counts()
+            if level >= len(counts):
+                return False
+            finer = self._left[level - 1].result()
+            assert cameras is not None
+            _log.info("level %d of %d: %s splats", level, len(counts) - 1, f"{counts[level]:,}")
+            family = None if lane.device is None else lane.device.family
+            how, cameras = coarser(how, level, counts[level], family), views_of_level(cameras, level)
+            tell = partial(_told_of, tell, level)
+        last = Fit if not level and how.stage(Fit).asked_for else Prune
+
+        def follow(stage: Stage, state: State) -> None:
+            if isinstance(stage, last):
+                lane.share()
+                self._left[level].set_result(Kept(state.survivors, state.results.importance))
+
+        made = encode(
+            self._scene, cameras, how, progress, lane.device, kept=self._kept, in_frame=self._in_frame or level > 0,
+            pool=lane.pool, tell=tell, finer=finer, follow=follow,
+        )  # fmt: skip
+        self.made[level] = made
+        if not self._left[level].done():  # nothing was removed
+            self._left[level].set_result(Kept(np.sort(made.order), made.importance))
+        return True
+
+
+def _told_of(tell: Callable[[str], None], level: int, line: str) -> None:
+    tell(f"level {level}: {line}")
 
 
 def coarser(options: EncodeOptions, level: int, count: int, family: Family | None) -> EncodeOptions:

@@ -3,29 +3,41 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from potr_cl.host.mapped import bounded
-from potr_cl.host.threads import in_background
-from potr_cl.model.agreement import require_agreement
 from potr_cl.model.camera import Camera, train_views, within_photographs
 from potr_cl.model.scene import Scene
-from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encoded import Encoded
 from potr_cl.pipeline.fallback import with_fallback
+from potr_cl.pipeline.frame import FrameCheck, check_frame
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.run import Run, Stopwatch
 from potr_cl.placement.virtual import place_cameras
-from potr_cl.quality.evidence import evidence_of
 from potr_cl.raster.resident import ResidentScene
-from potr_cl.stages.stage import Progress, State
+from potr_cl.stages.stage import Progress, Stage, State
 from potr_cl.workers.pool import Pool
 
 _log = logging.getLogger("potr_cl")
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What an encode has kept of a scene of N splats.
+
+    Attributes:
+        splats: (n,) int64, their numbers, ascending.
+        importance: (N,) float32, what views show of each splat; None: that was not measured.
+    """
+
+    splats: NDArray[np.int64]
+    importance: NDArray[np.float32] | None
 
 
 def encode(
@@ -39,7 +51,8 @@ def encode(
     in_frame: bool = False,
     pool: Pool | None = None,
     tell: Callable[[str], None] | None = None,
-    finer: Encoded | None = None,
+    finer: Kept | None = None,
+    follow: Callable[[Stage, State], None] | None = None,
 ) -> Encoded:
     """Encode a scene.
 
@@ -53,11 +66,12 @@ def encode(
             is not enough, a CPU does the work. A warning says so.
         antialiased: whether to take it as an antialiased scene; None: as what it says that it is.
         kept: the scene on the device, if it will be needed there afterwards.
-        in_frame: whether :func:`check_frame` has found the cameras to be in the scene's frame.
+        in_frame: whether :func:`potr_cl.pipeline.frame.check_frame` has found the cameras to be in the scene's frame.
         pool: workers that views are shared out to, of which ``device`` is the first; None: the device does all.
         tell: told a line for every round of a fit.
-        finer: the next finer level of detail, where this is to be a coarser one: only splats that it has may be kept,
-            but colours are re-fitted to the whole scene's pictures all the same. None: all may be kept.
+        finer: of the next finer level of detail, where this is to be a coarser one: only splats that it has kept may
+            be, but colours are re-fitted to the whole scene's pictures all the same. None: all may be kept.
+        follow: called with each stage and what it has left.
 
     Raises:
         UsageError: options out of range, cameras without a training view, or cameras that are probably not in the
@@ -68,20 +82,20 @@ def encode(
     options = options or EncodeOptions()
     scene = scene.rendered(antialiased)
     tell_losses(scene, options)
-    watch = Stopwatch(progress, tell)
     with ExitStack() as stack:
         stack.enter_context(bounded(options.memory))
-        with frame_checked_beside(scene, cameras, options.cameras_anyway or in_frame):
-            if options.look_at_views(scene):
-                device = device or (Device() if pool is None else pool.first)
-            cameras = cameras_or_virtual(scene, cameras, options, watch, in_frame=True, device=device)
-            if kept is None and cameras and device is not None and options.look_at_views(scene):
-                others = () if pool is None else pool.devices
-                kept = stack.enter_context(ResidentScene(device, scene, options.memory, others))
-        run = Run(options, watch, device, kept, pool)
+        check = FrameCheck(scene, cameras, options.cameras_anyway or in_frame)
+        watch = Stopwatch(stack.enter_context(check.beside(progress)), tell)
+        if options.look_at_views(scene):
+            device = device or (Device() if pool is None else pool.first)
+        cameras = cameras_or_virtual(scene, cameras, options, watch, in_frame=True, device=device)
+        if kept is None and cameras and device is not None and options.look_at_views(scene):
+            others = () if pool is None else pool.devices
+            kept = stack.enter_context(ResidentScene(device, scene, options.memory, others))
+        run = Run(options, watch, device, kept, pool, follow)
         start = State.of(scene, train_views(cameras) if cameras else [])
         if finer is not None:
-            start = start.keeping(np.sort(finer.order)).with_results(importance=finer.importance)
+            start = start.keeping(finer.splats).with_results(importance=finer.importance)
         encoded = run.finished(run.stages(start))
     tell_left_out(scene, encoded)
     return encoded
@@ -133,28 +147,3 @@ def cameras_or_virtual(
     if cameras is not None and any(getattr(stage, "ground_truth", None) is not None for stage in options.stages):
         return within_photographs(cameras)
     return cameras
-
-
-def check_frame(scene: Scene, cameras: Sequence[Camera] | None, anyway: bool) -> None:
-    """Refuse cameras that are probably not in the scene's frame, but virtual ones and those that are wanted anyway.
-
-    Raises:
-        UsageError: they are not in it, or there is no training view among them.
-    """
-    if cameras and not anyway and not is_virtual(cameras):
-        views = train_views(cameras)
-        require_agreement(scene, views, evidence_of(scene, views))
-
-
-@contextmanager
-def frame_checked_beside(scene: Scene, cameras: Sequence[Camera] | None, anyway: bool) -> Iterator[None]:
-    """:func:`check_frame` in another thread, while this one opens and fills a device; a wrong frame is told first.
-
-    Raises:
-        As :func:`check_frame`, when the context ends.
-    """
-    checked = in_background(check_frame, scene, cameras, anyway)
-    try:
-        yield
-    finally:
-        checked.result()

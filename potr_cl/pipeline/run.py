@@ -147,6 +147,7 @@ class Run:
         device: the first to be tried; by default the best one there is, opened when a stage needs it.
         kept: the uncompressed scene on that device.
         pool: workers that views are shared out to, as long as the work is done on the pool's first device.
+        follow: called with each stage and what it has left.
 
     Attributes:
         device: the one on which the last stage ran that needs views; None if none did.
@@ -159,8 +160,10 @@ class Run:
         device: Device | None = None,
         kept: ResidentScene | None = None,
         pool: Pool | None = None,
+        follow: Callable[[Stage, State], None] | None = None,
     ) -> None:
         self.device: Device | None = None
+        self._follow = follow
         self._pool = pool
         self._before = Traffic() if pool is None else dataclasses.replace(pool.traffic)
         self._options, self._watch, self._given, self._kept = options, watch, device, kept
@@ -182,6 +185,8 @@ class Run:
             after = as_they_were(after)
             # What is before it is kept no longer than this: colours of a large scene take gigabytes.
             state = self._fit_that_pays(state, after) if isinstance(stage, Fit) else after
+            if self._follow is not None:
+                self._follow(stage, state)
         return state
 
     def _is_wanted(self, stage: Stage, state: State) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import closing, nullcontext
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +16,7 @@ from potr_cl.levels.plan import views_of_level
 from potr_cl.model import splat_groups
 from potr_cl.model.camera import test_views as held_out
 from potr_cl.opencl.discovery import choose_device
-from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.encode import Kept, encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.stages.fit import STEPS
 from potr_cl.views import visibility
@@ -138,7 +137,7 @@ def test_what_is_left_of_some_splats_shows_the_whole_scene(plush_excerpt, plush_
     """Its colours make up for those that could not be kept."""
     among = np.arange(0, len(plush_excerpt), 3)
     options = EncodeOptions().changed(prune={"count": len(among)}, between={"views": 0.0})
-    finer = SimpleNamespace(order=among[::-1], importance=None)
+    finer = Kept(among, None)
     found = encode(plush_excerpt, plush_excerpt_cameras, options, device=device, finer=finer)
     assert np.array_equal(np.sort(found.order), among)
     views = held_out(plush_excerpt_cameras)

@@ -16,7 +16,7 @@ from potr_cl.model.agreement import judge_cameras
 from potr_cl.model.camera import resized, train_views
 from potr_cl.model.lens import Lens
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.encode import check_frame
+from potr_cl.pipeline.frame import check_frame
 from potr_cl.quality.evidence import by_photographs, by_points, evidence_of
 from potr_cl.raster.rasterizer import Rasterizer
 from tests.cases.photographs import bent
