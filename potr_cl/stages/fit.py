@@ -41,13 +41,15 @@ FURTHER, _AT_THRESHOLD, _MOST_FURTHER = 3.5, 10**-9.3, 20.0
 #: few splats are left there, and finer steps for these cost more than they bring (docs/benchmarks/findings.md).
 FINER, _FINER_FROM = 0.18, 0.5
 #: Steps that "auto" stands for.
-STEPS: dict[Family, int] = {"cpu": 800, "gpu": 1300}
+STEPS: dict[Family, int] = {"cpu": 1000, "gpu": 1600}
 #: Views between for each given one that a fit looks at: they keep it from fitting the given ones too closely.
 BETWEEN: dict[Family, float] = {"cpu": 1.0, "gpu": 3.0}
 #: Steps of a fit to photographs that "auto" stands for: their number's square, divided by this, because few photographs
 #: are followed too closely soon; and the most.
 _SQUARE = 10
 _MOST_STEPS: dict[Family, int] = {"cpu": 250, "gpu": 1000}
+#: Views of each of these.
+_PHOTOGRAPHS = 4
 #: Iterations of the pruning before a fit.
 ITERATIONS = 16
 #: Part of the steps in each cycle but the last.
@@ -299,6 +301,7 @@ class Fit(Stage):
         options = dataclasses.replace(
             self._options(family, bench.memory),
             steps=self.photograph_steps_on(family, len(views)),
+            batch=_PHOTOGRAPHS,
             rates=self._sparse(longer(FitOptions.rates), state),
         )
         bench.progress("fit to photographs", 0.0)

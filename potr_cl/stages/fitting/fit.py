@@ -55,7 +55,8 @@ class FitOptions:
 
     Attributes:
         steps: in all, at the most.
-        batch: views that a step looks at.
+        batch: views that a step looks at. More steps with fewer views each come farther; with one view, some come to
+            nothing (docs/benchmarks/time_error.md).
         rounds: after how many equal parts of the steps the held-out views are looked at.
         patience: the fit ends after so many rounds in which they did not become better.
         rates: of the first step, if the scene is far from the targets; smaller where it is near to them. ``means`` in
@@ -70,7 +71,7 @@ class FitOptions:
     """
 
     steps: int = 1500
-    batch: int = 4
+    batch: int = 2
     rounds: int = 10
     patience: int = 3
     rates: Rates = RATES
