@@ -22,9 +22,9 @@ import numpy as np
 
 from potr_cl.errors import UsageError
 from potr_cl.levels.errors import MeasuredErrors, measuring_views
-from potr_cl.levels.lanes import Lane, lanes, side_by_side
 from potr_cl.levels.plan import MOST_BY_ITSELF, counts_of_levels, scaled, views_of_level
 from potr_cl.levels.seams import scales_shown
+from potr_cl.levels.slots import Slot, side_by_side, slots
 from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
@@ -85,11 +85,11 @@ def encode_levels(
     output = options.output
     single = options.changed(output=output.of_level(), levels=1)
     makers = _Levels(scene, cameras, single, options.wanted_levels, kept, in_frame, tell)
-    with lanes(device, pool, scene.nbytes, options) as found:
+    with slots(device, pool, scene.nbytes, options) as found:
         if kept is not None:
-            for lane in found[1:]:
-                assert lane.device is not None
-                kept.bring_to(lane.device)
+            for slot in found[1:]:
+                assert slot.device is not None
+                kept.bring_to(slot.device)
         side_by_side(makers.make, found, progress)
     made = [makers.made[level] for level in range(len(makers.made))]
     first, files, counts = made[0], [each.data for each in made], makers.counts()
@@ -157,18 +157,18 @@ class _Levels:
             raise UsageError("coarser levels of detail are pruned: leave out --no-prune, or give --levels 1")
         return found
 
-    def make(self, level: int, lane: Lane, progress: Progress) -> bool:
+    def make(self, level: int, slot: Slot, progress: Progress) -> bool:
         """Make a level; whether there is one of that number."""
         if level >= len(self._left):
             return False
         try:
-            return self._made(level, lane, progress)
+            return self._made(level, slot, progress)
         except BaseException as error:
             if not self._left[level].done():
                 self._left[level].set_exception(error)  # who waits for it ends, too
             raise
 
-    def _made(self, level: int, lane: Lane, progress: Progress) -> bool:
+    def _made(self, level: int, slot: Slot, progress: Progress) -> bool:
         how, cameras, finer, tell = self._single, self._cameras, None, self._tell
         if level:
             counts = self.counts()
@@ -177,19 +177,19 @@ class _Levels:
             finer = self._left[level - 1].result()
             assert cameras is not None
             _log.info("level %d of %d: %s splats", level, len(counts) - 1, f"{counts[level]:,}")
-            family = None if lane.device is None else lane.device.family
+            family = None if slot.device is None else slot.device.family
             how, cameras = coarser(how, level, counts[level], family), views_of_level(cameras, level)
             tell = partial(_told_of, tell, level)
         last = Fit if not level and how.stage(Fit).asked_for else Prune
 
         def follow(stage: Stage, state: State) -> None:
             if isinstance(stage, last):
-                lane.share()
+                slot.share()
                 self._left[level].set_result(Kept(state.survivors, state.results.importance))
 
         made = encode(
-            self._scene, cameras, how, progress, lane.device, kept=self._kept, in_frame=self._in_frame or level > 0,
-            pool=lane.pool, tell=tell, finer=finer, follow=follow,
+            self._scene, cameras, how, progress, slot.device, kept=self._kept, in_frame=self._in_frame or level > 0,
+            pool=slot.pool, tell=tell, finer=finer, follow=follow,
         )  # fmt: skip
         self.made[level] = made
         if not self._left[level].done():  # nothing was removed

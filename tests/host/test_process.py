@@ -6,9 +6,12 @@ import os
 import signal
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+
+from potr_cl.host import process
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals")
 
@@ -102,6 +105,19 @@ with process.unwinding(), replacing(sys.argv[1]) as file:
                     os.kill(os.getpid(), getattr(signal, name))
     file.write(b"%d" % number)
 """
+
+
+def test_threads_are_not_asked():
+    """Work of the main thread is, also while another thread's begins and ends."""
+    with process.first_interrupt_asks() as asked, ThreadPoolExecutor(1) as threads:
+
+        def work():
+            with process.first_interrupt_asks() as other:
+                process._handle(signal.SIGINT, None)
+                return bool(other)
+
+        assert not threads.submit(work).result()
+        assert asked
 
 
 def test_the_first_interrupt_asks_and_the_work_goes_on(tmp_path):

@@ -1,4 +1,4 @@
-"""Levels that are made at the same time: :func:`lanes` are what each thread makes them with, :func:`side_by_side` runs
+"""Levels that are made at the same time: :func:`slots` are what each thread makes them with, :func:`side_by_side` runs
 the threads.
 
 A level leaves the GPU idle while the host works, and the host's processors while the GPU does; of the next finer level
@@ -8,6 +8,7 @@ it has to know only which splats that keeps. Several GPUs make levels of their o
 from __future__ import annotations
 
 import itertools
+import logging
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -15,17 +16,20 @@ from contextlib import contextmanager
 from contextvars import copy_context
 from dataclasses import dataclass, replace
 
+from potr_cl.errors import DeviceError
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.stages.stage import Progress
 from potr_cl.workers.pool import Pool
 
-#: Lanes of one GPU, if its memory is so many times the scene in each.
+_log = logging.getLogger("potr_cl")
+
+#: Slots of one GPU, if its memory is so many times the scene in each.
 _ON_ONE, _ROOM = 2, 24
 
 
 @dataclass(frozen=True)
-class Lane:
+class Slot:
     """What a thread makes levels with.
 
     Attributes:
@@ -44,7 +48,7 @@ class Lane:
             self.device.info = replace(self.device.info, memory=self.memory)
 
 
-def lanes_on(device: Device, nbytes: int, memory: int | None) -> int:
+def slots_on(device: Device, nbytes: int, memory: int | None) -> int:
     """How many levels a device makes at the same time.
 
     Args:
@@ -57,28 +61,32 @@ def lanes_on(device: Device, nbytes: int, memory: int | None) -> int:
 
 
 @contextmanager
-def lanes(device: Device | None, pool: Pool | None, nbytes: int, options: EncodeOptions) -> Iterator[list[Lane]]:
-    """The lanes that there are on a device, or on all of this computer's that share the work.
+def slots(device: Device | None, pool: Pool | None, nbytes: int, options: EncodeOptions) -> Iterator[list[Slot]]:
+    """The slots that there are on a device, or on all of this computer's that share the work.
 
     A file is the same however many there are; but on a GPU that they share, views of a scene that is large for it are
-    kept in the part of its memory that is a lane's.
+    kept in the part of its memory that is a slot's.
 
     Args:
         device: the first one. pool: others that help it.
         nbytes: of the scene. options: of the encode.
     """
     if device is None or not (pool is None or pool.in_process):
-        yield [Lane(device, pool)]
+        yield [Slot(device, pool)]
         return
     devices = [device, *(() if pool is None else pool.devices)]
-    number = lanes_on(device, nbytes, options.memory)
+    number = slots_on(device, nbytes, options.memory)
     infos = [each.info for each in devices]
-    share = None if number == 1 else device.info.memory // number
-    devices += [Device(info) for _ in range(number - 1) for info in infos]
-    found = [Lane(each, None, share) for each in devices]
     try:
-        for lane in found[1:]:
-            lane.share()
+        devices += [Device(info) for _ in range(number - 1) for info in infos]
+    except DeviceError as error:  # some drivers open a device once
+        _log.debug("levels are made one after the other: %s", error)
+        number = 1
+    share = None if number == 1 else device.info.memory // number
+    found = [Slot(each, None, share) for each in devices]
+    try:
+        for slot in found[1:]:
+            slot.share()
         yield found
     finally:
         for each, info in zip(devices, infos, strict=False):
@@ -89,14 +97,14 @@ class _StopError(Exception):
     """Another thread has failed, or was interrupted."""
 
 
-def side_by_side(work: Callable[[int, Lane, Progress], bool], lanes: Sequence[Lane], progress: Progress | None) -> None:
-    """Have each lane do one work after another, from number 0 on, until there are no more.
+def side_by_side(work: Callable[[int, Slot, Progress], bool], slots: Sequence[Slot], progress: Progress | None) -> None:
+    """Have each slot do one work after another, from number 0 on, until there are no more.
 
     This thread does the first one, and tells of those that it does. If one fails, the others end as soon as they report
     how far they are.
 
     Args:
-        work: called with a number, the lane, and what to report to; false: there is none of this number.
+        work: called with a number, the slot, and what to report to; false: there is none of this number.
 
     Raises:
         What a work raises.
@@ -112,22 +120,22 @@ def side_by_side(work: Callable[[int, Lane, Progress], bool], lanes: Sequence[La
         if progress is not None:
             progress(what, done)
 
-    def go_on(lane: Lane, first: int, report: Progress) -> None:
+    def go_on(slot: Slot, first: int, report: Progress) -> None:
         try:
-            while work(first, lane, report):
+            while work(first, slot, report):
                 first = next(numbers)
         except BaseException:
             stopped.set()
             raise
 
     first = next(numbers)
-    with ThreadPoolExecutor(max(len(lanes) - 1, 1), thread_name_prefix="potr_cl lane") as threads:
+    with ThreadPoolExecutor(max(len(slots) - 1, 1), thread_name_prefix="potr_cl slot") as threads:
         others: list[Future[None]] = [
-            threads.submit(copy_context().run, lambda lane=lane: go_on(lane, next(numbers), report))
-            for lane in lanes[1:]
+            threads.submit(copy_context().run, lambda slot=slot: go_on(slot, next(numbers), report))
+            for slot in slots[1:]
         ]
         try:
-            go_on(lanes[0], first, tell)
+            go_on(slots[0], first, tell)
             for other in others:
                 other.result()
         except BaseException as error:
