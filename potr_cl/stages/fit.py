@@ -25,7 +25,7 @@ from potr_cl.quality.photographs import GroundTruth
 from potr_cl.stages.fitting.adam import Rates
 from potr_cl.stages.fitting.fit import FitOptions, Following, Sight, SupportsBool, fit_scene, held_out_error
 from potr_cl.stages.fitting.fitted import Fitted, LeftOut
-from potr_cl.stages.fitting.photographs import fit_to_photographs, shorter
+from potr_cl.stages.fitting.photographs import fit_to_photographs, longer
 from potr_cl.stages.fitting.settling import PicturesOf, Settling, settle
 from potr_cl.stages.fitting.together import kept_pictures
 from potr_cl.stages.prune import Prune
@@ -302,7 +302,7 @@ class Fit(Stage):
             self._options(family, bench.memory),
             steps=self.photograph_steps_on(family, len(views)),
             batch=_PHOTOGRAPHS,
-            rates=self._sparse(shorter(FitOptions.rates), state),
+            rates=self._sparse(longer(FitOptions.rates), state),
         )
         bench.progress("fit to photographs", 0.0)
         following = Following(lambda done, steps: bench.progress("fit to photographs", done / steps), bench.tell, asked)

@@ -45,7 +45,7 @@ _LARGEST_UNIT = 2.0**20
 #: Of the first step, means in parts of a usual splat's size, for a scene whose mean squared error has this root. All
 #: rates go with the root, because a step in all parameters at once must not do more harm than it can mend; but no rate
 #: is larger than these, or smaller than a part of them.
-RATES = Rates(means=0.01, log_scales=2e-2, quaternions=4e-3, opacity_logits=8e-2, dc=1e-2, ac=1e-3)
+RATES = Rates(means=0.005, log_scales=1e-2, quaternions=2e-3, opacity_logits=4e-2, dc=5e-3, ac=5e-4)
 _USUAL_ERROR, _SLOWEST = 1 / 128, 0.02
 
 

@@ -27,8 +27,8 @@ from potr_cl.views.targets import Photographs, PhotographTargets
 _TRIAL_STEPS, _TRIAL_LOOKS, _TRIAL_RATES = 40, 4, 0.1
 #: Whole rounds of the fit, of which someone who ends it early keeps the last.
 _ROUNDS = 5
-#: Sizes, opacities and colours take shorter steps than in a fit to a scene's own pictures.
-_SHORTER = 0.5
+#: Centres and rotations take longer steps than in a fit to a scene's own pictures, to which they come near in one go.
+_LONGER = 2.0
 
 
 def fit_to_photographs(
@@ -75,9 +75,9 @@ def fit_to_photographs(
     )  # fmt: skip
 
 
-def shorter(rates: Rates) -> Rates:
+def longer(rates: Rates) -> Rates:
     """The rates for photographs, where these are those for pictures of a scene."""
-    return dataclasses.replace(times(rates, _SHORTER), means=rates.means, quaternions=rates.quaternions)
+    return dataclasses.replace(rates, means=_LONGER * rates.means, quaternions=_LONGER * rates.quaternions)
 
 
 def times(rates: Rates, factor: float) -> Rates:
