@@ -15,7 +15,9 @@ from potr_cl.model.scene import Scene
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.compare import mean_view
 from potr_cl.quality.judging import Judging, Looks
-from potr_cl.stages.merge import Merge, _groups, merged
+from potr_cl.raster.scene_buffers import uploaded
+from potr_cl.stages.merge import Merge
+from potr_cl.stages.merging.merged import groups_of, merged
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.stage import State, Workbench
 from tests.reference.scenes import covariances, random_scene
@@ -30,11 +32,15 @@ def two_groups() -> Scene:
     return dataclasses.replace(scene, means=AT.copy(), log_scales=scene.log_scales + 1, sh=np.float32(0.1) * scene.sh)
 
 
-def merge(scene, left, importance, run=map, become=None):
-    return merged(scene, left, np.asarray(importance, np.float32), run, become)
+@pytest.fixture
+def merge(device):
+    def merge(scene, left, importance, run=map, become=None, drawable=None):
+        return merged(device, scene, left, np.asarray(importance, np.float32), run, become, drawable)
+
+    return merge
 
 
-def test_a_splat_becomes_what_its_group_was_together():
+def test_a_splat_becomes_what_its_group_was_together(merge):
     scene = two_groups()
     importance = np.array([0.5, 2.0, 1.5, 8.0, 1.0, 1.0])  # of the first group removed ones have most
     found = merge(scene, LEFT, importance)
@@ -54,7 +60,47 @@ def test_a_splat_becomes_what_its_group_was_together():
         assert np.array_equal(array[1], before[3])  # its neighbours show less than a third of the group
 
 
-def test_where_views_show_little_all_are_merged():
+def test_all_groups_are_what_float64_makes_of_them(device, merge, monkeypatch):
+    scene = random_scene(2000, 3, seed=8)
+    left = np.arange(0, len(scene), 5)
+    importance = np.random.default_rng(2).random(len(scene)).astype(np.float32) ** 3
+    with uploaded(device, scene) as whole:
+        group = groups_of(device, scene, left, map, whole)
+        found = merge(scene, left, importance, drawable=whole)
+    scales = np.sort(np.exp(scene.log_scales.astype(np.float64)), axis=1)
+    opacities = 1 / (1 + np.exp(-scene.opacity_logits.astype(np.float64)))
+    covered = np.where(opacities < 1 / 255, 0, opacities * scales[:, 1] * scales[:, 2])
+    usual = importance.sum() / covered.sum()
+    expected = covariances(found)
+    changed = 0
+    for place, own in enumerate(left):
+        of = np.flatnonzero(group == place)
+        shown, cover = importance[of].sum(), covered[of].sum()
+        merges = shown - importance[own] > 0.7 * shown or shown < 0.05 * usual * cover
+        if len(of) == 1 or not merges:
+            assert np.array_equal(found.means[place], scene.means[own])
+            continue
+        changed += 1
+        weights = importance[of] + 0.1 * usual * covered[of]
+        weights /= weights.sum()
+        middle = weights @ scene.means[of].astype(np.float64)
+        off = scene.means[of] - middle
+        covariance = np.einsum("i,ijk->jk", weights, covariances(scene)[of] + off[:, :, None] * off[:, None])
+        assert np.allclose(found.means[place], middle, atol=1e-5 * np.abs(off).max())
+        assert np.allclose(expected[place], covariance, atol=2e-6 * np.trace(covariance))
+        assert np.allclose(found.sh[place], np.einsum("i,ijk->jk", weights, scene.sh[of]), atol=1e-5)
+        area = np.prod(np.sort(np.sqrt(np.linalg.eigvalsh(covariance)))[1:])
+        opacity = 1 / (1 + np.exp(-found.opacity_logits[place].astype(np.float64)))
+        assert np.isclose(opacity, np.clip(cover / area, 1 / 255, 0.995), rtol=1e-4)
+    assert changed > 100
+    for one, two in zip(found.arrays, merge(scene, left, importance).arrays, strict=True):
+        assert np.array_equal(one, two), "as of a scene that is not on the device"
+    monkeypatch.setattr("potr_cl.stages.merging.merged._TOGETHER", 100)
+    for one, two in zip(found.arrays, merge(scene, left, importance).arrays, strict=True):
+        assert np.allclose(one, two, atol=1e-6), "as a few at a time"
+
+
+def test_where_views_show_little_all_are_merged(merge):
     scene = two_groups()
     importance = np.array([1e-6, 1e-9, 1e-9, 8.0, 1.0, 1.0])
     found = merge(scene, LEFT, importance)
@@ -62,7 +108,7 @@ def test_where_views_show_little_all_are_merged():
     assert np.array_equal(found.means[1], AT[3])
 
 
-def test_neither_threads_nor_the_length_of_quaternions_matter():
+def test_neither_threads_nor_the_length_of_quaternions_matter(merge):
     scene = random_scene(3000, 1, seed=2)
     left = np.arange(0, len(scene), 3)
     importance = np.random.default_rng(1).random(len(scene)) ** 4
@@ -78,7 +124,7 @@ def test_neither_threads_nor_the_length_of_quaternions_matter():
 
 
 @pytest.mark.parametrize("log_scale", [-80.0, 80.0])
-def test_scales_of_any_size_leave_numbers(log_scale):
+def test_scales_of_any_size_leave_numbers(merge, log_scale):
     scene = two_groups()
     scene.log_scales[1] = log_scale
     scene.opacity_logits[2] = -120.0
@@ -86,15 +132,18 @@ def test_scales_of_any_size_leave_numbers(log_scale):
     assert all(np.isfinite(array).all() for array in found.arrays)
 
 
-def test_of_a_scene_that_nobody_sees_numbers_are_left():
+def test_of_a_scene_that_nobody_sees_numbers_are_left(merge):
     found = merge(two_groups(), LEFT, np.zeros(6))
     assert all(np.isfinite(array).all() for array in found.arrays)
 
 
-def test_removed_ones_are_taken_over_by_near_ones_that_are_left():
+def test_removed_ones_are_taken_over_by_near_ones_that_are_left(device):
     scene = random_scene(3000, 1, seed=2)
     left = np.arange(0, len(scene), 3)
-    group = _groups(scene, left, map)
+    with uploaded(device, scene) as whole:
+        group = groups_of(device, scene, left, map, whole)
+        with ThreadPoolExecutor(3) as pool:
+            assert np.array_equal(groups_of(device, scene, left, pool.map, whole), group)
     assert np.array_equal(group[left], np.arange(len(left)))
     taken = np.flatnonzero(group < len(left))
     assert len(taken) > 0.9 * len(scene)
@@ -103,11 +152,9 @@ def test_removed_ones_are_taken_over_by_near_ones_that_are_left():
         np.linalg.norm(scene.means[taken] - scene.means[left[places]], axis=1) for places in (group[taken], others)
     )
     assert np.median(near) < 0.3 * np.median(far)
-    with ThreadPoolExecutor(3) as pool:
-        assert np.array_equal(_groups(scene, left, pool.map), group)
 
 
-def test_groups_of_many_are_merged():
+def test_groups_of_many_are_merged(merge):
     scene = random_scene(40_000, 0, seed=5)
     scene = dataclasses.replace(scene, means=0.01 * scene.means)
     found = merge(scene, np.array([7]), np.ones(len(scene)))
@@ -152,7 +199,7 @@ def test_only_coarser_levels_are_merged_and_none_of_preset_paper():
     assert not coarser(EncodeOptions(preset="paper"), 1, 100, "gpu").stage(Merge).on
 
 
-def test_what_is_far_or_never_drawn_is_taken_over_by_nobody():
+def test_what_is_far_or_never_drawn_is_taken_over_by_nobody(merge):
     scene = two_groups()
     scene.means[1] = 1e30
     scene.log_scales[2], scene.opacity_logits[2] = 9, -20
@@ -161,7 +208,7 @@ def test_what_is_far_or_never_drawn_is_taken_over_by_nobody():
     assert np.allclose(found.log_scales[0].max(), scene.log_scales[0].max(), atol=1e-3)
 
 
-def test_colours_stay_as_stages_before_have_left_them():
+def test_colours_stay_as_stages_before_have_left_them(merge):
     scene = two_groups()
     by_now = dataclasses.replace(scene.subset(LEFT), sh=np.full((2, 4, 3), 0.25, np.float32))
     found = merge(scene, LEFT, np.array([0.5, 2.0, 1.5, 8.0, 1.0, 1.0]), become=by_now)

@@ -1,0 +1,1 @@
+"""What the stage "merge" computes with: merged.py."""
