@@ -180,8 +180,8 @@ class ResidentScene(Owner, SceneHandle):
         return scene is self._scene
 
     def drawable(self, device: Device, scene: Scene) -> Drawable:
-        """What to give to a rasterizer for a scene: what is kept, if it is this scene and on this device."""
-        return self.found_on(device) if self.is_of(scene) and device is self._device else scene
+        """What to give to a rasterizer for a scene: what is kept, if it is this scene, brought to this device."""
+        return self.found_on(device) if self.is_of(scene) and device in self._on else scene
 
     def bring_to(self, device: Device) -> Future[SceneBuffers | None]:
         """Begin to bring it to a device, to be kept there, and do not wait for it."""

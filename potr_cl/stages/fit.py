@@ -238,6 +238,7 @@ class Fit(Stage):
             further = self.limit(price) / price
         last = best = state
         taken: Fitted | None = None
+        pace: float | None = None
         steps_of = self._steps_of_cycles(bench.opened.family, price is not None and further > 1)
         total, done = sum(steps_of) + self.further_steps_on(bench.opened.family), 0
         for number, steps in enumerate(steps_of):
@@ -251,9 +252,11 @@ class Fit(Stage):
             options = dataclasses.replace(
                 self._options(bench.opened.family, bench.memory),
                 steps=steps,
+                pace=pace,
                 rates=self._sparse(FitOptions.rates, last),
             )
             fitted = fit_scene(bench.opened, last.scene, sight, options, Following(progress, bench.tell, asked))
+            pace = fitted.pace
             last, done = dataclasses.replace(last, scene=fitted.scene, geometry=None), done + steps
             cost = fitted.error + worth * len(fitted.scene)
             spared = len(state.scene) - len(fitted.scene)

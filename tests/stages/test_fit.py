@@ -13,8 +13,9 @@ from potr_cl.errors import UsageError
 from potr_cl.model.views_between import views_between
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fit import Fit
-from potr_cl.stages.fitting.fit import FitOptions, Following, Sight, batches, fit_scene, held_out_error
+from potr_cl.stages.fitting.fit import FitOptions, Following, Sight, _best_pace, batches, fit_scene, held_out_error
 from potr_cl.stages.fitting.fitted import File, Fitted, LeftOut, TwoFiles
+from potr_cl.stages.fitting.photographs import times
 from potr_cl.stages.held_out import share_out
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.stage import Results, State, Workbench
@@ -177,6 +178,41 @@ def test_every_view_comes_as_often_as_any_other():
     taken = np.concatenate([next(order) for _ in range(7)])
     assert np.array_equal(np.bincount(taken)[3:], [4] * 7)
     assert next(batches([5], 4, seed=0)) == [5]
+
+
+@pytest.mark.parametrize(
+    ("after", "pace", "tried"),
+    [
+        ({1: 8, 2: 7, 4: 6}, 4, [1, 2, 4]),
+        ({1: 8, 2: 7, 4: 8}, 2, [1, 2, 4]),
+        ({1: 8, 2: 9, 0.5: 7}, 1, [1, 2]),  # shorter steps help more at first only
+        ({1: 11, 0.5: 9, 0.25: 10}, 0.5, [1, 0.5, 0.25]),
+        ({1: 14, 0.5: 13, 0.25: 12, 0.125: 11, 0.0625: 10.5}, 0.0625, [1, 0.5, 0.25, 0.125, 0.0625]),
+        ({1: math.nan, 0.5: 11, 0.25: 12}, 0.5, [1, 0.5, 0.25]),
+    ],
+)
+def test_the_longest_steps_that_help_are_taken(after, pace, tried):
+    asked = []
+
+    def run(options, following):
+        asked.append(options.pace)
+        return Fitted(SOURCE, options.steps, 0, (10.0, after[options.pace]), 1)
+
+    assert _best_pace(STEPS, run, Following()) == pace
+    assert asked == tried
+
+
+def test_few_steps_are_as_long_as_usual():
+    assert _best_pace(FitOptions(steps=100), None, Following()) == 1
+
+
+def test_steps_that_do_harm_become_shorter(family_device):
+    options = dataclasses.replace(STEPS, rates=times(STEPS.rates, 30.0))
+    scene, cameras = shaken(SOURCE), CAMERAS[:4]
+    harmed = fitted_to(family_device, SOURCE, scene, cameras, options)
+    found = fitted_to(family_device, SOURCE, scene, cameras, dataclasses.replace(options, pace=None))
+    assert found.pace < 1
+    assert found.error < 0.5 * harmed.error
 
 
 def test_progress_and_what_is_told(family_device):

@@ -47,6 +47,9 @@ _LARGEST_UNIT = 2.0**20
 #: is larger than these, or smaller than a part of them.
 RATES = Rates(means=0.005, log_scales=1e-2, quaternions=2e-3, opacity_logits=4e-2, dc=5e-3, ac=5e-4)
 _USUAL_ERROR, _SLOWEST = 1 / 128, 0.02
+#: A pace is tried for so many steps, at the most for such a part of all; the slowest and the fastest one; and by how
+#: many times two of them differ.
+_TRIED, _AT_MOST, _PACES, _FASTER = 48, 0.25, (1 / 16, 4.0), 2.0
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,7 @@ class FitOptions:
         rates: of the first step, if the scene is far from the targets; smaller where it is near to them. ``means`` in
             parts of a usual splat's size.
         start: part of the rates that it begins with.
+        pace: by how many times these are larger; None: as much as helps in the first steps, which are tried.
         last: part of these that is left at the end; they fall by the same factor in each step.
         seed: of the order of the views.
         memory: bytes of device memory that target pictures may take; None: a quarter of what is free.
@@ -76,6 +80,7 @@ class FitOptions:
     patience: int = 3
     rates: Rates = RATES
     start: float = 1.0
+    pace: float | None = 1.0
     last: float = 0.1
     seed: int = 0
     memory: int | None = None
@@ -173,15 +178,54 @@ def fit_scene(
         raise UsageError("a fit needs two training views or more: one of them is held out and tells whether it helps")
     rates = dataclasses.replace(options.rates, means=options.rates.means * _usual_size(scene))
     ground = Ground(scene, cameras, sight.background, rates, _limits(scene), factors)
-    with sight.pictures(device, options.memory) as pictures, DeviceFit(device, ground, pictures) as descent:
+    following = following or Following()
+    with sight.pictures(device, options.memory) as pictures:
         if options.memory is None and options.steps * options.batch >= len(fit_to):
             pictures.fill([(number,) for number in (*held_out, *fit_to)])
-        batch, helping = min(options.batch, len(fit_to)), sight.help_from if options.steps else None
-        with (
-            Judges(device, descent.derivatives.rasterizer, cameras, pictures, held_out) as judges,
-            SharedFit(descent, ground, helping, options.memory, batch) as steps,
-        ):
-            return _run(options, steps, descent.adam, judges, fit_to, following or Following())
+
+        def run(options: FitOptions, following: Following, helping: HelpFrom | None = None) -> Fitted:
+            batch = min(options.batch, len(fit_to))
+            with (
+                DeviceFit(device, ground, pictures) as descent,
+                Judges(device, descent.derivatives.rasterizer, cameras, pictures, held_out) as judges,
+                SharedFit(descent, ground, helping, options.memory, batch) as steps,
+            ):
+                return _run(options, steps, descent.adam, judges, fit_to, following)
+
+        if options.pace is None:
+            options = dataclasses.replace(options, pace=_best_pace(options, run, following))
+        return run(options, following, sight.help_from if options.steps else None)
+
+
+def _best_pace(options: FitOptions, run: Callable[[FitOptions, Following], Fitted], following: Following) -> float:
+    """The longest steps that help: longer ones if held-out views gain more by them at first, shorter ones where usual
+    ones do harm.
+
+    What suits all depends on how many of the views show a splat, and on how far these are from their targets. In a
+    large scene, of which each shows little, steps that are right for an object make it worse. But where steps help,
+    shorter ones help more at first, and come less far in the end.
+    """
+    if options.steps * _AT_MOST < _TRIED:
+        return 1.0
+    quiet = Following(tell=lambda line: None, asked=following.asked)
+
+    def errors(pace: float) -> tuple[float, float]:
+        """Before, and after."""
+        tried = dataclasses.replace(options, steps=_TRIED, rounds=1, last=1.0, pace=pace)
+        found = run(tried, quiet).errors
+        said = f"{decibels(found[-1]):.2f} dB after {_TRIED} steps at a pace of {pace:g}"
+        following.tell(f"fit: held-out views {said}, {decibels(found[0]):.2f} dB at first")
+        return found[0], found[-1]
+
+    slowest, fastest = _PACES
+    pace, (before, least) = 1.0, errors(1.0)
+    factor = _FASTER if least < before else 1 / _FASTER
+    while slowest <= pace * factor <= fastest and not following.asked:
+        _, found = errors(pace * factor)
+        if found >= least:
+            break
+        pace, least = pace * factor, found
+    return pace
 
 
 def held_out_error(device: Device, scene: Drawable, sight: Sight) -> float:
@@ -198,7 +242,7 @@ def _run(
     options: FitOptions, steps: SharedFit, adam: Adam, judges: Judges, fit_to: Sequence[int], following: Following
 ) -> Fitted:
     errors, asked = [judges.error()], following.asked
-    pace = options.start * min(max(math.sqrt(errors[0]) / _USUAL_ERROR, _SLOWEST), 1.0)
+    pace = (options.pace or 1.0) * options.start * min(max(math.sqrt(errors[0]) / _USUAL_ERROR, _SLOWEST), 1.0)
     slowing = options.last ** (1 / max(options.steps - 1, 1))
     kept = done = since = 0
     order = batches(fit_to, options.batch, options.seed)
@@ -223,7 +267,7 @@ def _run(
         following.tell(f"fit: {done} steps, held-out views {now:.2f} dB, {first:.2f} dB at first")
         if since >= options.patience:
             break
-    return Fitted(adam.kept(), done, kept, tuple(errors), len(judges), bool(asked))
+    return Fitted(adam.kept(), done, kept, tuple(errors), len(judges), bool(asked), pace=options.pace or 1.0)
 
 
 def _usual_size(scene: Scene) -> float:

@@ -130,6 +130,7 @@ class Fitted:
         photographs: what a further fit to photographs did; None if there were none.
         cost: what the scene costs, error and splats together, as a part of what it cost before those were removed.
         files: that were made to see whether the fit pays; None where there was no doubt.
+        pace: by how many times its steps were longer than usual ones.
     """
 
     scene: Scene
@@ -144,6 +145,7 @@ class Fitted:
     photographs: FittedToPhotographs | None = None
     cost: float = 0.0
     files: TwoFiles | None = None
+    pace: float = 1.0
 
     @property
     def in_doubt(self) -> bool:
@@ -164,7 +166,7 @@ class Fitted:
     @property
     def facts(self) -> dict[str, Any]:
         """All but the scene, by name."""
-        names = ("steps", "kept", "held_out", "ended_early", "spared", "without")
+        names = ("steps", "kept", "held_out", "ended_early", "spared", "without", "pace")
         facts = {name: getattr(self, name) for name in names}
         facts |= {"errors": list(self.errors), "settled": list(self.settled)}
         facts |= {"cost": self.cost, "files": None if self.files is None else self.files.facts}
