@@ -43,10 +43,11 @@ from potr_cl.workers.pool import Pool
 _log = logging.getLogger("potr_cl")
 
 #: The part of a usual fit's steps that a level is fitted for where no fit is asked for.
-_FITTED = 0.8
+_FITTED: dict[Family, float] = {"cpu": 0.8, "gpu": 0.6}
 #: By how many times a step of its fit looks at more views in each coarser level, from one view on: on a GPU at as many
-#: pixels, where a CPU would take three times as long in all. And the most views.
+#: pixels, where a CPU would take three times as long in all. And the least and the most views.
 _BATCH: dict[Family, float] = {"cpu": math.sqrt(2), "gpu": 2.0}
+_LEAST_BATCH: dict[Family, int] = {"cpu": 2, "gpu": 4}
 _MOST_BATCH = 32
 #: How strongly the re-fit holds colours to the fit's. With the usual 0.1 a small city's levels lose 2 to 4 dB in views
 #: that nobody gave, with this next to nothing, and given ones 0.4 dB (docs/benchmarks/levels.md).
@@ -219,7 +220,7 @@ def coarser(options: EncodeOptions, level: int, count: int, family: Family | Non
     fit: dict[str, Any] = {}
     if family is not None and options.preset != "paper" and not options.stage(Fit).asked_for:
         prune["iterations"] = min(options.stage(Prune).iterations, _ITERATIONS)
-        batch = min(round(_BATCH[family] ** level), _MOST_BATCH)
-        fit = {"steps": round(_FITTED * STEPS[family]), "compared": False, "batch": batch}
+        batch = min(max(round(_BATCH[family] ** level), _LEAST_BATCH[family]), _MOST_BATCH)
+        fit = {"steps": round(_FITTED[family] * STEPS[family]), "compared": False, "batch": batch}
     merge = {"on": options.preset != "paper"}
     return options.changed(prune=prune, merge=merge, fit=fit, refit={"ground_truth": None, "prior": _PRIOR})

@@ -408,7 +408,8 @@ def uploaded(device: Device, scene: Scene) -> SceneBuffers:
     """
     with device.all_or_nothing():
         buffers = SceneBuffers(device, len(scene), scene.sh.shape[1], scene.antialiased, scene.low_pass)
-        buffers.write(scene, colours=bool(scene.sh.any()))  # new ones are black
+        colours = bool(scene.sh[:_TAKEN].any() or scene.sh.any())  # new ones are black
+        buffers.write(scene, colours)
     return buffers
 
 
