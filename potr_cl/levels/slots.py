@@ -78,7 +78,7 @@ def slots(device: Device | None, pool: Pool | None, nbytes: int, options: Encode
     number = slots_on(device, nbytes, options.memory)
     infos = [each.info for each in devices]
     try:
-        devices += [Device(each.info, beside=each) for _ in range(number - 1) for each in tuple(devices)]
+        devices += [Device(info) for _ in range(number - 1) for info in infos]
     except DeviceError as error:  # some drivers open a device once
         _log.debug("levels are made one after the other: %s", error)
         number = 1

@@ -62,8 +62,6 @@ class Device:
         variants: kernel files and headers to read in place of those of these names in ``cl/``, or under names that it
             does not have (for experiments); what they include is looked up in the same way.
         macros: values that the kernels' macros have in every program, whatever the package asks for (for experiments).
-        beside: another one on the same device, whose context and programs it shares: kernels of two contexts take
-            turns there, those of one run beside each other.
 
     Attributes:
         info, context, queue.
@@ -88,7 +86,6 @@ class Device:
         build_options: Sequence[str] = (),
         variants: Mapping[str, Path] | None = None,
         macros: Mapping[str, str | int | float] | None = None,
-        beside: Device | None = None,
     ) -> None:
         self.info = info if isinstance(info, DeviceInfo) else choose_device(info)
         if (fault := compiler_fault(self.info)) is not None:
@@ -113,12 +110,9 @@ class Device:
         self._of_this_thread = threading.local()
         self._leaving: weakref.finalize[..., Device] | None = None
         with self.errors("cannot be opened"):
-            if beside is None:
-                self.context, self._built_before = context_of(self.info)
-                self._leaving = weakref.finalize(self, leave, self.info.handle, self.context, self._built_before)
-                self._leaving.atexit = False
-            else:
-                self.context, self._built_before = beside.context, beside._built_before
+            self.context, self._built_before = context_of(self.info)
+            self._leaving = weakref.finalize(self, leave, self.info.handle, self.context, self._built_before)
+            self._leaving.atexit = False
             if profiling and not self.info.profiling:
                 raise DeviceError(f"device {self.info} measures no times: open it without profiling")
             flags = cl.command_queue_properties.PROFILING_ENABLE if profiling else 0

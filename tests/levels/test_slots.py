@@ -76,7 +76,7 @@ def test_a_gpu_makes_two_levels_where_it_has_room(memory, shared, asked, slots):
 
 
 def test_a_device_that_cannot_be_opened_again_makes_one_level_after_the_other(monkeypatch, device):
-    def refuse(*_, **__):
+    def refuse(_):
         raise DeviceError("it is taken")
 
     memory = device.info.memory
