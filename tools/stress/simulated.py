@@ -54,6 +54,7 @@ from potr_cl.raster import preparing_memory as long_lists_module
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
 from potr_cl.raster.scene_buffers import Drawable, uploaded
+from potr_cl.stages.merging.merged import merged
 from potr_cl.stages.pruning.buffers import Survivors
 from potr_cl.stages.pruning.controller import prune_scene
 from potr_cl.stages.pruning.exchange import AddedChanges, AlivePacking, ChangedTotals
@@ -231,6 +232,13 @@ def clusters(device: Device) -> None:
     cluster(device, points, generator.uniform(0.1, 2, (150, 3)).astype(np.float32), 40)
 
 
+def merging(device: Device) -> None:
+    """Groups of many sizes, some of which stay as they are."""
+    scene = random_splats(300, 1, seed=4)
+    importance = np.random.default_rng(5).random(len(scene)).astype(np.float32) ** 4
+    merged(device, scene, np.arange(0, len(scene), 6), importance)
+
+
 def filling(device: Device) -> None:
     """A buffer that a kernel fills, as large ones are."""
     with patch.object(opencl_device, "_FILLED", 0), Memory(device) as memory:
@@ -241,7 +249,8 @@ def filling(device: Device) -> None:
 
 
 STEPS: tuple[Step, ...] = (
-    views, long_lists, all_stages, view_by_view, refits, packing, marks, decoding, clusters, check_similarity, filling,
+    views, long_lists, all_stages, view_by_view, refits, packing, marks, decoding, clusters, merging, check_similarity,
+    filling,
 )  # fmt: skip
 
 
