@@ -43,7 +43,7 @@ from potr_cl.workers.pool import Pool
 _log = logging.getLogger("potr_cl")
 
 #: The part of a usual fit's steps that a level is fitted for where no fit is asked for.
-_FITTED: dict[Family, float] = {"cpu": 0.8, "gpu": 0.6}
+_FITTED: dict[Family, float] = {"cpu": 0.5, "gpu": 0.6}
 #: By how many times a step of its fit looks at more views in each coarser level, from one view on: on a GPU at as many
 #: pixels, where a CPU would take three times as long in all. And the least and the most views.
 _BATCH: dict[Family, float] = {"cpu": math.sqrt(2), "gpu": 2.0}

@@ -13,6 +13,7 @@ from potr_cl.errors import UsageError
 from potr_cl.model.views_between import views_between
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fit import Fit
+from potr_cl.stages.fitting.adam import Adam
 from potr_cl.stages.fitting.fit import FitOptions, Following, Sight, _best_pace, batches, fit_scene, held_out_error
 from potr_cl.stages.fitting.fitted import File, Fitted, LeftOut, TwoFiles
 from potr_cl.stages.fitting.photographs import times
@@ -213,6 +214,20 @@ def test_steps_that_do_harm_become_shorter(family_device):
     found = fitted_to(family_device, SOURCE, scene, cameras, dataclasses.replace(options, pace=None))
     assert found.pace < 1
     assert found.error < 0.5 * harmed.error
+
+
+def test_rates_are_halved_where_held_out_views_gain_nothing(family_device, monkeypatch):
+    parts, step = [], Adam.step
+
+    def noted(self, gradient, part):
+        parts.append(part)
+        step(self, gradient, part)
+
+    monkeypatch.setattr(Adam, "step", noted)
+    options = FitOptions(steps=40, rounds=4, last=1.0)
+    fitted_to(family_device, SOURCE, SOURCE, CAMERAS, options)
+    pace = parts[0]
+    assert parts == [pace] * 20 + [pace / 2] * 10  # not after the first round, and it ends after three
 
 
 def test_progress_and_what_is_told(family_device):
