@@ -184,7 +184,7 @@ def test_every_view_comes_as_often_as_any_other():
 @pytest.mark.parametrize(
     ("after", "pace", "tried"),
     [
-        ({1: 8, 2: 7, 4: 6}, 4, [1, 2, 4]),
+        ({1: 8, 2: 7, 4: 6, 8: 5}, 8, [1, 2, 4, 8]),
         ({1: 8, 2: 7, 4: 8}, 2, [1, 2, 4]),
         ({1: 8, 2: 9, 0.5: 7}, 1, [1, 2]),  # shorter steps help more at first only
         ({1: 11, 0.5: 9, 0.25: 10}, 0.5, [1, 0.5, 0.25]),
