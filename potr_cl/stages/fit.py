@@ -23,7 +23,15 @@ from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.discovery import Family
 from potr_cl.quality.photographs import GroundTruth
 from potr_cl.stages.fitting.adam import Rates
-from potr_cl.stages.fitting.fit import FitOptions, Following, Sight, SupportsBool, fit_scene, held_out_error
+from potr_cl.stages.fitting.fit import (
+    FitOptions,
+    Following,
+    Sight,
+    SupportsBool,
+    fit_scene,
+    held_out_error,
+    tries_paces,
+)
 from potr_cl.stages.fitting.fitted import Fitted, LeftOut
 from potr_cl.stages.fitting.photographs import fit_to_photographs, longer
 from potr_cl.stages.fitting.settling import PicturesOf, Settling, settle
@@ -256,7 +264,7 @@ class Fit(Stage):
                 rates=self._sparse(FitOptions.rates, last),
             )
             fitted = fit_scene(bench.opened, last.scene, sight, options, Following(progress, bench.tell, asked))
-            pace = fitted.pace
+            pace = fitted.pace if tries_paces(steps) else None
             last, done = dataclasses.replace(last, scene=fitted.scene, geometry=None), done + steps
             cost = fitted.error + worth * len(fitted.scene)
             spared = len(state.scene) - len(fitted.scene)
@@ -274,7 +282,10 @@ class Fit(Stage):
         self, state: State, bench: Workbench, sight: Sight, pictures: PicturesOf, asked: SupportsBool
     ) -> State:
         """Choose coefficients and round geometry, with what is left fitted once more in between."""
-        options = self._options(bench.opened.family, bench.memory)
+        told = state.results.fitted
+        assert isinstance(told, Fitted)
+        # Where usual steps do harm, these do, too.
+        options = dataclasses.replace(self._options(bench.opened.family, bench.memory), pace=min(told.pace, 1.0))
         settling = Settling(self.choosing, self.rounding)
         done, total = options.steps, options.steps + self.further_steps_on(bench.opened.family)
 
@@ -284,8 +295,6 @@ class Fit(Stage):
             bench.progress("fit", min(done / total, 1.0) * 0.99)
 
         then, errors = settle(state, bench, sight, pictures, settling, options, asked, progress)
-        told = state.results.fitted
-        assert isinstance(told, Fitted)
         return then.with_results(fitted=dataclasses.replace(told, settled=errors))
 
     def _steps_of_cycles(self, family: Family, removing: bool) -> list[int]:

@@ -14,7 +14,16 @@ from potr_cl.model.views_between import views_between
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fit import Fit
 from potr_cl.stages.fitting.adam import Adam
-from potr_cl.stages.fitting.fit import FitOptions, Following, Sight, _best_pace, batches, fit_scene, held_out_error
+from potr_cl.stages.fitting.fit import (
+    FitOptions,
+    Following,
+    Judges,
+    Sight,
+    _best_pace,
+    batches,
+    fit_scene,
+    held_out_error,
+)
 from potr_cl.stages.fitting.fitted import File, Fitted, LeftOut, TwoFiles
 from potr_cl.stages.fitting.photographs import times
 from potr_cl.stages.held_out import share_out
@@ -189,6 +198,7 @@ def test_every_view_comes_as_often_as_any_other():
         ({1: 8, 2: 9, 0.5: 7}, 1, [1, 2]),  # shorter steps help more at first only
         ({1: 11, 0.5: 9, 0.25: 10}, 0.5, [1, 0.5, 0.25]),
         ({1: 14, 0.5: 13, 0.25: 12, 0.125: 11, 0.0625: 10.5}, 0.0625, [1, 0.5, 0.25, 0.125, 0.0625]),
+        ({1: 8, 2: math.nan}, 1, [1, 2]),
         ({1: math.nan, 0.5: 11, 0.25: 12}, 0.5, [1, 0.5, 0.25]),
     ],
 )
@@ -201,6 +211,24 @@ def test_the_longest_steps_that_help_are_taken(after, pace, tried):
 
     assert _best_pace(STEPS, run, Following()) == pace
     assert asked == tried
+
+
+def test_a_pace_is_no_good_where_someone_asks_to_end_meanwhile():
+    def run(options, following):
+        return Fitted(SOURCE, 0, 0, (10.0, 12.0 if options.pace == 1 else 9.0), 1, options.pace < 1)
+
+    assert _best_pace(STEPS, run, Following()) == 1
+
+
+def test_a_trial_says_that_it_goes_on():
+    told = []
+
+    def run(options, following):
+        following.progress(1, options.steps)
+        return Fitted(SOURCE, 0, 0, (10.0, 9.0 if options.pace == 1 else 9.5), 1)
+
+    _best_pace(STEPS, run, Following(lambda *done: told.append(done)))
+    assert told == [(0, STEPS.steps)] * 2
 
 
 def test_few_steps_are_as_long_as_usual():
@@ -216,7 +244,7 @@ def test_steps_that_do_harm_become_shorter(family_device):
     assert found.error < 0.5 * harmed.error
 
 
-def test_rates_are_halved_where_held_out_views_gain_nothing(family_device, monkeypatch):
+def test_rates_are_halved_where_held_out_views_become_worse(family_device, monkeypatch):
     parts, step = [], Adam.step
 
     def noted(self, gradient, part):
@@ -224,10 +252,12 @@ def test_rates_are_halved_where_held_out_views_gain_nothing(family_device, monke
         step(self, gradient, part)
 
     monkeypatch.setattr(Adam, "step", noted)
-    options = FitOptions(steps=40, rounds=4, last=1.0)
+    errors = iter([0.10, 0.14, 0.12, 0.13, 0.11])
+    monkeypatch.setattr(Judges, "error", lambda self: next(errors))
+    options = FitOptions(steps=50, rounds=5, patience=4, last=1.0)
     fitted_to(family_device, SOURCE, SOURCE, CAMERAS, options)
-    pace = parts[0]
-    assert parts == [pace] * 20 + [pace / 2] * 10  # not after the first round, and it ends after three
+    # Not after the first round, nor after the second, which gains; the fit ends after four that are not the best.
+    assert parts == [parts[0]] * 30 + [parts[0] / 2] * 10
 
 
 def test_progress_and_what_is_told(family_device):

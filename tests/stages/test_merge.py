@@ -132,6 +132,10 @@ def test_scales_of_any_size_leave_numbers(merge, log_scale):
     assert all(np.isfinite(array).all() for array in found.arrays)
 
 
+def test_where_nothing_is_left_nothing_is_merged(merge):
+    assert len(merge(two_groups(), np.array([], np.int64), np.ones(6))) == 0
+
+
 def test_of_a_scene_that_nobody_sees_numbers_are_left(merge):
     found = merge(two_groups(), LEFT, np.zeros(6))
     assert all(np.isfinite(array).all() for array in found.arrays)

@@ -26,7 +26,7 @@
 
 inline float3 column3(global const float *columns, uint stride, uint splat)
 {
-    return (float3)(columns[splat], columns[stride + splat], columns[2 * (size_t)stride + splat]);
+    return (float3)(columns[splat], columns[(size_t)stride + splat], columns[2 * (size_t)stride + splat]);
 }
 
 /* Of an ellipsoid where it is seen as large as can be, but for a factor. */
@@ -80,11 +80,11 @@ kernel void nearest(uint stride, global const float *means, global const float *
     groups[splat] = found;
 }
 
-/* One rotation of Jacobi's method: of the symmetric matrix with a_pp, a_qq, a_pq, and a_pr, a_qr; sign and axis say
-   which way a quaternion turns with it. */
+/* One rotation of Jacobi's method, of the symmetric matrix with a_pp, a_qq, a_pq, and a_pr, a_qr; axis: about which the
+   quaternion turns with it. */
 inline void turn(float *pp, float *qq, float *pq, float *pr, float *qr, float4 *quaternion, float4 axis)
 {
-    if (*pq == 0.0f)
+    if (!(fabs(*pq) > 1e-37f))
         return;
     const float theta = (*qq - *pp) / (2 * *pq);
     const float t = copysign(1.0f, theta) / (fabs(theta) + sqrt(theta * theta + 1));
@@ -106,7 +106,8 @@ inline void turn(float *pp, float *qq, float *pq, float *pr, float *qr, float4 *
    starts[g + 1]; kept is what views show of that which is left. */
 kernel void merge_shapes(uint stride, global const float *means, global const float *scales,
     global const float *quaternions, global const float *covered, global const float *importance,
-    global const float *kept, float usual, global const uint *starts, uint count, global float *weights, global uint *merged, global float *found)
+    global const float *kept, float usual, global const uint *starts, uint count, global float *weights,
+    global uint *merged, global float *found)
 {
     const uint group = get_global_id(0);
     if (group >= count)
@@ -130,7 +131,7 @@ kernel void merge_shapes(uint stride, global const float *means, global const fl
     }
     float xx = 0.0f, yy = 0.0f, zz = 0.0f, xy = 0.0f, xz = 0.0f, yz = 0.0f;
     for (uint k = first; k < end; ++k) {
-        const float w = quaternions[k], x = quaternions[stride + k];
+        const float w = quaternions[k], x = quaternions[(size_t)stride + k];
         const float y = quaternions[2 * (size_t)stride + k], z = quaternions[3 * (size_t)stride + k];
         const float3 size = fmax(column3(scales, stride, k), LEAST);
         const float3 off = column3(means, stride, k) - from - middle;

@@ -16,6 +16,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -44,12 +45,14 @@ _USUAL_DIFFERENCE = 1 / 8
 _LARGEST_UNIT = 2.0**20
 #: Of the first step, means in parts of a usual splat's size, for a scene whose mean squared error has this root. All
 #: rates go with the root, because a step in all parameters at once must not do more harm than it can mend; but no rate
-#: is larger than these, or smaller than a part of them.
+#: is larger than these, or smaller than a part of them, before the pace is looked for.
 RATES = Rates(means=0.005, log_scales=1e-2, quaternions=2e-3, opacity_logits=4e-2, dc=5e-3, ac=5e-4)
 _USUAL_ERROR, _SLOWEST = 1 / 128, 0.02
-#: A pace is tried for so many steps, at the most for such a part of all; the slowest and the fastest one; and by how
-#: many times two of them differ.
+#: A pace is tried for so many steps, if they are no more than such a part of all; the slowest and the fastest one; and
+#: by how many times two of them differ.
 _TRIED, _AT_MOST, _PACES, _FASTER = 32, 0.25, (1 / 16, 8.0), 2.0
+#: Rates are multiplied by this after a round in which held-out views became worse.
+_SLOWER = 0.5
 
 
 @dataclass(frozen=True)
@@ -66,7 +69,8 @@ class FitOptions:
             parts of a usual splat's size.
         start: part of the rates that it begins with.
         pace: by how many times these are larger; None: as much as helps in the first steps, which are tried.
-        last: part of these that is left at the end; they fall by the same factor in each step.
+        last: part of these that is left at the end; they fall by the same factor in each step, and by half after a round
+            in which the held-out views became worse.
         seed: of the order of the views.
         memory: bytes of device memory that target pictures may take; None: a quarter of what is free.
 
@@ -91,6 +95,8 @@ class FitOptions:
         for name in ("batch", "rounds", "patience"):
             if not 1 <= getattr(self, name) <= 1000:
                 raise UsageError(f"the fit's {name} is {getattr(self, name)}, it must be from 1 to 1000")
+        if self.pace is not None and not 0 < self.pace <= 1000:
+            raise UsageError(f"the fit's pace is {self.pace:g}, it must be above 0 and at most 1000")
         for name in ("start", "last"):
             if not 0 < getattr(self, name) <= 1:
                 raise UsageError(f"the fit's {name} rate is {getattr(self, name):g}, it must be above 0 and at most 1")
@@ -153,10 +159,6 @@ class Sight:
         return kept_pictures(device, self.cameras, self.targets, memory)
 
 
-#: The rates are less by so much after a round in which held-out views did not gain.
-_SLOWER = 0.5
-
-
 def fit_scene(
     device: Device,
     scene: Scene,
@@ -187,18 +189,20 @@ def fit_scene(
         if options.memory is None and options.steps * options.batch >= len(fit_to):
             pictures.fill([(number,) for number in (*held_out, *fit_to)])
 
-        def run(options: FitOptions, following: Following, helping: HelpFrom | None = None) -> Fitted:
+        def run(
+            options: FitOptions, following: Following, helping: HelpFrom | None = None, tried: bool = False
+        ) -> Fitted:
             batch = min(options.batch, len(fit_to))
             with (
                 DeviceFit(device, ground, pictures) as descent,
                 Judges(device, descent.derivatives.rasterizer, cameras, pictures, held_out) as judges,
                 SharedFit(descent, ground, helping, options.memory, batch) as steps,
             ):
-                return _run(options, steps, descent.adam, judges, fit_to, following)
+                return _run(options, steps, descent.adam, judges, fit_to, following, scene if tried else None)
 
         if options.pace is None:
-            options = dataclasses.replace(options, pace=_best_pace(options, run, following))
-        return run(options, following, sight.help_from if options.steps else None)
+            options = dataclasses.replace(options, pace=_best_pace(options, partial(run, tried=True), following))
+        return run(options, following)
 
 
 def _best_pace(options: FitOptions, run: Callable[[FitOptions, Following], Fitted], following: Following) -> float:
@@ -209,27 +213,34 @@ def _best_pace(options: FitOptions, run: Callable[[FitOptions, Following], Fitte
     large scene, of which each shows little, steps that are right for an object make it worse. But where steps help,
     shorter ones help more at first, and come less far in the end.
     """
-    if options.steps * _AT_MOST < _TRIED:
+    if not tries_paces(options.steps):
         return 1.0
-    quiet = Following(tell=lambda line: None, asked=following.asked)
+    quiet = Following(lambda *_: following.progress(0, options.steps), lambda line: None, following.asked)
 
     def errors(pace: float) -> tuple[float, float]:
-        """Before, and after."""
+        """Before, and after; where someone asks to end meanwhile, this pace is no good."""
         tried = dataclasses.replace(options, steps=_TRIED, rounds=1, last=1.0, pace=pace)
-        found = run(tried, quiet).errors
-        said = f"{decibels(found[-1]):.2f} dB after {_TRIED} steps at a pace of {pace:g}"
-        following.tell(f"fit: held-out views {said}, {decibels(found[0]):.2f} dB at first")
-        return found[0], found[-1]
+        found = run(tried, quiet)
+        if found.ended_early:
+            return found.errors[0], math.inf
+        said = f"{decibels(found.errors[-1]):.2f} dB after {_TRIED} steps at a pace of {pace:g}"
+        following.tell(f"fit: held-out views {said}, {decibels(found.errors[0]):.2f} dB at first")
+        return found.errors[0], found.errors[-1]
 
     slowest, fastest = _PACES
     pace, (before, least) = 1.0, errors(1.0)
     factor = _FASTER if least < before else 1 / _FASTER
     while slowest <= pace * factor <= fastest and not following.asked:
         _, found = errors(pace * factor)
-        if found >= least:
+        if not (found < least or math.isnan(least)):
             break
         pace, least = pace * factor, found
     return pace
+
+
+def tries_paces(steps: int) -> bool:
+    """Whether a fit of so many steps tries how long they may be."""
+    return _AT_MOST * steps >= _TRIED
 
 
 def held_out_error(device: Device, scene: Drawable, sight: Sight) -> float:
@@ -243,10 +254,13 @@ def held_out_error(device: Device, scene: Drawable, sight: Sight) -> float:
 
 
 def _run(
-    options: FitOptions, steps: SharedFit, adam: Adam, judges: Judges, fit_to: Sequence[int], following: Following
-) -> Fitted:
+    options: FitOptions, steps: SharedFit, adam: Adam, judges: Judges, fit_to: Sequence[int], following: Following,
+    scene: Scene | None = None,
+) -> Fitted:  # fmt: skip
+    """Take the steps. ``scene``: what the result has for its scene, where nobody asks for it."""
     errors, asked = [judges.error()], following.asked
-    pace = (options.pace or 1.0) * options.start * min(max(math.sqrt(errors[0]) / _USUAL_ERROR, _SLOWEST), 1.0)
+    first_pace = 1.0 if options.pace is None else options.pace
+    pace = first_pace * options.start * min(max(math.sqrt(errors[0]) / _USUAL_ERROR, _SLOWEST), 1.0)
     slowing = options.last ** (1 / max(options.steps - 1, 1))
     kept = done = since = 0
     order = batches(fit_to, options.batch, options.seed)
@@ -267,13 +281,15 @@ def _run(
                 kept, since = done, 0
             else:
                 since += 1
-                if round_number > 1:  # roundings that a fit begins with make it worse at first
+                # Roundings that a fit begins with make it worse at first.
+                if round_number > 1 and not errors[-1] < errors[-2]:
                     pace *= _SLOWER
         now, first = decibels(errors[-1]), decibels(errors[0])
         following.tell(f"fit: {done} steps, held-out views {now:.2f} dB, {first:.2f} dB at first")
         if since >= options.patience:
             break
-    return Fitted(adam.kept(), done, kept, tuple(errors), len(judges), bool(asked), pace=options.pace or 1.0)
+    found = adam.kept() if scene is None else scene
+    return Fitted(found, done, kept, tuple(errors), len(judges), bool(asked), pace=first_pace)
 
 
 def _usual_size(scene: Scene) -> float:

@@ -130,7 +130,7 @@ class Fitted:
         photographs: what a further fit to photographs did; None if there were none.
         cost: what the scene costs, error and splats together, as a part of what it cost before those were removed.
         files: that were made to see whether the fit pays; None where there was no doubt.
-        pace: by how many times its steps were longer than usual ones.
+        pace: by how many times its first steps were longer than usual ones.
     """
 
     scene: Scene

@@ -24,7 +24,7 @@ _SOURCE = "merge/merge.cl"
 #: By which the second curve is turned, about two axes: what is far apart on one is mostly near on the other.
 _COS, _SIN = math.cos(0.7), math.sin(0.7)
 _TURN = np.array([[_COS, -_SIN, 0], [_COS * _SIN, _COS * _COS, -_SIN], [_SIN * _SIN, _SIN * _COS, _COS]], np.float32)
-#: Splats that a thread turns at a time, and that are merged at a time, but for the last group's.
+#: Splats that a thread turns at a time; and that are merged at a time, but for a group of more.
 _TURNED, _TOGETHER = 1 << 17, 1 << 20
 
 
@@ -154,7 +154,7 @@ def groups_of(device: Device, scene: Scene, left: _Indices, run: Run, whole: Sce
             order = morton_order(means, run)
             stays = is_left[order]
             curve, gone = (order[which].astype(np.uint32) for which in (stays, ~stays))
-            if not len(gone):
+            if not len(gone) or not len(curve):
                 break
             places = np.cumsum(stays, dtype=np.uint32)[~stays]
             with Memory(device) as passing:
