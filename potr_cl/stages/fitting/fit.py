@@ -69,8 +69,8 @@ class FitOptions:
             parts of a usual splat's size.
         start: part of the rates that it begins with.
         pace: by how many times these are larger; None: as much as helps in the first steps, which are tried.
-        last: part of these that is left at the end; they fall by the same factor in each step, and by half after a round
-            in which the held-out views became worse.
+        last: part of these that is left at the end; they fall by the same factor in each step, and by half after a
+            round in which the held-out views became worse.
         seed: of the order of the views.
         memory: bytes of device memory that target pictures may take; None: a quarter of what is free.
 
