@@ -33,7 +33,7 @@ KNOBS: dict[str, tuple[str, str, tuple[Any, ...]]] = {
     "views between, for each given one": ("best", "between.views", (0, 0.25, 1)),
     "steps of the re-fit": ("best", "refit.steps", (2, 4, 12, 16)),
     "re-fits while pruning": ("best", "refit.at", ((0.5,), (0.5, 0.75))),
-    "smallest: steps of the fit": ("smallest", "fit.steps", (400, 800, 3200)),
+    "smallest: steps of the fit": ("smallest", "fit.steps", (400, 700, 1500, 3200)),
     "smallest: views in a step of the fit": ("smallest", "fit.batch", (1, 4)),
     "smallest: views between of the fit, for each given one": ("smallest", "fit.between", (0.5, 1.0)),
     "smallest: re-fits while pruning": ("smallest", "refit.at", ((), (0.5, 0.75))),
