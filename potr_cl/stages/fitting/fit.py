@@ -189,9 +189,8 @@ def fit_scene(
         if options.memory is None and options.steps * options.batch >= len(fit_to):
             pictures.fill([(number,) for number in (*held_out, *fit_to)])
 
-        def run(
-            options: FitOptions, following: Following, helping: HelpFrom | None = None, tried: bool = False
-        ) -> Fitted:
+        def run(options: FitOptions, following: Following, tried: bool = False) -> Fitted:
+            helping = sight.help_from if options.steps and not tried else None
             batch = min(options.batch, len(fit_to))
             with (
                 DeviceFit(device, ground, pictures) as descent,
