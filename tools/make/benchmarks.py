@@ -15,10 +15,11 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import hashlib
+import itertools
 import json
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -229,11 +230,12 @@ class Plot:
             figure, axes = pyplot.subplots(1, 2, figsize=(10, 5))
             self.panels(results, axes)
             figure.suptitle(self.title, fontsize=12)
-            handles, labels = axes[0].get_legend_handles_labels()
-            columns = 4 if max(map(len, labels)) < 30 else 2
-            rows = -(-len(labels) // columns)
+            entries = (zip(*reversed(axis.get_legend_handles_labels()), strict=True) for axis in axes)
+            handles = dict(itertools.chain.from_iterable(entries))
+            columns = 4 if max(map(len, handles)) < 30 else 2
+            rows = -(-len(handles) // columns)
             figure.tight_layout(rect=(0, 0.015 + 0.045 * rows, 1, 1))
-            figure.legend(handles, labels, loc="lower center", ncols=columns, fontsize=9)
+            figure.legend(handles.values(), handles.keys(), loc="lower center", ncols=columns, fontsize=9)
             figure.savefig(self.path, dpi=120, metadata={"Results": self.digest(results), "Software": None})
             pyplot.close(figure)
 
@@ -244,22 +246,25 @@ def _ticks(axis: Any, ticks: Sequence[float]) -> None:
     axis.minorticks_off()
 
 
-def _knobs(results: Results, axes: Sequence[Any]) -> None:
-    """Bytes at equal PSNR by time, a line a knob through the defaults at (1, 0)."""
-    for (name, title), axis in zip(_KNOBS.items(), axes, strict=True):
-        rows = results[name].records()
-        knobs = dict.fromkeys(row["knob"] for row in rows if row["value"] != "default")
-        for knob, style in zip(knobs, [*_STYLES, *({**each, "mfc": "w"} for each in _STYLES)], strict=False):
-            turned = [row for row in rows if row["knob"] == knob]
-            cells = ((row["time, in that of the default"], row["bytes at equal PSNR"]) for row in turned)
-            axis.plot(*zip(*sorted([(1.0, 0.0), *cells]), strict=True), label=knob, lw=1, **style)
-        axis.plot([1], [0], marker="*", ms=14, color="k", ls="", label="default")
-        axis.set(title=title, xlabel="time, in that of the default", ylim=(-3, 10))
-        _ticks(axis, (0.6, 0.8, 1, 1.3, 1.6))
-    axes[0].set_ylabel("bytes at equal PSNR, %")
+def _knobs(name: str, machine: str, tables: Mapping[str, str], bytes_shown: tuple[float, float]) -> Plot:
+    """Bytes at equal PSNR by time, a line a knob through the defaults at (1, 0); a panel a table, by its title."""
 
+    def panels(results: Results, axes: Sequence[Any]) -> None:
+        rows = {table: [row for row in results[table].records() if row["value"] != "default"] for table in tables}
+        changes: tuple[dict[str, Any], ...] = ({}, {"mfc": "w"}, {"ls": ":"})
+        styles = ({**each, **more} for more in changes for each in _STYLES)
+        style_of = dict(zip(dict.fromkeys(row["knob"] for some in rows.values() for row in some), styles, strict=False))
+        for (table, title), axis in zip(tables.items(), axes, strict=True):
+            for knob in dict.fromkeys(row["knob"] for row in rows[table]):
+                turned = [row for row in rows[table] if row["knob"] == knob]
+                cells = ((row["time, in that of the default"], row["bytes at equal PSNR"]) for row in turned)
+                axis.plot(*zip(*sorted([(1.0, 0.0), *cells]), strict=True), label=knob, lw=1, **style_of[knob])
+            axis.plot([1], [0], marker="*", ms=14, color="k", ls="", label="default")
+            axis.set(title=title, xlabel="time, in that of the default", ylim=bytes_shown)
+            _ticks(axis, (0.6, 0.8, 1, 1.3, 1.6, 2))
+        axes[0].set_ylabel("bytes at equal PSNR, %")
 
-_KNOBS = {"time_error/lego_h200": "lego, on a GPU", "time_error/plush_h200": "plush, on a GPU"}
+    return Plot(name, f"What does each knob cost and bring on a {machine}?", tuple(tables), panels)
 
 
 def _curves(name: str, title: str, subject: str, series: Sequence[str], against: str, formats: bool = True) -> Plot:
@@ -332,7 +337,13 @@ PLOTS: tuple[Plot, ...] = (
         "photographs", "What does a fit to photographs bring, on photographs that nobody has looked at?",
         "photographs", _FITTED, "photographs", formats=False,
     ),
-    Plot("time_error", "What does each knob cost and bring?", tuple(_KNOBS), _knobs),
+    _knobs("time_error", "GPU", {"time_error/lego_h200": "lego", "time_error/plush_h200": "plush"}, (-3, 10)),
+    _knobs(
+        "time_error_cpu",
+        "CPU",
+        {"time_error/lego_cpu": "lego, small views, best", "time_error/lego_cpu_smallest": "the same, smallest"},
+        (-8, 15),
+    ),
     Plot("gpus", "What do more GPUs bring?", ("scaling/gpu_points", "scaling/gpu_foretold"), _gpus),
 )  # fmt: skip
 
