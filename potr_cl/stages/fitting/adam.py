@@ -107,21 +107,34 @@ class Adam(Owner):
         factors: Factors = UNROUNDED,
     ) -> None:
         self._device, self._scene, self.buffers, self.columns = device, scene, buffers, columns
-        self._factors, self._taken = factors, 0
+        self._factors = factors
         # AC coefficients that stand still are left out: four fifths of all columns. Their average is what they are.
         self._moving = columns.count if rates.ac else columns.ac.start
         self._start = _columns_of(scene, columns, buffers.stride)
         self._memory = Memory(device)
         with device.all_or_nothing():
             self.values = self._memory.upload(self._start, "the parameters")
-            self._kept = self._memory.upload(self._start, "the best parameters")
             nbytes = self.values.size
+            self._kept = self._memory.allocate(nbytes, "the best parameters")
             self._moments = [self._memory.allocate(nbytes, "the gradient's moments") for _ in range(2)]
-            for moment in self._moments:
-                device.fill(moment, np.float32(0), nbytes)
-            self._averages = self._memory.upload(self._start, "the averages")
+            self._averages = self._memory.allocate(nbytes, "the averages")
+            self._begin()
             self._steps = self._memory.upload(_steps(columns, rates, limits), "the steps")
             self._activate, self._step = (device.shared_kernel("fit/adam.cl", name) for name in ("activate", "adam"))
+
+    def restart(self) -> None:
+        """Begin anew, and give the rasterizer its scene."""
+        self._device.copy(self.values, self._start)
+        self._begin()
+        self.give()
+
+    def _begin(self) -> None:
+        """The moments and averages of parameters that have not moved."""
+        self._taken = 0
+        for moment in self._moments:
+            self._device.fill(moment, np.float32(0), moment.size)
+        self.keep()
+        self._device.copy(self._averages, self.values)
 
     def step(self, gradient: cl.Buffer, part: float) -> None:
         """Take a step, and give the rasterizer its scene.

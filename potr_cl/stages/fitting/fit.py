@@ -16,7 +16,6 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -189,24 +188,29 @@ def fit_scene(
         if options.memory is None and options.steps * options.batch >= len(fit_to):
             pictures.fill([(number,) for number in (*held_out, *fit_to)])
 
-        def run(options: FitOptions, following: Following, tried: bool = False) -> Fitted:
-            helping = sight.help_from if options.steps and not tried else None
-            batch = min(options.batch, len(fit_to))
-            with (
-                DeviceFit(device, ground, pictures) as descent,
-                Judges(device, descent.derivatives.rasterizer, cameras, pictures, held_out) as judges,
-                SharedFit(descent, ground, helping, options.memory, batch) as steps,
-            ):
-                return _run(options, steps, descent.adam, judges, fit_to, following, scene if tried else None)
+        with (
+            DeviceFit(device, ground, pictures) as descent,
+            Judges(device, descent.derivatives.rasterizer, cameras, pictures, held_out) as judges,
+        ):
 
-        if options.pace is None:
-            options = dataclasses.replace(options, pace=_best_pace(options, partial(run, tried=True), following))
-        return run(options, following)
+            def run(options: FitOptions, following: Following, tried: bool = False) -> Fitted:
+                helping = sight.help_from if options.steps and not tried else None
+                with SharedFit(descent, ground, helping, options.memory, min(options.batch, len(fit_to))) as steps:
+                    return _run(options, steps, descent.adam, judges, fit_to, following, scene if tried else None)
+
+            def trial(options: FitOptions, following: Following) -> Fitted:
+                found = run(options, following, tried=True)
+                descent.restart()
+                return found
+
+            if options.pace is None:
+                options = dataclasses.replace(options, pace=_best_pace(options, trial, following))
+            return run(options, following)
 
 
 def _best_pace(options: FitOptions, run: Callable[[FitOptions, Following], Fitted], following: Following) -> float:
-    """The longest steps that help: longer ones if held-out views gain more by them at first, shorter ones where usual
-    ones do harm.
+    """The longest steps that help: longer ones if held-out views gain more by them at first, and where usual ones do
+    harm, the first shorter ones that do none.
 
     What suits all depends on how many of the views show a splat, and on how far these are from their targets. In a
     large scene, of which each shows little, steps that are right for an object make it worse. But where steps help,
@@ -228,12 +232,14 @@ def _best_pace(options: FitOptions, run: Callable[[FitOptions, Following], Fitte
 
     slowest, fastest = _PACES
     pace, (before, least) = 1.0, errors(1.0)
-    factor = _FASTER if least < before else 1 / _FASTER
-    while slowest <= pace * factor <= fastest and not following.asked:
-        _, found = errors(pace * factor)
-        if not (found < least or math.isnan(least)):
+    while not least < before and pace > slowest and not following.asked:
+        pace /= _FASTER
+        _, least = errors(pace)
+    while 1 <= pace < fastest and not following.asked:
+        _, found = errors(pace * _FASTER)
+        if not found < least:
             break
-        pace, least = pace * factor, found
+        pace, least = pace * _FASTER, found
     return pace
 
 

@@ -104,9 +104,13 @@ class DeviceFit(Owner):
             self.adam = owned.enter_context(
                 Adam(device, ground.scene, buffers, columns, ground.rates, ground.limits, ground.factors)
             )
-            if ground.factors != UNROUNDED:
-                self.adam.give()
+            self.adam.give()
             self._owned = owned.pop_all()
+
+    def restart(self) -> None:
+        """Begin anew."""
+        self.adam.restart()
+        self.taken = 0
 
     def step(self, batch: Batch) -> None:
         """Take a step alone."""
