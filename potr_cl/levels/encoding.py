@@ -15,12 +15,13 @@ import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from potr_cl.errors import UsageError
+from potr_cl.host.threads import in_background
 from potr_cl.levels.errors import MeasuredErrors, measuring_views
 from potr_cl.levels.plan import MOST_BY_ITSELF, counts_of_levels, scaled, views_of_level
 from potr_cl.levels.seams import scales_shown
@@ -99,9 +100,8 @@ def encode_levels(
     watch("levels", 0.0)
     opened = first.device or device
 
-    @cache  # each has half the splats of the one before: all together take no more than twice the first
     def read(level: int) -> Scene:
-        return single.output.read(files[level], trust=True)
+        return makers.read[level].result()
 
     scales, views, between = [1.0], train_views(cameras) if cameras else [], list[Camera]()
     if len(files) > 1 and opened is not None:
@@ -133,6 +133,8 @@ class _Levels:
 
     Attributes:
         made: by level.
+        read: what readers see of it: each has half the splats of the one before, all together no more than twice the
+            first.
     """
 
     def __init__(
@@ -150,6 +152,7 @@ class _Levels:
         most = MOST_BY_ITSELF if isinstance(wanted, str) else wanted
         self._left: list[Future[Kept]] = [Future() for _ in range(most)]
         self.made: dict[int, Encoded] = {}
+        self.read: dict[int, Future[Scene]] = {}
 
     def counts(self) -> list[int]:
         """How many splats each level has, once the finest has all that it keeps."""
@@ -193,6 +196,7 @@ class _Levels:
             pool=slot.pool, tell=tell, finer=finer, follow=follow,
         )  # fmt: skip
         self.made[level] = made
+        self.read[level] = in_background(how.output.read, made.data, True)
         if not self._left[level].done():  # nothing was removed
             self._left[level].set_result(Kept(np.sort(made.order), made.importance))
         return True

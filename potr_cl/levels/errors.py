@@ -28,6 +28,7 @@ from potr_cl.model.camera import Camera, resized
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.model.views_between import views_between
 from potr_cl.opencl.device import Device
+from potr_cl.outputs.output import Leaves
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import stride_of
 from potr_cl.stages.refitting.coefficients import Coefficients
@@ -93,18 +94,18 @@ class MeasuredErrors:
         return Surroundings.of(self.scene, self.views)
 
     def of_leaves(
-        self, scenes: Callable[[int], Scene], levels: int, leaves: NDArray[np.int64], boxes: NDArray[np.float64]
+        self, scenes: Callable[[int], Scene], levels: int, leaves: Callable[[], Leaves]
     ) -> NDArray[np.float64]:
         """See :meth:`potr_cl.outputs.output.LevelErrors.of_leaves`."""
-        found = np.zeros((len(boxes), levels))
         if not self.views or levels < 2:
-            return found
+            return np.zeros((len(leaves().boxes), levels))
         assert self.device is not None
         views = [_small(view) for view in self.between or self.views]
-        covered = np.array([seen_coverage(view, boxes) for view in views])
-        finest = scenes(0)
-        with SharedOut(self.device, finest, views, leaves, len(boxes), self.background, self.memory) as shared:
+        with SharedOut(self.device, scenes(0), views, leaves, self.background, self.memory) as shared:
             parts = shared.of(map(scenes, range(1, levels)))
+        boxes = leaves().boxes
+        covered = np.array([seen_coverage(view, boxes) for view in views])
+        found = np.zeros((len(boxes), levels))
         found[:, 1:] = errors_a_coverage(parts, covered)
         return np.maximum.accumulate(found, axis=1)
 
@@ -161,8 +162,7 @@ class SharedOut:
         device: to render on.
         scene: the finest level, as readers see it.
         views: to look from.
-        leaves: (N,) in which leaf each of its splats lies; ``count``: in none, and the others share its part.
-        count: of the leaves.
+        leaves: gives these; what lies in none, the others share.
         background, memory: as of :class:`MeasuredErrors`.
     """
 
@@ -171,12 +171,11 @@ class SharedOut:
         device: Device,
         scene: Scene,
         views: Sequence[Camera],
-        leaves: NDArray[np.int64],
-        count: int,
+        leaves: Callable[[], Leaves],
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         memory: int | None = None,
     ) -> None:
-        self._device, self._views, self._leaves, self._count = device, views, leaves, count
+        self._device, self._views, self._leaves = device, views, leaves
         self._background, self._memory = background, memory
         self._pictures, self._covered = [], []
         for picture, transmittance in self._rendered(scene):
@@ -253,8 +252,8 @@ class SharedOut:
     def _of_leaves(self, of_view: tuple[FloatArray, FloatArray]) -> NDArray[np.float64]:
         """(leaves, 3) the parts of three pictures' squared differences (H, W, 3), of which splats have (N, 3)."""
         difference, of_splats = of_view
-        columns = np.maximum(of_splats, 0).T
-        parts = np.stack([np.bincount(self._leaves, each, self._count + 1)[:-1] for each in columns], axis=1)
+        columns, (of_leaf, boxes) = np.maximum(of_splats, 0).T, self._leaves()
+        parts = np.stack([np.bincount(of_leaf, each, len(boxes) + 1)[:-1] for each in columns], axis=1)
         whole = difference.mean(axis=(0, 1), dtype=np.float64)
         shared: NDArray[np.float64] = parts * (whole / np.maximum(parts.sum(axis=0), 1e-300))
         return shared

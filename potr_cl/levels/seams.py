@@ -6,8 +6,8 @@ small pictures, where the finer level then has more matter than the coarser one.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 
 import numpy as np
 
@@ -15,7 +15,9 @@ from potr_cl.levels.plan import scale_of_level, scaled
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.quality.compare import mean_view
+from potr_cl.quality.judging import Judging, Looks
+from potr_cl.raster.scene_buffers import uploaded
 
 #: Pictures of two levels that are as near, decibels, nobody tells from each other at a glance.
 SEAM = 40.0
@@ -50,21 +52,17 @@ def scales_shown(
     """
     some = [views[k] for k in np.linspace(0, len(views) - 1, min(len(views), _VIEWS)).round().astype(int)]
     found = [1.0]
-    for level in range(1, levels):
-        tried = [min(scale_of_level(level), found[-1]) * _FACTOR**k for k in range(_TRIED)]
-        near: list[float] = []
-        with (
-            Rasterizer(device, scenes(level - 1), background=background) as finer,
-            Rasterizer(device, scenes(level), background=background) as coarser,
-        ):
+    with ExitStack() as stack:
+        finer = stack.enter_context(uploaded(device, scenes(0)))
+        for level in range(1, levels):
+            coarser = stack.enter_context(uploaded(device, scenes(level)))
+            tried = [min(scale_of_level(level), found[-1]) * _FACTOR**k for k in range(_TRIED)]
+            near: list[float] = []
             while len(near) < len(tried) and max(near, default=0.0) < SEAM:
-                views_there = scaled(some, tried[len(near)])
-                near.append(float(np.mean([_decibels(finer, coarser, view) for view in views_there])))
-        enough = min(SEAM, max(near) - _ABOUT)
-        found.append(next(scale for scale, decibels in zip(tried, near, strict=False) if decibels >= enough))
+                with Judging(device, finer, scaled(some, tried[len(near)]), Looks(background)) as judging:
+                    near.append(mean_view(judging.figures(coarser)).figures["b_against_a"].psnr)
+            enough = min(SEAM, max(near) - _ABOUT)
+            found.append(next(scale for scale, decibels in zip(tried, near, strict=False) if decibels >= enough))
+            finer.close()
+            finer = coarser
     return found
-
-
-def _decibels(one: Rasterizer, other: Rasterizer, view: Camera) -> float:
-    pictures = [rasterizer.render(view)[0].clip(0, 1) for rasterizer in (one, other)]
-    return -10 * math.log10(max(float(np.square(pictures[0] - pictures[1]).mean(dtype=np.float64)), 1e-12))

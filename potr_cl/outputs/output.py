@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar, Protocol
+from typing import Any, BinaryIO, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +63,18 @@ class Request:
     blocks: Callable[[], FloatArray] | None = None
 
 
+class Leaves(NamedTuple):
+    """Parts of space that viewers show at a level of their own.
+
+    Attributes:
+        of_splats: (N,) in which leaf each splat of the finest level lies; as many as there are leaves: in none.
+        boxes: (leaves, 6) x0, y0, z0, x1, y1, z1 of each, world units.
+    """
+
+    of_splats: NDArray[np.int64]
+    boxes: NDArray[np.float64]
+
+
 class LevelErrors(Protocol):
     """What coarser levels of detail lose; each is measured when it is asked for."""
 
@@ -75,15 +87,14 @@ class LevelErrors(Protocol):
         ...
 
     def of_leaves(
-        self, scenes: Callable[[int], Scene], levels: int, leaves: NDArray[np.int64], boxes: NDArray[np.float64]
+        self, scenes: Callable[[int], Scene], levels: int, leaves: Callable[[], Leaves]
     ) -> NDArray[np.float64]:
         """What each part of space loses in each level.
 
         Args:
             scenes: gives a level's scene, as readers see it.
             levels: how many there are.
-            leaves: (N,) in which leaf each splat of the finest level lies; as many as there are leaves: in none.
-            boxes: (leaves, 6) x0, y0, z0, x1, y1, z1 of each, world units.
+            leaves: gives the parts; asked for only once pictures have been rendered.
 
         Returns:
             (leaves, levels) float64 from 0 up, never falling from level to level; the finest has 0. Times the part of a

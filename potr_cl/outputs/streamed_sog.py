@@ -21,11 +21,11 @@ from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes import sog_levels
 from potr_cl.formats.scenes.sog_images import DESCRIPTION as SOG_DESCRIPTION
 from potr_cl.formats.scenes.sog_levels import DESCRIPTION
-from potr_cl.host.threads import Ahead
+from potr_cl.host.threads import Ahead, in_background
 from potr_cl.model.scene import Scene, joined
 from potr_cl.outputs.level_folder import LevelFolder, archive
 from potr_cl.outputs.lod_tree import Node, lod_tree
-from potr_cl.outputs.output import LevelErrors, Output
+from potr_cl.outputs.output import Leaves, LevelErrors, Output
 from potr_cl.outputs.sog import Sog
 from potr_cl.outputs.sog_chunks import SogChunks
 
@@ -59,15 +59,21 @@ class StreamedSog(LevelFolder, Sog):
         far = [errors.far(scene) for scene in scenes]
         near = [~each if far[0].any() else np.ones(len(each), bool) for each in far]
         sky = np.flatnonzero(~near[0])
-        tree = lod_tree(scenes, limits, near)
-        leaves = list(tree.leaves())
+
+        def cut() -> tuple[Node, Leaves]:
+            tree = lod_tree(scenes, limits, near)
+            leaves = list(tree.leaves())
+            return tree, Leaves(_numbers(leaves, len(scenes[0])), _boxes(leaves))
 
         def shown(level: int) -> Scene:
             if not level or not len(sky):
                 return scenes[level]
             return joined([scenes[level].subset(np.flatnonzero(near[level])), scenes[0].subset(sky)])
 
-        lost = errors.of_leaves(shown, len(files), _numbers(leaves, len(scenes[0])), _boxes(leaves))
+        coming = in_background(cut)
+        lost = errors.of_leaves(shown, len(files), lambda: coming.result()[1])
+        tree, _ = coming.result()
+        leaves = list(tree.leaves())
         filenames: list[str] = []
         places: list[dict[str, dict[str, int]]] = [{} for _ in leaves]
 

@@ -147,8 +147,8 @@ def files(plush_excerpt: Scene, tmp_path_factory: Any) -> tuple[Path, Path]:
         def of_level(self, level: int) -> float:
             return float(level)
 
-        def of_leaves(self, scenes: Any, levels: int, leaves: Any, boxes: Any) -> Any:
-            return np.arange(1, len(boxes) + 1)[:, None] * np.arange(levels)
+        def of_leaves(self, scenes: Any, levels: int, leaves: Any) -> Any:
+            return np.arange(1, len(leaves().boxes) + 1)[:, None] * np.arange(levels)
 
     folder, request = tmp_path_factory.mktemp("levels"), Request(HyperParameters.from_quality(0.5, "best"))
     found = []

@@ -29,7 +29,7 @@ from potr_cl.model.views_between import views_between
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.level_folder import archive
 from potr_cl.outputs.lod_tree import Limits, extents_of, lod_tree
-from potr_cl.outputs.output import Output, Request
+from potr_cl.outputs.output import Leaves, Output, Request
 from potr_cl.outputs.sog import Sog
 from potr_cl.outputs.spz import Gltf
 from potr_cl.outputs.streamed_sog import StreamedSog
@@ -55,8 +55,9 @@ class Told:
     def of_level(self, level: int) -> float:
         return 0.0
 
-    def of_leaves(self, scenes, levels, leaves, boxes):
-        assert len(leaves) == len(scenes(0))
+    def of_leaves(self, scenes, levels, leaves):
+        of_splats, boxes = leaves()
+        assert len(of_splats) == len(scenes(0))
         return np.arange(len(boxes))[:, None] * np.arange(levels) / 3
 
 
@@ -185,8 +186,9 @@ def test_what_is_far_is_the_environment_once(files, tmp_path):
     shown = []
 
     class Errors(Told):
-        def of_leaves(self, scenes, levels, leaves, boxes):
-            assert np.array_equal(leaves == len(boxes), self.far(scenes(0)))
+        def of_leaves(self, scenes, levels, leaves):
+            of_splats, boxes = leaves()
+            assert np.array_equal(of_splats == len(boxes), self.far(scenes(0)))
             shown.extend(scenes(level) for level in range(levels))
             return np.zeros((len(boxes), levels))
 
@@ -206,7 +208,8 @@ def test_errors_of_leaves_add_up_and_say_where(plush_excerpt, views, device):
     left = plush_excerpt.means[:, 0] < np.median(plush_excerpt.means[:, 0])
     other = dataclasses.replace(plush_excerpt, sh=plush_excerpt.sh.copy())
     other.sh[left, 0] += 0.3
-    with SharedOut(device, plush_excerpt, views, left.astype(np.int64), 2) as shared:
+    halves = Leaves(left.astype(np.int64), np.zeros((2, 6)))
+    with SharedOut(device, plush_excerpt, views, lambda: halves) as shared:
         parts = shared.of([other, plush_excerpt])
     assert not parts[:, :, 1].any()
     right_part, left_part = parts[:, :, 0].mean(axis=0)
@@ -219,9 +222,10 @@ def test_an_error_times_what_the_leaf_covers_is_what_it_adds(plush_excerpt, view
     fewer = plush_excerpt[::2]
     scenes = [plush_excerpt, fewer]
     boxes = np.concatenate([plush_excerpt.means.min(axis=0), plush_excerpt.means.max(axis=0)])[None]
-    leaves = np.zeros(len(plush_excerpt), np.int64)
+    leaf = Leaves(np.zeros(len(plush_excerpt), np.int64), boxes)
     views = measuring_views(plush_excerpt, views)
-    errors = MeasuredErrors(device, views, plush_excerpt, between=views).of_leaves(scenes.__getitem__, 2, leaves, boxes)
+    measured = MeasuredErrors(device, views, plush_excerpt, between=views)
+    errors = measured.of_leaves(scenes.__getitem__, 2, lambda: leaf)
     assert errors[0, 0] == 0
     covered = np.array([seen_coverage(view, boxes)[0] for view in views])
     each = [mean_squared_errors(device, plush_excerpt, [fewer], [view])[0] for view in views]
