@@ -178,15 +178,19 @@ class Run:
             As :func:`potr_cl.pipeline.encode.encode`.
         """
         state = self._guarded(state)
-        for stage in self._options.stages:
-            if (only is not None and type(stage) not in only) or not self._is_wanted(stage, state):
-                continue
-            after = self._done(stage, state)
-            after = as_they_were(after)
-            # What is before it is kept no longer than this: colours of a large scene take gigabytes.
-            state = self._fit_that_pays(state, after) if isinstance(stage, Fit) else after
-            if self._follow is not None:
-                self._follow(stage, state)
+        try:
+            for stage in self._options.stages:
+                if (only is not None and type(stage) not in only) or not self._is_wanted(stage, state):
+                    continue
+                after = self._done(stage, state)
+                after = as_they_were(after)
+                # What is before it is kept no longer than this: colours of a large scene take gigabytes.
+                state = self._fit_that_pays(state, after) if isinstance(stage, Fit) else after
+                if self._follow is not None:
+                    self._follow(stage, state)
+        finally:
+            if state.results.pictures is not None:
+                state.results.pictures.close()
         return state
 
     def _is_wanted(self, stage: Stage, state: State) -> bool:
@@ -246,6 +250,7 @@ class Run:
             output=options.output,
             kept=self._kept,
             photographs=next((each.ground_truth for each in options.stages if isinstance(each, Refit)), None),
+            shown_again=any(isinstance(each, (Fit, Refit)) and each.asked_for for each in options.stages),
         )
 
     def _done(self, stage: Stage, state: State) -> State:

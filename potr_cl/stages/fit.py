@@ -207,7 +207,8 @@ class Fit(Stage):
                 visibility = bench.visibility_of_source(state, views) if scene is state.source else None
                 return targets_of(bench.opened, bench.drawable(scene), views, bench.background, visibility)
 
-            targets = stack.enter_context(pictures(state.source, seen.views))
+            rendered = stack.enter_context(pictures(state.source, seen.views))
+            targets = bench.rendered_before(state, rendered, seen.views)
             sight = Sight(seen.views, targets, seen.added, bench.background, _help_from(bench, state))
             if bench.memory is None:  # else pruning needs all that is allowed, between two fits
                 kept = stack.enter_context(kept_pictures(bench.opened, seen.views, targets))
@@ -221,8 +222,8 @@ class Fit(Stage):
             if asked or not (isinstance(told, Fitted) and told.spared):
                 return found
             if found.truth is not None:
-                targets = stack.enter_context(pictures(found.truth, seen.views))
-                sight = dataclasses.replace(sight, targets=targets, help_from=_help_from(bench, found))
+                rendered = stack.enter_context(pictures(found.truth, seen.views))
+                sight = dataclasses.replace(sight, targets=rendered, help_from=_help_from(bench, found))
             return self._settled(found, bench, sight, partial(pictures, found.goal), asked)
 
     def _looking_between(self, state: State, bench: Workbench) -> State:
@@ -336,7 +337,9 @@ class Fit(Stage):
     def _pruned(self, state: State, limit: float, bench: Workbench) -> State:
         """The state without the splats that a fit will make up for."""
         parameters = dataclasses.replace(bench.parameters, delta_mse_max=limit)
-        alone = dataclasses.replace(bench, parameters=parameters, interludes=(), progress=lambda what, done: None)
+        alone = dataclasses.replace(
+            bench, parameters=parameters, interludes=(), progress=lambda what, done: None, shown_again=False
+        )
         left = Prune(iterations=ITERATIONS).run(state, alone)
         return dataclasses.replace(left, results=state.results)
 

@@ -19,9 +19,18 @@ from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import Course, Pruned, PruningOptions
 from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
-from potr_cl.stages.unseen import CHOICES, Unresolved, Unseen, as_of_whole, find_unseen, without_directions
+from potr_cl.stages.unseen import (
+    CHOICES,
+    Unresolved,
+    Unseen,
+    as_of_whole,
+    find_unseen,
+    showing_none,
+    without_directions,
+)
 from potr_cl.views.reached import surely_seen
 from potr_cl.views.shares import ViewShares
+from potr_cl.views.targets import PicturesInPassing
 from potr_cl.views.visibility import MOST_SEEN, Visibility, groups_of_large, seen_part, visibility_of_large
 from potr_cl.workers.pool import Pool
 
@@ -240,8 +249,13 @@ class Prune(Stage):
             stays = unresolved.among(state.survivors)
         waiting = sorted(bench.interludes, key=lambda interlude: interlude.after)
         schedule = self._schedule(bench.parameters.delta_mse_max, len(state.scene) if seen is None else len(seen))
+        pictures = None
+        if bench.shown_again and bench.memory is None and state.scene is state.source:
+            whole = state.views if seen is None or hidden is None else showing_none(hidden, state)
+            pictures = PicturesInPassing.wanted(bench.opened, whole)
         bench.progress("prepare views", 0.0)
-        with measurement(state, bench, self._sweep_options(bench.memory), visibility, dealt, seen) as removal:
+        sweep_options = self._sweep_options(bench.memory)
+        with measurement(state, bench, sweep_options, visibility, dealt, seen, pictures) as removal:
             course = _Course(state, removal, seen)
             ready = removal.ready_views >= (1 - _MADE_AGAIN) * len(state.views)
 
@@ -264,7 +278,8 @@ class Prune(Stage):
                     course.visit(interlude, pruned.survivors, bench)
             # While drivers give the measurement's memory back.
             left = in_background(self._left, course, pruned, seen, hidden)
-        return left.result()
+        then = left.result()
+        return then if pictures is None else then.with_results(pictures=pictures)
 
     def _left(
         self, course: _Course, pruned: Pruned, seen: NDArray[np.int64] | None, hidden: NDArray[np.bool_] | None

@@ -248,9 +248,12 @@ def _pictures_of_goal(state: State, bench: Workbench, ahead: PicturesAhead | Non
     device, views = bench.opened, state.views
     little = residency_of(device, len(state.scene), state.scene.sh.shape[1], bench.memory).slice is not None
     little = little or (bench.memory is not None and state.source.nbytes > _LARGE * bench.memory)
-    with _rendered(state, state.goal, bench) as targets:
+    with _rendered(state, state.goal, bench) as rendered:
+        targets: Targets = rendered
         if ahead is not None:
             targets = ahead.before(device, targets)
+        if state.truth is None:
+            targets = bench.rendered_before(state, targets, views)
         if not little or bench.pool is not None:
             yield targets
             return

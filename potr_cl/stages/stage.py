@@ -30,6 +30,7 @@ from potr_cl.outputs.potr import Potr
 from potr_cl.raster.resident import ResidentScene, ResidentSubset
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.views.shares import ViewShares
+from potr_cl.views.targets import PicturesInPassing, Targets
 from potr_cl.views.visibility import Visibility, visibility_of_large
 from potr_cl.workers.pool import Pool, Shared
 
@@ -61,6 +62,7 @@ class Results:
         unseen: splats that no view sees, or that stay though none resolves them.
         price: ΔMSE below which a splat has gone.
         shares: who of the workers elsewhere does which views, with what these see.
+        pictures: of the source in the state's views, rendered in passing.
         pruned: the order in which splats went.
         importance: (N,) float32, I_k of each splat of the source before any went, in the finest level's views.
         fitted: the fit, or why there is none.
@@ -77,6 +79,7 @@ class Results:
     unseen: Unseen | Unresolved | None = None
     price: float | None = None
     shares: ViewShares | None = None
+    pictures: PicturesInPassing | None = None
     pruned: Pruned | None = None
     importance: NDArray[np.float32] | None = None
     fitted: Fitted | LeftOut | None = None
@@ -172,6 +175,7 @@ class Workbench:
         photographs: folder of the given views' photographs, where truth is wanted rather than fidelity.
         kept: the uncompressed scene, where it stays on the device from one stage to the next.
         pool: workers that views are shared out to; None: the device does all of them.
+        shown_again: whether later stages look at the source's pictures in the views.
     """
 
     parameters: HyperParameters
@@ -187,6 +191,7 @@ class Workbench:
     kept: ResidentScene | None = None
     photographs: Path | None = None
     pool: Pool | None = None
+    shown_again: bool = False
 
     def drawable(self, scene: Scene) -> Drawable:
         """What to give to a rasterizer for a scene: it may lie on the device already."""
@@ -217,6 +222,15 @@ class Workbench:
             numbers = state.survivors if some is None else state.survivors[some]
         with pool.shared(state.source if state.is_cut else state.scene) as whole:
             yield whole if numbers is None else Shared(whole.handle, numbers.astype(np.uint32))
+
+    def rendered_before(self, state: State, targets: Targets, views: Sequence[Camera]) -> Targets:
+        """Pictures of the source in some views: what was rendered in passing first, the others by ``targets``."""
+        pictures = state.results.pictures
+        if pictures is None:
+            return targets
+        if self.memory is not None:  # there is no room for them any more
+            pictures.close()
+        return pictures.before(targets, views)
 
     @property
     def all_here(self) -> bool:

@@ -6,6 +6,7 @@ Whoever gives them is a :class:`Targets`, asked for some views at a time:
 - :class:`PhotographTargets`: in files, read whenever somebody asks.
 - :class:`HostTargets`: on the host, asked for once, so that what made them can go.
 - :class:`PicturesAhead`: on devices, rendered in the background before anybody asks, and given away once.
+- :class:`PicturesInPassing`: on a CPU, rendered while views are prepared for something else, and given away once.
 
 :class:`TargetPictures` keeps as many of them on a device as a budget allows, and asks for the others again.
 """
@@ -34,6 +35,7 @@ from potr_cl.raster.picked_splats import IndexSubsets
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.resident import ResidentScene, whole_on_device
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
+from potr_cl.raster.view_set import ViewSet
 from potr_cl.views.budget import ViewCache, target_bytes
 from potr_cl.views.pictures import SeenRasterizer
 from potr_cl.views.visibility import Visibility
@@ -278,6 +280,70 @@ class _Rendered(Owner):
     def close(self) -> None:
         self._places = {}
         self._memory.close()
+
+
+class PicturesInPassing(Owner):
+    """A scene's pictures on a CPU, rendered while its views are prepared for something else; each is given once.
+
+    To prepare a view takes four times as long as to render it then.
+
+    Args:
+        cameras: whose pictures are taken.
+    """
+
+    def __init__(self, device: Device, cameras: Sequence[Camera]) -> None:
+        self._device, self._memory = device, Memory(device)
+        self._wanted = {id(camera): camera for camera in cameras}
+        self._of: dict[int, cl.Buffer] = {}
+
+    @staticmethod
+    def wanted(device: Device, cameras: Sequence[Camera]) -> PicturesInPassing | None:
+        """None: a GPU renders pictures ahead, or there is not much more room than they take."""
+        if device.family != "cpu" or sum(map(target_bytes, cameras)) > AHEAD * device.info.memory:
+            return None
+        return PicturesInPassing(device, cameras)
+
+    def take(self, rasterizer: Rasterizer, views: ViewSet) -> None:
+        """Render the picture of a prepared view, if it is wanted."""
+        (view,) = views.views
+        if id(view.camera) not in self._wanted:
+            return
+        with suppress(DeviceMemoryError):
+            buffer = self._memory.allocate(12 * views.pixels, _WHAT)
+            rasterizer.pictures_into(views, buffer)
+            self._of[id(view.camera)] = buffer
+
+    def before(self, targets: Targets, cameras: Sequence[Camera]) -> Targets:
+        """The pictures that ``targets`` gives of these cameras: it is asked for those that are not here."""
+        return _InPassing(self, targets, cameras)
+
+    def give(self, camera: Camera, buffer: cl.Buffer, start: int) -> bool:
+        """Enqueue a copy to another buffer; whether the picture is there."""
+        picture = self._of.pop(id(camera), None)
+        if picture is None:
+            return False
+        self._device.copy(buffer, picture, target_bytes(camera), to=start)
+        self._memory.free(picture)
+        return True
+
+    def close(self) -> None:
+        self._of = {}
+        self._memory.close()
+
+
+@dataclass(frozen=True)
+class _InPassing:
+    pictures: PicturesInPassing
+    targets: Targets
+    cameras: Sequence[Camera]
+
+    def into(self, numbers: Sequence[int], buffer: cl.Buffer, start: int = 0) -> None:
+        """See :meth:`Targets.into`."""
+        for number in numbers:
+            camera = self.cameras[number]
+            if not self.pictures.give(camera, buffer, start):
+                self.targets.into([number], buffer, start)
+            start += target_bytes(camera)
 
 
 @dataclass

@@ -35,6 +35,7 @@ from potr_cl.stages.stage import State, Workbench
 from potr_cl.views.plan import none
 from potr_cl.views.shares import ViewShares
 from potr_cl.views.subsets import NoSplats
+from potr_cl.views.targets import PicturesInPassing
 from potr_cl.views.visibility import Visibility
 from potr_cl.workers.parts import Each, Parts, Pending
 from potr_cl.workers.pool import Part, Pool, shares
@@ -232,6 +233,7 @@ def measurement(
     visibility: Visibility | None = None,
     dealt: ViewShares | None = None,
     seen: NDArray[np.int64] | None = None,
+    pictures: PicturesInPassing | None = None,
 ) -> Iterator[RemovalSweep]:
     """A removal sweep over the views of a state, its splats numbered as in the state's scene.
 
@@ -239,6 +241,7 @@ def measurement(
         visibility: what the views see, where each had better be looked at with what it sees.
         dealt: the views, for a pool whose workers get what these see and no more of the scene.
         seen: (n,) numbers of the splats that the sweep is to have, ascending, which it numbers from 0 on; None: all.
+        pictures: as of :class:`potr_cl.stages.pruning.removal.RemovalSweep`.
     """
 
     def progress(done: int, count: int) -> None:
@@ -256,7 +259,7 @@ def measurement(
                 whole = stack.enter_context(whole_on_device(device, bench.drawable(scene)))
             else:
                 whole = stack.enter_context(scene_on(device, bench.scene_of(state, seen)))
-            yield stack.enter_context(planned_sweep(device, whole, wanted, scene, progress))
+            yield stack.enter_context(planned_sweep(device, whole, wanted, scene, progress, None, pictures))
             return
         given: list[tuple[Any, Wanted]] = []
         drawable: Drawable | None = None
@@ -283,7 +286,7 @@ def measurement(
         helpers = stack.enter_context(RemovalHelpers(device, splats, parts, pool, numbers))
         if drawable is not None and share.own:
             own = replace(wanted, numbers=share.own)
-            sweep = stack.enter_context(planned_sweep(device, drawable, own, progress=progress, helpers=helpers))
+            sweep = stack.enter_context(planned_sweep(device, drawable, own, None, progress, helpers, pictures))
         else:
             source = NoSplats(device, splats)
             sweep = stack.enter_context(RemovalSweep(source, views, options, plan=none(), helpers=helpers))

@@ -42,6 +42,7 @@ from potr_cl.views.budget import default_memory, tiles_of
 from potr_cl.views.engine import ViewEngine
 from potr_cl.views.plan import ViewPlan
 from potr_cl.views.subsets import CopiedSplats, NamedSplats, SplatSource, Subset, WholeScene
+from potr_cl.views.targets import PicturesInPassing
 from potr_cl.views.visibility import Visibility
 
 if TYPE_CHECKING:
@@ -62,6 +63,7 @@ class RemovalSweep(Owner):
         progress: called with the views prepared and their number.
         numbers: of the views that are measured here, ascending, where others are measured elsewhere; None: all.
         plan: of these views; None: all of them with all splats.
+        pictures: take those of views that stay.
         helpers: measure the other views. All totals are integers in units that follow from all views, so it makes no
             difference to any bit who measures which.
 
@@ -88,6 +90,7 @@ class RemovalSweep(Owner):
         numbers: Sequence[int] | None = None,
         plan: ViewPlan | None = None,
         helpers: RemovalHelpers | None = None,
+        pictures: PicturesInPassing | None = None,
     ) -> None:
         source = scene if isinstance(scene, SplatSource) else WholeScene(scene)
         if not cameras:
@@ -99,6 +102,7 @@ class RemovalSweep(Owner):
             room = default_memory(self.device) if options.memory is None else options.memory
             plan = plans.whole(range(len(cameras)) if numbers is None else numbers, self.splats, room)
         self._cameras, self._pending, self._helpers = cameras, list[cl.Event](), helpers
+        self._pictures = pictures
         with ExitStack() as owned:
             owned.callback(source.close)
             self._memory = owned.enter_context(Memory(self.device))
@@ -130,6 +134,8 @@ class RemovalSweep(Owner):
     def _attach(
         self, numbers: Sequence[int], subset: Subset, views: ViewSet, memory: Memory | None, target: cl.Buffer | None
     ) -> PreparedSet:
+        if self._pictures is not None and memory is None:
+            self._pictures.take(subset.rasterizer, views)
         # The device sorts the lists while the next view is made ready.
         return PreparedSet(subset.rasterizer, views, memory, target, None if memory else self._pending)
 
@@ -331,13 +337,14 @@ def planned_sweep(
     scene: Scene | None = None,
     progress: Callable[[int, int], None] | None = None,
     helpers: RemovalHelpers | None = None,
+    pictures: PicturesInPassing | None = None,
 ) -> Iterator[RemovalSweep]:
     """A removal sweep over some views, as long as the context lasts.
 
     Args:
         drawable: the uncompressed scene, perhaps on the device.
         scene: the uncompressed scene on the host; None: it is there only if ``drawable`` is.
-        progress, helpers: as of :class:`RemovalSweep`.
+        progress, helpers, pictures: as of :class:`RemovalSweep`.
     """
     cameras, options, visibility, numbers = wanted.cameras, wanted.options, wanted.visibility, wanted.numbers
     scene = drawable if isinstance(drawable, Scene) else scene
@@ -359,7 +366,7 @@ def planned_sweep(
                 plan = plans.by_cluster(clusters, memory, scene.nbytes // max(len(scene), 1))
         else:
             source = owned.enter_context(Rasterizer(device, drawable, background=wanted.background))
-        sweep = RemovalSweep(source, cameras, options, progress, numbers, plan, helpers)
+        sweep = RemovalSweep(source, cameras, options, progress, numbers, plan, helpers, pictures)
         yield owned.enter_context(sweep)
 
 
