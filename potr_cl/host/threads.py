@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from contextvars import copy_context
 from itertools import islice
 from typing import Any, Generic, TypeVar
 
@@ -37,9 +38,12 @@ def thread_pool(threads: int = 0) -> Iterator[ThreadPoolExecutor]:
 
 
 def in_background(work: Callable[..., T], *args: Any) -> Future[T]:
-    """Call a function in a thread of its own; what it returns or raises is the future's."""
+    """Call a function in a thread of its own; what it returns or raises is the future's.
+
+    The thread has this one's context: what bounds memory here, does there.
+    """
     pool = ThreadPoolExecutor(1, thread_name_prefix=BACKGROUND)
-    future = pool.submit(work, *args)
+    future = pool.submit(copy_context().run, work, *args)
     pool.shutdown(wait=False)
     return future
 

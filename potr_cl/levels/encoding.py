@@ -4,8 +4,9 @@ A level is one run of the stages: with a number of splats to keep, and smaller v
 the next finer level has kept, begins with them as they are in the full scene, and is fitted and re-fitted to the full
 scene's pictures. What views show of each splat of the scene the finest one has measured for all.
 
-What is kept of each level is the file that it became; while these become one, the scenes that they hold are kept, too:
-together no more than twice the finest.
+What is kept of each level is the file that it became, and the scene that this holds, which takes the host's memory as
+soon as it is made; with a bound on memory only while the files become one. All together they are no more than twice the
+finest.
 """
 
 from __future__ import annotations
@@ -100,15 +101,12 @@ def encode_levels(
     watch("levels", 0.0)
     opened = first.device or device
 
-    def read(level: int) -> Scene:
-        return makers.read[level].result()
-
     scales, views, between = [1.0], train_views(cameras) if cameras else [], list[Camera]()
     if len(files) > 1 and opened is not None:
         between = measuring_views(scene, views)
-        scales = scales_shown(opened, read, len(files), between, options.background)
+        scales = scales_shown(opened, makers.read, len(files), between, options.background)
     errors = MeasuredErrors(opened, views, scene, options.background, options.memory, between, scales)
-    pieces = output.levelled(files, errors, read)
+    pieces = output.levelled(files, errors, makers.read)
     levels = [LevelMade(*each) for each in zip(counts, scales, strict=True)]
     if judge and cameras is not None and opened is not None:
         for k, scale in enumerate(scales):
@@ -116,7 +114,7 @@ def encode_levels(
                 watch("levels", k / len(files))
             judged = EvaluationViews.of(scaled(cameras, scale))
             with Evaluator(opened, kept or scene, judged, options.background, pool, remember=False) as evaluator:
-                levels[k] = replace(levels[k], psnr=evaluator.psnr(read(k)))
+                levels[k] = replace(levels[k], psnr=evaluator.psnr(makers.read(k)))
     watch("levels", 1.0)
     return replace(
         first, pieces=pieces, nbytes=output.size(pieces), options=options, levels=tuple(levels),
@@ -133,8 +131,6 @@ class _Levels:
 
     Attributes:
         made: by level.
-        read: what readers see of it: each has half the splats of the one before, all together no more than twice the
-            first.
     """
 
     def __init__(
@@ -152,7 +148,7 @@ class _Levels:
         most = MOST_BY_ITSELF if isinstance(wanted, str) else wanted
         self._left: list[Future[Kept]] = [Future() for _ in range(most)]
         self.made: dict[int, Encoded] = {}
-        self.read: dict[int, Future[Scene]] = {}
+        self._read: dict[int, Future[Scene]] = {}
 
     def counts(self) -> list[int]:
         """How many splats each level has, once the finest has all that it keeps."""
@@ -160,6 +156,17 @@ class _Levels:
         if len(found) > 1 and (self._cameras is None or not self._single.stage(Prune).on):
             raise UsageError("coarser levels of detail are pruned: leave out --no-prune, or give --levels 1")
         return found
+
+    def read(self, level: int) -> Scene:
+        """What readers see of a level: each has half the splats of the one before, all together no more than twice the
+        first.
+        """
+        return self._reading(level).result()
+
+    def _reading(self, level: int) -> Future[Scene]:
+        if level not in self._read:
+            self._read[level] = in_background(self._single.output.read, self.made[level].data, True)
+        return self._read[level]
 
     def make(self, level: int, slot: Slot, progress: Progress) -> bool:
         """Make a level; whether there is one of that number."""
@@ -196,9 +203,10 @@ class _Levels:
             pool=slot.pool, tell=tell, finer=finer, follow=follow,
         )  # fmt: skip
         self.made[level] = made
-        self.read[level] = in_background(how.output.read, made.data, True)
         if not self._left[level].done():  # nothing was removed
             self._left[level].set_result(Kept(np.sort(made.order), made.importance))
+        if how.memory is None and len(self.counts()) > 1:
+            self._reading(level)  # meanwhile others are made
         return True
 
 

@@ -162,7 +162,7 @@ class SharedOut:
         device: to render on.
         scene: the finest level, as readers see it.
         views: to look from.
-        leaves: gives these; what lies in none, the others share.
+        leaves: gives the leaves, once it is asked; splats that lie in none have no part, which the others share.
         background, memory: as of :class:`MeasuredErrors`.
     """
 

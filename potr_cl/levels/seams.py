@@ -15,7 +15,6 @@ from potr_cl.levels.plan import scale_of_level, scaled
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.quality.compare import mean_view
 from potr_cl.quality.judging import Judging, Looks
 from potr_cl.raster.scene_buffers import uploaded
 
@@ -25,6 +24,8 @@ SEAM = 40.0
 _ABOUT = 1.0
 #: Scales of pictures that are tried for a level, each smaller by this factor, and how many.
 _FACTOR, _TRIED = 2**-0.25, 9
+#: Decibels that identical pictures count as.
+_SAME = 120.0
 #: Views to compare them in, spread evenly.
 _VIEWS = 8
 
@@ -60,7 +61,8 @@ def scales_shown(
             near: list[float] = []
             while len(near) < len(tried) and max(near, default=0.0) < SEAM:
                 with Judging(device, finer, scaled(some, tried[len(near)]), Looks(background)) as judging:
-                    near.append(mean_view(judging.figures(coarser)).figures["b_against_a"].psnr)
+                    views_there = judging.figures(coarser)
+                near.append(float(np.mean([min(view.figures["b_against_a"].psnr, _SAME) for view in views_there])))
             enough = min(SEAM, max(near) - _ABOUT)
             found.append(next(scale for scale, decibels in zip(tried, near, strict=False) if decibels >= enough))
             finer.close()

@@ -60,10 +60,10 @@ class StreamedSog(LevelFolder, Sog):
         near = [~each if far[0].any() else np.ones(len(each), bool) for each in far]
         sky = np.flatnonzero(~near[0])
 
-        def cut() -> tuple[Node, Leaves]:
+        def cut() -> tuple[Node, list[Node], Leaves]:
             tree = lod_tree(scenes, limits, near)
             leaves = list(tree.leaves())
-            return tree, Leaves(_numbers(leaves, len(scenes[0])), _boxes(leaves))
+            return tree, leaves, Leaves(_numbers(leaves, len(scenes[0])), _boxes(leaves))
 
         def shown(level: int) -> Scene:
             if not level or not len(sky):
@@ -71,9 +71,8 @@ class StreamedSog(LevelFolder, Sog):
             return joined([scenes[level].subset(np.flatnonzero(near[level])), scenes[0].subset(sky)])
 
         coming = in_background(cut)
-        lost = errors.of_leaves(shown, len(files), lambda: coming.result()[1])
-        tree, _ = coming.result()
-        leaves = list(tree.leaves())
+        lost = errors.of_leaves(shown, len(files), lambda: coming.result()[2])
+        tree, leaves, _ = coming.result()
         filenames: list[str] = []
         places: list[dict[str, dict[str, int]]] = [{} for _ in leaves]
 

@@ -178,19 +178,23 @@ class Run:
             As :func:`potr_cl.pipeline.encode.encode`.
         """
         state = self._guarded(state)
+        done = [stage for stage in self._options.stages if only is None or type(stage) in only]
+        again = any(isinstance(stage, (Fit, Refit)) and stage.asked_for for stage in done)
+        pictures = state.results.pictures
         try:
-            for stage in self._options.stages:
-                if (only is not None and type(stage) not in only) or not self._is_wanted(stage, state):
+            for stage in done:
+                if not self._is_wanted(stage, state):
                     continue
-                after = self._done(stage, state)
+                after = self._done(stage, state, again)
+                pictures = after.results.pictures
                 after = as_they_were(after)
                 # What is before it is kept no longer than this: colours of a large scene take gigabytes.
                 state = self._fit_that_pays(state, after) if isinstance(stage, Fit) else after
                 if self._follow is not None:
                     self._follow(stage, state)
         finally:
-            if state.results.pictures is not None:
-                state.results.pictures.close()
+            if pictures is not None:
+                pictures.close()
         return state
 
     def _is_wanted(self, stage: Stage, state: State) -> bool:
@@ -236,7 +240,7 @@ class Run:
         self._watch(Fit.name, 1.0)
         return state
 
-    def _bench(self, stage: Stage, state: State) -> Workbench:
+    def _bench(self, stage: Stage, state: State, shown_again: bool) -> Workbench:
         options = as_done(self._options, state)
         return Workbench(
             priced(options.parameters, state),
@@ -250,12 +254,12 @@ class Run:
             output=options.output,
             kept=self._kept,
             photographs=next((each.ground_truth for each in options.stages if isinstance(each, Refit)), None),
-            shown_again=any(isinstance(each, (Fit, Refit)) and each.asked_for for each in options.stages),
+            shown_again=shown_again,
         )
 
-    def _done(self, stage: Stage, state: State) -> State:
-        """The state after a stage."""
-        bench = self._bench(stage, state)
+    def _done(self, stage: Stage, state: State, shown_again: bool) -> State:
+        """The state after a stage; ``shown_again`` as of the workbench."""
+        bench = self._bench(stage, state, shown_again)
         if not stage.needs_views:
             return stage.run(state, bench)
 

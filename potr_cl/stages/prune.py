@@ -25,7 +25,6 @@ from potr_cl.stages.unseen import (
     Unseen,
     as_of_whole,
     find_unseen,
-    showing_none,
     without_directions,
 )
 from potr_cl.views.reached import surely_seen
@@ -38,6 +37,8 @@ from potr_cl.workers.pool import Pool
 #: less and less, so that what is left of the time is this power of what is left of the iterations. But not where more
 #: than this part of the views is made again each time.
 _FIRST, _FEWER, _MADE_AGAIN = 0.11, 1.4, 0.1
+#: Splats that no given view sees are looked for in the views where they are no more than this part of all.
+_FEW_HIDDEN = 1 / 8
 
 
 @dataclass(frozen=True)
@@ -249,10 +250,7 @@ class Prune(Stage):
             stays = unresolved.among(state.survivors)
         waiting = sorted(bench.interludes, key=lambda interlude: interlude.after)
         schedule = self._schedule(bench.parameters.delta_mse_max, len(state.scene) if seen is None else len(seen))
-        pictures = None
-        if bench.shown_again and bench.memory is None and state.scene is state.source:
-            whole = state.views if seen is None or hidden is None else showing_none(hidden, state)
-            pictures = PicturesInPassing.wanted(bench.opened, whole)
+        pictures = _in_passing(state, bench, hidden if seen is not None else None)
         bench.progress("prepare views", 0.0)
         sweep_options = self._sweep_options(bench.memory)
         with measurement(state, bench, sweep_options, visibility, dealt, seen, pictures) as removal:
@@ -296,6 +294,25 @@ class Prune(Stage):
         # Nobody looked at the hidden ones from any direction.
         left = without_directions(course.having(numbers), hidden[numbers])
         return _knowing(left, of_whole.result())
+
+
+def _in_passing(state: State, bench: Workbench, hidden: NDArray[np.bool_] | None) -> PicturesInPassing | None:
+    """Takes the pictures of the source that later stages will ask for; None: nobody does, or it does not pay.
+
+    Args:
+        hidden: (N,) splats that are not there while views are prepared; None: all are.
+    """
+    if not bench.shown_again or bench.memory is not None or state.scene is not state.source:
+        return None
+    pictures = PicturesInPassing.wanted(bench.opened, state.views)
+    if pictures is None or hidden is None:
+        return pictures
+    numbers = np.flatnonzero(hidden)
+    if len(numbers) > _FEW_HIDDEN * len(hidden):
+        return None
+    # Those that no given view sees may be seen from between, and a tile's list may have them.
+    pictures.leave_out(state.scene.uncoloured().subset(numbers))
+    return pictures
 
 
 def part_of_time(iterations: float, stays: bool) -> float:

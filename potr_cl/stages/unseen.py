@@ -166,13 +166,6 @@ def find_unseen(
     return unseen, in_background(part_of_area, scene, unseen).result
 
 
-def showing_none(unseen: NDArray[np.bool_], state: State) -> list[Camera]:
-    """The views of a state that show none of the splats (N,) that no given view sees: added ones may."""
-    some = state.scene.subset(np.flatnonzero(unseen))
-    given = len(state.views) - state.added
-    return [view for number, view in enumerate(state.views) if number < given or unseen_splats(some, [view]).all()]
-
-
 def part_of_area(scene: Scene, splats: NDArray[np.bool_]) -> float:
     """The part of a scene's opacity-weighted area that some splats have, (N,), 0 to 1."""
     areas = opacity_weighted_areas(scene, map)

@@ -27,7 +27,7 @@ from potr_cl.errors import DeviceError, DeviceMemoryError
 from potr_cl.host import mapped
 from potr_cl.host.threads import in_background
 from potr_cl.model.camera import Camera
-from potr_cl.model.scene import FloatArray
+from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.ferry import Cargo, Ferry
 from potr_cl.opencl.memory import Memory, Owner, Scratch
@@ -43,7 +43,8 @@ from potr_cl.views.visibility import Visibility
 #: Pictures that are asked for together to be kept one by one, and their bytes at the most: a GPU prepares several views
 #: in one go. And bytes of those that go to the host together.
 _TOGETHER, _MOST_BYTES, _TO_HOST = 16, 1 << 28, 1 << 26
-#: Pictures ahead take no more than this part of a device's memory: for a moment they lie there twice.
+#: Pictures ahead and in passing take no more than this part of a device's memory: those ahead lie there twice for a
+#: moment, the others beside all that pruning has.
 AHEAD = 1 / 16
 _WHAT = "the target images"
 
@@ -285,7 +286,7 @@ class _Rendered(Owner):
 class PicturesInPassing(Owner):
     """A scene's pictures on a CPU, rendered while its views are prepared for something else; each is given once.
 
-    To prepare a view takes four times as long as to render it then.
+    They lie there until then: to make a view ready takes longer than to render it.
 
     Args:
         cameras: whose pictures are taken.
@@ -302,6 +303,14 @@ class PicturesInPassing(Owner):
         if device.family != "cpu" or sum(map(target_bytes, cameras)) > AHEAD * device.info.memory:
             return None
         return PicturesInPassing(device, cameras)
+
+    def leave_out(self, splats: Scene) -> None:
+        """Take no pictures of views that show any of these splats, which whoever prepares the views has not got."""
+        with Rasterizer(self._device, splats) as rasterizer:
+            for camera in list(self._wanted.values()):
+                with rasterizer.prepare_set([camera]) as views:
+                    if views.views[0].intersection_count:
+                        del self._wanted[id(camera)]
 
     def take(self, rasterizer: Rasterizer, views: ViewSet) -> None:
         """Render the picture of a prepared view, if it is wanted."""

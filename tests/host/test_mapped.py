@@ -16,6 +16,7 @@ import potr_cl
 from potr_cl.errors import PotrError
 from potr_cl.formats import load_scene
 from potr_cl.host import mapped
+from potr_cl.host.threads import in_background
 from tests.reference.scenes import random_scene
 
 linux = pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="looks at /proc")
@@ -69,6 +70,12 @@ def test_rows_are_those_that_numpy_takes(kind):
 
 
 @linux
+@linux
+def test_a_bound_holds_for_what_goes_on_in_the_background():
+    with mapped.bounded(64_000_000):
+        assert in_a_file(in_background(mapped.array, (1_000_001,), np.uint8, "bytes").result())
+
+
 def test_a_scene_that_is_read_and_what_is_taken_of_it(tmp_path):
     scene = random_scene(500, 3)
     potr_cl.save(scene, tmp_path / "scene.ply")

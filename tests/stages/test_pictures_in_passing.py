@@ -7,19 +7,19 @@ import dataclasses
 import numpy as np
 import pytest
 
-from potr_cl import EncodeOptions, encode
+from potr_cl import EncodeOptions
 from potr_cl.errors import DeviceError
 from potr_cl.model.camera import train_views
+from potr_cl.model.splat_groups import unseen_splats
 from potr_cl.opencl.memory import Memory
+from potr_cl.pipeline.encode import encode
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages import refit
 from potr_cl.stages.pruning.removal import RemovalSweep
-from potr_cl.stages.stage import State
-from potr_cl.stages.unseen import find_unseen, showing_none
 from potr_cl.views import targets
 from potr_cl.views.targets import PicturesInPassing, RenderedTargets, target_bytes
 from tests.devices import shared_device
-from tests.reference.scenes import ring_of_cameras, visible_scene
+from tests.reference.scenes import plain_splats, ring_of_cameras, straight_camera, visible_scene
 from tests.reference.surfaces import together
 
 SCENE, CAMERAS = visible_scene(60), ring_of_cameras(4, size=40)
@@ -75,7 +75,7 @@ def test_a_gpu_and_a_cpu_with_little_memory_take_none(cpu, monkeypatch):
 @pytest.mark.parametrize(("preset", "more"), [("best", {}), ("smallest", {"fit": {"steps": 4, "compared": False}})])
 def test_an_encode_takes_them_and_the_bytes_stay(cpu, monkeypatch, rendered, plush_excerpt, small_views, preset, more):
     """Of a scene with splats that no given view sees."""
-    beyond = plush_excerpt.subset(np.arange(0, len(plush_excerpt), 5))
+    beyond = plush_excerpt.subset(np.arange(0, len(plush_excerpt), 10))
     scene = together(plush_excerpt, dataclasses.replace(beyond, means=beyond.means + np.float32(30)))
     options = EncodeOptions.for_preset(preset, prune={"iterations": 2}, refit={"steps": 2}, **more)
     made = encode(scene, small_views, options, device=cpu)
@@ -103,13 +103,32 @@ def test_they_are_given_back_if_a_later_stage_fails(cpu, monkeypatch, plush_exce
     assert cpu.allocated == 0
 
 
-def test_views_between_may_show_what_no_given_one_does():
-    """Of those, pictures are taken that show none of it."""
-    away = dataclasses.replace(SCENE, means=SCENE.means + np.float32([0, 0, 40]))
-    scene = together(SCENE, away)
-    centre = CAMERAS[0].centre
-    there = dataclasses.replace(CAMERAS[0], translation=-CAMERAS[0].rotation @ (centre + np.array([0, 0, 40])))
-    state = dataclasses.replace(State.of(scene, [*CAMERAS[:2], CAMERAS[2], there]), added=2)
-    unseen, _ = find_unseen(state)
-    assert list(np.flatnonzero(unseen)) == list(range(len(SCENE), 2 * len(SCENE)))
-    assert showing_none(unseen, state) == CAMERAS[:3]
+def beside(views, splats, seed=0):
+    """Large splats that wide views do not see, though their ellipses reach into some of these."""
+    rng = np.random.default_rng(seed)
+    depths = rng.uniform(0.6, 4, splats)
+    means = rng.uniform(-4, 4, (splats, 3)) * depths[:, None]
+    means[:, 2] = depths
+    scene = plain_splats(means, rng.uniform(0.3, 1.5, (splats, 1)), 3.0, rng.uniform(0, 1, (splats, 3)))
+    return scene.subset(np.flatnonzero(unseen_splats(scene, views)))
+
+
+def test_none_is_taken_of_views_that_show_what_pruning_has_not_got(cpu, monkeypatch, rendered):
+    """Splats that no given view sees are not there when it prepares views, but later they are drawn."""
+    rng = np.random.default_rng(1)
+    ahead = straight_camera(64, 64, 24.0)
+    views = [dataclasses.replace(ahead, name=str(k), translation=np.array([0.02 * k, 0, 0])) for k in range(4)]
+    depths = rng.uniform(1, 4, 3000)
+    means = np.stack([*(rng.uniform(-1, 1, (2, 3000)) * depths), depths], axis=1)
+    seen = plain_splats(means, 0.03, 1.0, rng.uniform(0, 1, (3000, 3)))
+    hidden = beside(views, 600)
+    scene = together(seen, hidden.subset(np.arange(min(len(hidden), 300))))
+    assert len(scene) > 3050
+    options = EncodeOptions.for_preset("best", prune={"iterations": 2}, refit={"steps": 2}, between={"views": 0.0})
+    made = encode(scene, views, options, device=cpu, in_frame=True)
+    assert rendered
+    monkeypatch.setattr(targets, "AHEAD", 0.0)
+    assert encode(scene, views, options, device=cpu, in_frame=True).data == made.data
+    monkeypatch.setattr(targets, "AHEAD", 1.0)
+    monkeypatch.setattr(PicturesInPassing, "leave_out", lambda *args: None)
+    assert encode(scene, views, options, device=cpu, in_frame=True).data != made.data

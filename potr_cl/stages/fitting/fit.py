@@ -210,7 +210,7 @@ def fit_scene(
 
 def _best_pace(options: FitOptions, run: Callable[[FitOptions, Following], Fitted], following: Following) -> float:
     """The longest steps that help: longer ones if held-out views gain more by them at first, and where usual ones do
-    harm, the first shorter ones that do none.
+    harm, the first shorter ones that do none, or the shortest.
 
     What suits all depends on how many of the views show a splat, and on how far these are from their targets. In a
     large scene, of which each shows little, steps that are right for an object make it worse. But where steps help,

@@ -63,7 +63,7 @@ class RemovalSweep(Owner):
         progress: called with the views prepared and their number.
         numbers: of the views that are measured here, ascending, where others are measured elsewhere; None: all.
         plan: of these views; None: all of them with all splats.
-        pictures: take those of views that stay.
+        pictures: take those of views as they are prepared for the first time.
         helpers: measure the other views. All totals are integers in units that follow from all views, so it makes no
             difference to any bit who measures which.
 
