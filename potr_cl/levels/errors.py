@@ -28,7 +28,6 @@ from potr_cl.model.camera import Camera, resized
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.model.views_between import views_between
 from potr_cl.opencl.device import Device
-from potr_cl.outputs.output import Leaves
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import stride_of
 from potr_cl.stages.refitting.coefficients import Coefficients
@@ -46,6 +45,8 @@ _ROUND = 1000
 _SAMPLE = 1 << 14
 #: What a splat without SH coefficients shows.
 _GREY = 0.5
+#: What :class:`potr_cl.outputs.output.Leaves` are: (N,) int64, and (leaves, 6) float64.
+Leaves = tuple[NDArray[np.int64], NDArray[np.float64]]
 #: Errors of so many scenes are shared out at once.
 _CHANNELS = 3
 
@@ -98,12 +99,12 @@ class MeasuredErrors:
     ) -> NDArray[np.float64]:
         """See :meth:`potr_cl.outputs.output.LevelErrors.of_leaves`."""
         if not self.views or levels < 2:
-            return np.zeros((len(leaves().boxes), levels))
+            return np.zeros((len(leaves()[1]), levels))
         assert self.device is not None
         views = [_small(view) for view in self.between or self.views]
         with SharedOut(self.device, scenes(0), views, leaves, self.background, self.memory) as shared:
             parts = shared.of(map(scenes, range(1, levels)))
-        boxes = leaves().boxes
+        _, boxes = leaves()
         covered = np.array([seen_coverage(view, boxes) for view in views])
         found = np.zeros((len(boxes), levels))
         found[:, 1:] = errors_a_coverage(parts, covered)
