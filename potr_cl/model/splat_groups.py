@@ -217,15 +217,30 @@ def _bounds(camera: Camera, near: float, origin: F64) -> F64:
         rows[row, 8] = offset - direction @ place + slack * _ROUNDING * away
 
     bound(0, forward, -near, 0.0, 1.0)
-    for row, axis, focal, before, pixels in (
-        (1, right, camera.fx, camera.cx, camera.width),
-        (3, down, camera.fy, camera.cy, camera.height),
+    for row, axis, focal, before, pixels, stretch in zip(
+        (1, 3), (right, down), *_along_axes(camera), stretches(camera), strict=True
     ):
-        steepest = max(_LIMIT * pixels / 2, abs(before) + _PIXELS, abs(pixels - before) + _PIXELS) / focal
-        size = REACH * focal * math.hypot(1, steepest)
+        size = REACH * focal * stretch
         bound(row, focal * axis + (before + _PIXELS) * forward, 0.0, size, focal)
         bound(row + 1, -focal * axis + (pixels - before + _PIXELS) * forward, 0.0, size, focal)
     return rows
+
+
+def _along_axes(camera: Camera) -> tuple[tuple[float, float], tuple[float, float], tuple[int, int]]:
+    """Across and down: the focal length, where the principal point is, and the size; pixels."""
+    return (camera.fx, camera.fy), (camera.cx, camera.cy), (camera.width, camera.height)
+
+
+def stretches(camera: Camera) -> list[float]:
+    """By how much a view stretches splats, across and down, at the most.
+
+    A splat is projected as if it were flat where it is: beside the middle of a wide picture it becomes longer than a
+    sphere's outline would, and beside the picture as long as at 1.3 times its half.
+    """
+    return [
+        math.hypot(1, max(_LIMIT * pixels / 2, abs(before) + _PIXELS, abs(pixels - before) + _PIXELS) / focal)
+        for focal, before, pixels in zip(*_along_axes(camera), strict=True)
+    ]
 
 
 def unseen_splats(
@@ -285,7 +300,7 @@ def bounds(camera: Camera) -> tuple[tuple[float, float], tuple[float, float]]:
     """The planes left and right of a view's picture, and above and below it, as positions at a depth of 1."""
     x, y = (
         ((-_PIXELS_OF_ONE - centre) / focal, (pixels + _PIXELS_OF_ONE - centre) / focal)
-        for focal, centre, pixels in ((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height))
+        for focal, centre, pixels in zip(*_along_axes(camera), strict=True)
     )
     return x, y
 
@@ -317,11 +332,11 @@ def opacity_weighted_areas(scene: Scene, run: Run = map) -> NDArray[np.float64]:
 
 
 def _shows(camera: Camera, means: NDArray[np.float64], reach: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which spheres touch the pyramid that a view sees; their centres in front of the near plane."""
+    """Which splats of some reach may touch a view's picture; their centres in front of the near plane."""
     with np.errstate(over="ignore", invalid="ignore"):
         x, y, depth = camera.rotation @ means.T + camera.translation[:, None]
         shown = depth > NEAR
-        for along, (low, high) in zip((x, y), bounds(camera), strict=True):
-            shown &= along - low * depth > -reach * math.hypot(1, low)
-            shown &= along - high * depth < reach * math.hypot(1, high)
+        for along, (low, high), stretch in zip((x, y), bounds(camera), stretches(camera), strict=True):
+            shown &= along - low * depth > -reach * stretch
+            shown &= along - high * depth < reach * stretch
     return np.asarray(shown)

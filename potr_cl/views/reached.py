@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from potr_cl.errors import DeviceMemoryError
 from potr_cl.model.camera import Camera
-from potr_cl.model.splat_groups import NEAR, REACH, bounds, views_in_turn
+from potr_cl.model.splat_groups import NEAR, REACH, bounds, stretches, views_in_turn
 from potr_cl.opencl.memory import Memory, Reused
 from potr_cl.opencl.structs import struct_dtype
 from potr_cl.raster.picked_splats import Picker
@@ -205,9 +205,7 @@ def surely_seen(scene: SceneBuffers, cameras: Sequence[Camera]) -> NDArray[np.ui
     for seer, number in zip(seers, views_in_turn(len(cameras)), strict=True):
         camera = cameras[number]
         seer["rotation"], seer["translation"] = camera.rotation.ravel(), camera.translation
-        for axis, (low, high) in enumerate(bounds(camera)):
-            seer["low"][axis], seer["high"][axis] = low, high
-            seer["low_length"][axis], seer["high_length"][axis] = np.hypot(1, low), np.hypot(1, high)
+        (seer["low"], seer["high"]), seer["stretch"] = zip(*bounds(camera), strict=True), stretches(camera)
     kernel = device.shared_kernel(_SOURCE, "surely_seen")
     with Memory(device) as memory:
         found = memory.allocate(scene.stride, "the splats that are seen")

@@ -11,6 +11,9 @@ from potr_cl.host.threads import thread_pool
 from potr_cl.model import order, splat_groups
 from potr_cl.model.order import BITS, ascending, morton_codes, morton_order
 from potr_cl.model.splat_groups import SplatGroups, opacity_weighted_areas, unseen_splats
+from potr_cl.opencl.discovery import choose_device
+from potr_cl.raster.rasterizer import Rasterizer
+from tests.devices import shared_device
 from tests.reference.scenes import plain_splats, random_splats, ring_of_cameras, straight_camera
 
 
@@ -20,6 +23,22 @@ def test_what_lies_beside_behind_and_right_in_front_is_unseen():
     places = [[0, 0, 5], [0, 0, -5], [0, 0, 0.1], *beside, [2.4, 0, 5], [0, 0, 1e6]]
     assert unseen_splats(plain_splats(places, 0.01), [camera]).tolist() == [False, *[True] * 6, False, False]
     assert not unseen_splats(plain_splats([[4, 0, 5]], 1.0), [camera])[0], "it reaches into the picture"
+
+
+@pytest.mark.parametrize("focal", [12.0, 30.0, 100.0])
+def test_no_view_draws_what_it_does_not_see(focal):
+    """Wide views draw large splats farther beside their pictures than their outlines reach."""
+    rng = np.random.default_rng(0)
+    camera = dataclasses.replace(straight_camera(48, 32, focal), cx=16.0)
+    depths = rng.uniform(0.3, 4, 20000)
+    means = np.stack([*(rng.uniform(-5, 5, (2, 20000)) * depths * 24 / focal), depths], axis=1)
+    scene = plain_splats(means, np.exp(rng.uniform(-4, 0.5, (20000, 3))), 5.0)
+    scene = dataclasses.replace(scene, quaternions=rng.normal(size=(20000, 4)).astype(np.float32))
+    unseen = unseen_splats(scene, [camera])
+    assert 1000 < np.count_nonzero(unseen) < 19000
+    device = shared_device(choose_device().family)
+    with Rasterizer(device, scene.subset(unseen)) as rasterizer, rasterizer.prepare_set([camera]) as views:
+        assert views.views[0].intersection_count == 0
 
 
 def test_every_view_counts_and_without_views_all_are_unseen():

@@ -10,7 +10,6 @@ import pytest
 from potr_cl import EncodeOptions
 from potr_cl.errors import DeviceError
 from potr_cl.model.camera import train_views
-from potr_cl.model.splat_groups import unseen_splats
 from potr_cl.opencl.memory import Memory
 from potr_cl.pipeline.encode import encode
 from potr_cl.raster.rasterizer import Rasterizer
@@ -19,7 +18,7 @@ from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.views import targets
 from potr_cl.views.targets import PicturesInPassing, RenderedTargets, target_bytes
 from tests.devices import shared_device
-from tests.reference.scenes import plain_splats, ring_of_cameras, straight_camera, visible_scene
+from tests.reference.scenes import ring_of_cameras, visible_scene
 from tests.reference.surfaces import together
 
 SCENE, CAMERAS = visible_scene(60), ring_of_cameras(4, size=40)
@@ -103,32 +102,20 @@ def test_they_are_given_back_if_a_later_stage_fails(cpu, monkeypatch, plush_exce
     assert cpu.allocated == 0
 
 
-def beside(views, splats, seed=0):
-    """Large splats that wide views do not see, though their ellipses reach into some of these."""
-    rng = np.random.default_rng(seed)
-    depths = rng.uniform(0.6, 4, splats)
-    means = rng.uniform(-4, 4, (splats, 3)) * depths[:, None]
-    means[:, 2] = depths
-    scene = plain_splats(means, rng.uniform(0.3, 1.5, (splats, 1)), 3.0, rng.uniform(0, 1, (splats, 3)))
-    return scene.subset(np.flatnonzero(unseen_splats(scene, views)))
-
-
-def test_none_is_taken_of_views_that_show_what_pruning_has_not_got(cpu, monkeypatch, rendered):
-    """Splats that no given view sees are not there when it prepares views, but later they are drawn."""
-    rng = np.random.default_rng(1)
-    ahead = straight_camera(64, 64, 24.0)
-    views = [dataclasses.replace(ahead, name=str(k), translation=np.array([0.02 * k, 0, 0])) for k in range(4)]
-    depths = rng.uniform(1, 4, 3000)
-    means = np.stack([*(rng.uniform(-1, 1, (2, 3000)) * depths), depths], axis=1)
-    seen = plain_splats(means, 0.03, 1.0, rng.uniform(0, 1, (3000, 3)))
-    hidden = beside(views, 600)
-    scene = together(seen, hidden.subset(np.arange(min(len(hidden), 300))))
-    assert len(scene) > 3050
-    options = EncodeOptions.for_preset("best", prune={"iterations": 2}, refit={"steps": 2}, between={"views": 0.0})
-    made = encode(scene, views, options, device=cpu, in_frame=True)
-    assert rendered
-    monkeypatch.setattr(targets, "AHEAD", 0.0)
-    assert encode(scene, views, options, device=cpu, in_frame=True).data == made.data
-    monkeypatch.setattr(targets, "AHEAD", 1.0)
-    monkeypatch.setattr(PicturesInPassing, "leave_out", lambda *args: None)
-    assert encode(scene, views, options, device=cpu, in_frame=True).data != made.data
+def test_none_is_taken_of_views_that_show_what_pruning_has_not_got(cpu):
+    """Splats that no given view sees are not there when it prepares views; those between may show them."""
+    away = dataclasses.replace(SCENE, means=SCENE.means + np.float32([0, 0, 40]))
+    centre = CAMERAS[0].centre
+    there = dataclasses.replace(CAMERAS[0], translation=-CAMERAS[0].rotation @ (centre + np.array([0, 0, 40])))
+    views = [*CAMERAS[:3], there]
+    with (
+        Rasterizer(cpu, SCENE) as rasterizer,
+        PicturesInPassing.wanted(cpu, views) as pictures,
+        Memory(cpu) as memory,
+    ):
+        pictures.leave_out(away)
+        for view in views:
+            with rasterizer.prepare_set([view]) as prepared:
+                pictures.take(rasterizer, prepared)
+        buffer = memory.allocate(target_bytes(there), "a picture")
+        assert [pictures.give(view, buffer, 0) for view in views] == [True] * 3 + [False]

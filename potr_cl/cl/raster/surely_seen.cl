@@ -14,11 +14,11 @@ enum { UNSEEN, SEEN, UNDECIDED };
 /* Standard deviations are cut short beyond this (raster/activation.py), world units. */
 #define LARGEST 1e12f
 
-/* A view: where it is, and the planes that bound its picture, for x and for y: along - low depth and
-   along - high depth are the distances from them, times the root of 1 + low^2 and of 1 + high^2. */
+/* A view: where it is, and for x and for y the planes that bound its picture, and by how much it stretches splats:
+   one whose along - low depth or high depth - along is less than -stretch times its reach is beside it. */
 typedef struct {
     float rotation[9], translation[3];
-    float low[2], high[2], low_length[2], high_length[2];
+    float low[2], high[2], stretch[2];
 } Seer;
 
 kernel void surely_seen(
@@ -53,10 +53,11 @@ kernel void surely_seen(
             const float low = seer->low[axis], high = seer->high[axis];
             const float above = along - low * depth, below = high * depth - along;
             const float low_slack = (1.0f + fabs(low)) * slack, high_slack = (1.0f + fabs(high)) * slack;
-            inside &= above > low_slack - least * seer->low_length[axis];
-            inside &= below > high_slack - least * seer->high_length[axis];
-            outside |= above < -low_slack - most * seer->low_length[axis];
-            outside |= below < -high_slack - most * seer->high_length[axis];
+            const float stretch = seer->stretch[axis];
+            inside &= above > low_slack - least * stretch;
+            inside &= below > high_slack - least * stretch;
+            outside |= above < -low_slack - most * stretch;
+            outside |= below < -high_slack - most * stretch;
         }
         found = inside ? SEEN : outside ? found : UNDECIDED;
     }
