@@ -304,10 +304,8 @@ def simulate(family: str, width: int, names: list[str], told: Path) -> None:
         patches.enter_context(patch.object(Device, "kernel", made))
         patches.enter_context(patch.object(Kernel, "launch", launched))
         patches.enter_context(patch.object(Device, "free", lambda _, buffer: freed.append(buffer)))
-        for module in (
-            resident,
-            target_pictures,
-        ):  # Oclgrind crashes where another thread than the first one asks for memory
+        # Oclgrind crashes where another thread than the first one asks for memory.
+        for module in (resident, target_pictures):
             patches.enter_context(patch.object(module, "in_background", _at_once))
         for module in (coefficients, sliced_arrays):
             patches.enter_context(patch.object(module, "DOT_ITEMS", _DOT_ITEMS))
