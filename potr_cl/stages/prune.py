@@ -19,14 +19,7 @@ from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import Course, Pruned, PruningOptions
 from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
-from potr_cl.stages.unseen import (
-    CHOICES,
-    Unresolved,
-    Unseen,
-    as_of_whole,
-    find_unseen,
-    without_directions,
-)
+from potr_cl.stages.unseen import CHOICES, Unresolved, Unseen, as_of_whole, find_unseen, without_directions
 from potr_cl.views.reached import surely_seen
 from potr_cl.views.shares import ViewShares
 from potr_cl.views.targets import PicturesInPassing
@@ -252,8 +245,8 @@ class Prune(Stage):
         schedule = self._schedule(bench.parameters.delta_mse_max, len(state.scene) if seen is None else len(seen))
         pictures = _in_passing(state, bench, hidden if seen is not None else None)
         bench.progress("prepare views", 0.0)
-        sweep_options = self._sweep_options(bench.memory)
-        with measurement(state, bench, sweep_options, visibility, dealt, seen, pictures) as removal:
+        options = self._sweep_options(bench.memory)
+        with measurement(state, bench, options, visibility, dealt, seen, pictures) as removal:
             course = _Course(state, removal, seen)
             ready = removal.ready_views >= (1 - _MADE_AGAIN) * len(state.views)
 
