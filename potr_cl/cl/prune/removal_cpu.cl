@@ -113,7 +113,7 @@ inline void walk_back(
     }
 }
 
-/* Work-item i handles tile tiles[start + i]. */
+/* Work-item i handles tile tiles[start + i]. counts[tile] becomes what its pixels count in `staleness`. */
 kernel void removal(
     uint start,
     global const uint *tiles,
@@ -133,6 +133,7 @@ kernel void removal(
     float bound,
     global float *target,
     global float2 *sums,
+    global float *counts,
     volatile global uint *totals)
 {
     const int tile = tiles[start + get_global_id(0)];
@@ -183,6 +184,7 @@ kernel void removal(
             walk(splats, lists[i], listed[i], subtile_centre(origin, i), &t[i], rgb[i], memory);
     }
 
+    float importance = 0.0f;
     for (uint segment = last + 1; segment-- > 0;) {
         const uint from = begin + segment * SEGMENT;
         if (segment < last) {
@@ -230,8 +232,10 @@ kernel void removal(
                 PREFETCH_TO_WRITE(totals + TOTAL_WORDS * intersections[from + k + PREFETCH_AHEAD]);
             replace_sums(totals + TOTAL_WORDS * intersections[from + k], sums[from + k], fresh[k], scale, bound);
             sums[from + k] = fresh[k];
+            importance += fresh[k].y;
         }
     }
+    counts[tile] = removed_counts(importance, kept - begin);
     /* What lies behind the last pixel's end has no effect any more. */
     for (uint e = begin + (last + 1) * SEGMENT; e < kept; ++e) {
         replace_sums(totals + TOTAL_WORDS * intersections[e], sums[e], (float2)(0.0f, 0.0f), scale, bound);

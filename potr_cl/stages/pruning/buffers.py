@@ -117,6 +117,7 @@ class PreparedSet(Owner):
         lengths: (tiles,) uint32, intersections that a tile has left.
         sums: (intersections, 2) float32, ΔMSE and I of an intersection, summed over its tile's pixels.
         target: (pixels, 3) float32, the pictures before any removal.
+        counts: (tiles,) float32, what removed pixels of a tile count for its staleness; on CPUs.
         first_tile: where the tiles begin among those of all resident views.
     """
 
@@ -137,6 +138,8 @@ class PreparedSet(Owner):
             views.found_offsets = []
             self.lengths = self._memory.upload(lengths, "the tile lists", pending)
             self.sums = self._memory.allocate(8 * views.capacity, "the tiles' removal effects")
+            if device.family == "cpu":
+                self.counts = self._memory.allocate(4 * views.tiles, "the tiles to sweep")
             self.target = target or self._memory.allocate(12 * views.pixels, "the target images")
         except BaseException:
             self.close()

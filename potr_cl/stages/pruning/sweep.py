@@ -39,8 +39,9 @@ class SweepOptions:
     """Speed/accuracy trade-offs of a removal sweep.
 
     Attributes:
-        tolerance: a tile is swept again once the importance removed from it, as a part of its area, exceeds this.
-            0: whenever anything was removed from it; negative: always.
+        tolerance: a tile is swept again once the importance removed from it, as a part of its area, exceeds this;
+            that of large splats counts less (removed_counts of cl/prune/removal.clh). 0: whenever anything was removed
+            from it; negative: always.
         turns: with n, a view is swept only in every n-th measurement after the first. Views that do not fit the memory
             budget are swept in each measurement.
         memory: bytes of device memory that the views may take; None: :func:`potr_cl.views.budget.default_memory`.
@@ -207,6 +208,7 @@ class SetKernels:
                 "scale": fixed_point.scale * weight,
                 "bound": fixed_point.bound / weight,
             }
+            both["counts"] = prepared.counts
         else:
             picked = ledger.numbers is not None
             macros["PICKED"] = int(picked)
