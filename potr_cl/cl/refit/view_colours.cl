@@ -143,8 +143,8 @@ kernel void view_colours(
 }
 
 #if LANES > 1 && !PICKED
-/* What a direction adds to the splats' colours in up to four views on a CPU, whose colours are buffers of their own:
-   the four `…_free`, of which there may be more than views. */
+/* What a direction adds to the splats' colours in up to eight views on a CPU, whose colours are buffers of their own:
+   `free_…`, of which there may be more than views. */
 kernel void colour_changes(
     global const float *coefficients,
     global const float *means,
@@ -154,12 +154,17 @@ kernel void colour_changes(
     global const SetView *views,
     uint view_count,
     float unit,
-    global const float4 *first_free,
-    global const float4 *second_free,
-    global const float4 *third_free,
-    global const float4 *fourth_free,
+    global const float4 *free_0,
+    global const float4 *free_1,
+    global const float4 *free_2,
+    global const float4 *free_3,
+    global const float4 *free_4,
+    global const float4 *free_5,
+    global const float4 *free_6,
+    global const float4 *free_7,
     global float4 *colours)
 {
+    global const float4 *const free[] = {free_0, free_1, free_2, free_3, free_4, free_5, free_6, free_7};
     const size_t splat = get_global_id(0);
     Changing changing;
     changing_coefficients(active, stride, splat, &changing);
@@ -172,9 +177,7 @@ kernel void colour_changes(
         basis_towards(means, stride, splat, &views[number].view, basis);
         vfloat red, green, blue;
         change_in_view(values, &changing, basis, &red, &green, &blue);
-        global const float4 *free =
-            number == 0 ? first_free : number == 1 ? second_free : number == 2 ? third_free : fourth_free;
-        const vint kept = free_channels(free, splat);
+        const vint kept = free_channels(free[number], splat);
         red = (kept & 1) != 0 ? red * unit : (vfloat)(0.0f);
         green = (kept & 2) != 0 ? green * unit : (vfloat)(0.0f);
         blue = (kept & 4) != 0 ? blue * unit : (vfloat)(0.0f);

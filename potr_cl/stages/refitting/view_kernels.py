@@ -42,7 +42,7 @@ def gathered_scale(cameras: Sequence[Camera], weights: Sequence[float]) -> float
 
 #: On CPUs, launches that are given colours, and whose sums are gathered, together: coefficients, which take much more
 #: than what is a view's, go through the memory once for so many views.
-TOGETHER = 4
+TOGETHER = 8
 #: On CPUs, splats of a tile that are done together. What they leave behind still fits the second cache; a longer list
 #: is walked twice. With 1024, that would be a third of lego's.
 _SEGMENT = 1536
@@ -235,7 +235,7 @@ class ViewKernels:
         self, tables: cl.Buffer, stride: int, x: cl.Buffer, result: cl.Buffer, free: Sequence[cl.Buffer], unit: float,
         constant: bool,
     ) -> None:  # fmt: skip
-        """Enqueue what a direction adds to the colours of up to four views that are prepared each for itself.
+        """Enqueue what a direction adds to the colours of up to :data:`TOGETHER` views, each prepared for itself.
 
         To bring the direction from memory takes most of the time, and they have it once.
 
@@ -248,7 +248,6 @@ class ViewKernels:
         kernel = self._device.shared_kernel(
             "refit/view_colours.cl", "colour_changes", PICKED=0, **self._layout.some(constant)
         )
-        first, second, third, fourth = [*free, *[result] * (TOGETHER - len(free))]
         kernel.bind(
             coefficients=x,
             means=self._means,
@@ -258,10 +257,7 @@ class ViewKernels:
             views=tables,
             view_count=len(free),
             unit=np.float32(unit),
-            first_free=first,
-            second_free=second,
-            third_free=third,
-            fourth_free=fourth,
+            **{f"free_{number}": free[min(number, len(free) - 1)] for number in range(TOGETHER)},
             colours=result,
         )
         kernel.launch(*self._layout.items(stride, 1))
