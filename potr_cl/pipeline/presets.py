@@ -23,7 +23,7 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
         Merge(),
         Fit(),
         Compact(on=False),
-        Refit(steps=6),
+        Refit(steps="auto"),
         Code(),
     ),
     "smallest": (

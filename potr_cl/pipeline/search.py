@@ -225,15 +225,16 @@ class _Search(AbstractContextManager["_Search"]):
     def _scout(self, q: float) -> float:
         """The q to begin with, by a rough encode of one, if that takes less time than a full one."""
         rough = min(max(q, 1 - _SCOUT_END), _SCOUT_END)
-        prune, refit = self._options.stage(Prune), self._options.stage(Refit)
+        prune, steps = self._options.stage(Prune), self._options.stage(Refit).steps_on(self._device.family)
+        fewer_steps = min(steps, _SCOUT_STEPS)
         options = self._options.changed(
             q=rough,
             prune={"iterations": min(prune.iterations, _SCOUT_ITERATIONS)},
-            refit={"steps": min(refit.steps, _SCOUT_STEPS), "at": ()},
+            refit={"steps": fewer_steps, "at": ()},
         )
         options = _with_short_fit(options)
         fewer_looks = prune.on and options.prune.iterations < prune.iterations
-        shorter_refit = self._fitted and options.refit.steps < refit.steps
+        shorter_refit = self._fitted and fewer_steps < steps
         if not self._views or not (fewer_looks or shorter_refit):
             return q
         thinned = self._thin(options)

@@ -9,13 +9,14 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from potr_cl.errors import UsageError
 from potr_cl.host.threads import in_background, thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import Family
 from potr_cl.outputs.output import ColourGrid, Rounded
 from potr_cl.quality.photographs import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
@@ -30,6 +31,9 @@ from potr_cl.stages.unseen import as_important
 from potr_cl.views.shares import HelpFrom
 from potr_cl.views.targets import HostTargets, PhotographTargets, PicturesAhead, Targets, targets_of
 
+#: The most steps that "auto" stands for. On a GPU further ones take little time, and a gain of less than they need ends
+#: them (docs/benchmarks/time_error.md).
+STEPS: dict[Family, int] = {"cpu": 6, "gpu": 12}
 #: A scene that takes more than this part of the memory that is given makes room for the re-fit.
 _LARGE = 1 / 16
 #: Threads that make of rounded geometry what a decoder sees; with 32 it takes half as long again.
@@ -50,7 +54,7 @@ class Refit(Stage):
     """Re-fit the colours to the training views, on the geometry and opacities that a decoder will see.
 
     Attributes:
-        steps: the most conjugate-gradient steps; with 0 the re-fit is left out.
+        steps: the most conjugate-gradient steps; with 0 the re-fit is left out. "auto": as many as pay on the device.
         drop: replaces the value that q gives.
         at: parts of the pruning iterations after which colours are re-fitted too, so that later iterations see colours
             that make up for the splats that went.
@@ -67,7 +71,7 @@ class Refit(Stage):
     name = "refit"
     title = "re-fit of the colours"
 
-    steps: int = option(
+    steps: int | Literal["auto"] = option(
         8,
         Flag(
             "--refit",
@@ -116,7 +120,7 @@ class Refit(Stage):
         for part in self.at:
             if not 0 <= part <= 1:
                 raise UsageError(f"--refit-at is {part:g}, it must lie between 0 and 1")
-        _ = RefitOptions(steps=self.steps, prior=self.prior), RefitOptions(steps=self.at_steps)
+        _ = RefitOptions(steps=self.steps_on("gpu"), prior=self.prior), RefitOptions(steps=self.at_steps)
 
     @classmethod
     def from_flags(cls, given: dict[str, Any]) -> dict[str, Any]:
@@ -124,7 +128,11 @@ class Refit(Stage):
 
     @property
     def asked_for(self) -> bool:
-        return self.on and self.steps > 0
+        return self.on and self.steps != 0
+
+    def steps_on(self, family: Family) -> int:
+        """The most steps on a device of a family."""
+        return STEPS[family] if self.steps == "auto" else self.steps
 
     def interludes(self, iterations: int) -> Sequence[Interlude]:
         times = sorted({max(round(part * iterations), 1) for part in self.at})
@@ -141,7 +149,9 @@ class Refit(Stage):
         active = active_coefficients(state.scene.sh, parameters.sf_sh) if compacted else None
         if state.results.chosen == parameters:
             active = chosen_coefficients(state.scene.sh)
-        options = RefitOptions(steps=self.steps, drop=parameters.drop, memory=bench.memory, prior=self.prior)
+        options = RefitOptions(
+            steps=self.steps_on(bench.opened.family), drop=parameters.drop, memory=bench.memory, prior=self.prior
+        )
         on_grid = bench.output.on_grid(bench.request(state))
         # What has been fitted to photographs already is what the colours should show again once all else is rounded.
         folder = self.ground_truth if state.truth is None else None

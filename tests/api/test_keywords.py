@@ -347,7 +347,7 @@ def test_choices_of_stages_by_name() -> None:
     assert not encode_options(None, "best", {"refit": False}).refit.on
     assert not encode_options(None, "best", {"prune": False}).prune.on
     assert not encode_options(None, "best", {"between": False}).stage(Between).on
-    assert encode_options(None, "best", {"refit": "auto"}).refit.steps == 6
+    assert encode_options(None, "best", {"refit": "auto"}).refit.steps_on("cpu") == 6
 
 
 @pytest.mark.parametrize(

@@ -184,12 +184,12 @@ def refit_rows(load: Workload) -> Iterator[Row]:
     with Rasterizer(Device(load.info), load.scene) as rasterizer, RemovalSweep(rasterizer, views) as removal:
         importance = removal.measure()[1]
     kept = load.scene.subset(np.sort(np.argsort(importance)[len(importance) // 2 :]))
-    default = EncodeOptions.for_preset("best").refit.steps
+    default = EncodeOptions.for_preset("best").refit.steps_on(load.info.family)
     for family in families(load.info)[: 1 if load.quick else 2]:
         device = Device(load.info, family=family)
         with Rasterizer(device, load.scene) as rasterizer:
             targets = RenderedTargets(rasterizer, views)
-            for steps in (0, 1, 2, 4, 6, 16) if load.quick else (0, 1, 2, 4, 6, 8, 16, 32, 64):
+            for steps in (0, 1, 2, 4, 6, 12, 16) if load.quick else (0, 1, 2, 4, 6, 8, 12, 16, 32, 64):
                 errors: list[float] = []
 
                 def work(device: Device = device, targets: RenderedTargets = targets, steps: int = steps) -> None:

@@ -170,7 +170,9 @@ def presets_table() -> str:
         assert isinstance(prune, Prune)
         assert isinstance(refit, Refit)
         assert isinstance(code, Code)
-        colours = f"re-fitted together in {refit.steps} steps" if refit.steps else "as they are"
+        cpu, gpu = refit.steps_on("cpu"), refit.steps_on("gpu")
+        on_gpu = "" if gpu == cpu else f" ({gpu} on a GPU)"
+        colours = f"re-fitted together in {cpu} steps{on_gpu}" if cpu else "as they are"
         if compact.on:
             colours = "compacted splat by splat"
         # The paper's steps are stored as plain streams.
