@@ -31,12 +31,24 @@ KNOBS: dict[str, tuple[str, str, tuple[Any, ...]]] = {
     "pruning iterations": ("best", "prune.iterations", (12, 24, 96)),
     "part of a tile that may be gone before it is measured again": ("best", "prune.tolerance", (0.0, 0.01, 0.04, 0.08)),
     "views between, for each given one": ("best", "between.views", (0, 0.25, 1)),
-    "steps of the re-fit": ("best", "refit.steps", (2, 4, 12, 16)),
+    "steps of the re-fit": ("best", "refit.steps", (2, 4, 6, 12, 16)),
     "re-fits while pruning": ("best", "refit.at", ((0.5,), (0.5, 0.75))),
     "smallest: steps of the fit": ("smallest", "fit.steps", (400, 700, 1500, 3200)),
     "smallest: views in a step of the fit": ("smallest", "fit.batch", (1, 4)),
     "smallest: views between of the fit, for each given one": ("smallest", "fit.between", (0.5, 1.0)),
     "smallest: re-fits while pruning": ("smallest", "refit.at", ((), (0.5, 0.75))),
+    "fast: pruning iterations": ("fast", "prune.iterations", (8, 24, 32)),
+    "fast: part of a tile that may be gone before it is measured again": ("fast", "prune.tolerance", (0.0, 0.04)),
+    "fast: views between, for each given one": ("fast", "between.views", (0, 1)),
+    "fast: steps of the re-fit": ("fast", "refit.steps", (2, 6, 12)),
+    "paper: pruning iterations": ("paper", "prune.iterations", (12, 24, 96)),
+    "paper: part of a tile that may be gone before it is measured again": (
+        "paper",
+        "prune.tolerance",
+        (0.0, 0.02, 0.04),
+    ),
+    "paper: two passes of the compaction": ("paper", "compact.two_pass", (False,)),
+    "paper: level of zstd": ("paper", "code.zstd_level", (3, 22)),
 }
 #: The qualities in which knobs are turned, and the others of the defaults' curve.
 QUALITIES, AROUND = (0.3, 0.5), (0.2, 0.25, 0.35, 0.4, 0.45, 0.55)
