@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 from contextlib import contextmanager
 
 import numpy as np
@@ -175,6 +176,30 @@ def test_tolerance_and_turns_save_sweeps(device, plush_excerpt, plush_excerpt_ca
     assert every == pytest.approx(4)
     assert in_turns == pytest.approx(1 + 3 * 0.5)
     assert every > changed > tolerant >= 1
+
+
+@pytest.mark.parametrize("large", [False, True])
+def test_what_goes_of_large_splats_counts_less(device, large):
+    """Down to a quarter of what it covered, by the root of the mean importance of the tile's intersections."""
+    scene = visible_scene(200, 0, seed=3)
+    if not large:
+        scene.log_scales[:] -= np.float32(2)
+        scene.opacity_logits[:] = -4
+    gone = np.arange(0, 200, 7)
+    with sweep(device, scene, ring_of_cameras(1, size=64), tolerance=1e3) as removal:
+        removal.measure()
+        (ready,) = removal._resident._sets
+        _, splats, sums = ready.work.read_sums(0)
+        starts = device.download(ready.views.offsets, (ready.views.tiles + 1,), np.uint32).astype(int)
+        removal.remove(gone)
+        stale = removal._resident._staleness()
+    counts = []
+    for tile, (start, stop) in enumerate(itertools.pairwise(starts)):
+        importances = sums[start:stop, 1].astype(np.float64)
+        counts.append(np.sqrt(np.clip(0.2 * (stop - start) / max(importances.sum(), 1e-30), 1 / 16, 1)))
+        lost = importances[np.isin(splats[start:stop], gone)].sum() / 256
+        assert stale[tile] == pytest.approx(lost * counts[-1], rel=1e-4, abs=1e-9)
+    assert (np.array(counts) < 1).any() == large
 
 
 def test_a_removal_lets_pixels_go_on(device):

@@ -247,7 +247,7 @@ def _ticks(axis: Any, ticks: Sequence[float]) -> None:
     axis.minorticks_off()
 
 
-def _knobs(name: str, machine: str, tables: Mapping[str, str], bytes_shown: tuple[float, float]) -> Plot:
+def _knobs(name: str, where: str, tables: Mapping[str, str], bytes_shown: tuple[float, float]) -> Plot:
     """Bytes at equal PSNR by time, a line a knob through the defaults at (1, 0); a panel a table, by its title."""
 
     def panels(results: Results, axes: Sequence[Any]) -> None:
@@ -265,7 +265,7 @@ def _knobs(name: str, machine: str, tables: Mapping[str, str], bytes_shown: tupl
             _ticks(axis, (0.6, 0.8, 1, 1.3, 1.6, 2))
         axes[0].set_ylabel("bytes at equal PSNR, %")
 
-    return Plot(name, f"What does each knob cost and bring on a {machine}?", tuple(tables), panels)
+    return Plot(name, f"What does each knob cost and bring {where}?", tuple(tables), panels)
 
 
 def _curves(name: str, title: str, subject: str, series: Sequence[str], against: str, formats: bool = True) -> Plot:
@@ -338,11 +338,17 @@ PLOTS: tuple[Plot, ...] = (
         "photographs", "What does a fit to photographs bring, on photographs that nobody has looked at?",
         "photographs", _FITTED, "photographs", formats=False,
     ),
-    _knobs("time_error", "GPU", {"time_error/lego_h200": "lego", "time_error/plush_h200": "plush"}, (-3, 10)),
+    _knobs("time_error", "on a GPU", {"time_error/lego_h200": "lego", "time_error/plush_h200": "plush"}, (-3, 10)),
     _knobs(
         "time_error_cpu",
-        "CPU",
+        "on a CPU",
         {"time_error/lego_cpu": "lego, small views, best", "time_error/lego_cpu_smallest": "the same, smallest"},
+        (-8, 15),
+    ),
+    _knobs(
+        "time_error_fast",
+        "in presets fast and paper",
+        {"time_error/lego_h200_fast": "lego, GPU", "time_error/lego_cpu_fast": "lego, small views, CPU"},
         (-8, 15),
     ),
     Plot("gpus", "What do more GPUs bring?", ("scaling/gpu_points", "scaling/gpu_foretold"), _gpus),
