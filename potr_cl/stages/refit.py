@@ -31,8 +31,7 @@ from potr_cl.stages.unseen import as_important
 from potr_cl.views.shares import HelpFrom
 from potr_cl.views.targets import HostTargets, PhotographTargets, PicturesAhead, Targets, targets_of
 
-#: The most steps that "auto" stands for. On a GPU further ones take little time, and a gain of less than they need ends
-#: them (docs/benchmarks/time_error.md).
+#: The most steps that "auto" stands for: on a GPU further ones take little time (docs/benchmarks/time_error.md).
 STEPS: dict[Family, int] = {"cpu": 6, "gpu": 12}
 #: A scene that takes more than this part of the memory that is given makes room for the re-fit.
 _LARGE = 1 / 16
@@ -120,6 +119,8 @@ class Refit(Stage):
         for part in self.at:
             if not 0 <= part <= 1:
                 raise UsageError(f"--refit-at is {part:g}, it must lie between 0 and 1")
+        if isinstance(self.steps, str) and self.steps != "auto":
+            raise UsageError(f"the re-fit's steps are '{self.steps}': give a number, or auto")
         _ = RefitOptions(steps=self.steps_on("gpu"), prior=self.prior), RefitOptions(steps=self.at_steps)
 
     @classmethod

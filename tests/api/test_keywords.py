@@ -347,7 +347,8 @@ def test_choices_of_stages_by_name() -> None:
     assert not encode_options(None, "best", {"refit": False}).refit.on
     assert not encode_options(None, "best", {"prune": False}).prune.on
     assert not encode_options(None, "best", {"between": False}).stage(Between).on
-    assert encode_options(None, "best", {"refit": "auto"}).refit.steps_on("cpu") == 6
+    usual = encode_options(None, "best", {"refit": "auto"}).refit
+    assert (usual.steps_on("cpu"), usual.steps_on("gpu")) == (6, 12)
 
 
 @pytest.mark.parametrize(

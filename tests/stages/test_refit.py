@@ -125,7 +125,7 @@ def test_coefficients_that_no_splat_nearby_may_change_are_left_out_and_no_bit_ch
     active[:, 0] = True
     active[60:, 1:] = False
     directions = np.random.default_rng(1).normal(size=scene.sh.shape) * active
-    with Case(device, scene, scene, ring_of_cameras(5, size=40)) as case, Linearised(case) as linear:
+    with Case(device, scene, scene, ring_of_cameras(9, size=40)) as case, Linearised(case) as linear:
         whole = linear.normal(directions)
         linear.activate(active)
         some = linear.normal(directions)

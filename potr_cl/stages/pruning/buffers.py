@@ -139,7 +139,7 @@ class PreparedSet(Owner):
             self.lengths = self._memory.upload(lengths, "the tile lists", pending)
             self.sums = self._memory.allocate(8 * views.capacity, "the tiles' removal effects")
             if device.family == "cpu":
-                self.counts = self._memory.allocate(4 * views.tiles, "the tiles to sweep")
+                self.counts = self._memory.allocate(4 * views.tiles, "what counts for the tiles' staleness")
             self.target = target or self._memory.allocate(12 * views.pixels, "the target images")
         except BaseException:
             self.close()

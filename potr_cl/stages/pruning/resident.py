@@ -63,8 +63,8 @@ class Queues:
 class TileSchedule:
     """Chooses the tiles of a measurement by staleness, and in turns.
 
-    A tile's staleness is the importance removed from it since its last sweep, as a part of its area; infinite before
-    the first sweep.
+    A tile's staleness is the importance removed from it since its last sweep, as far as it counts, as a part of its
+    area; infinite before the first sweep.
 
     Args:
         options: tolerance and turns.

@@ -74,6 +74,8 @@ class ViewErrors(Owner):
 
 #: Bytes a splat and view of a sweep's own buffers: the colours' change and the sums.
 _CHANGE, _TOTALS = 16, 32
+#: The most of a budget that these take of views that are gathered together, beyond those of one.
+_AT_ONCE = 1 / 16
 #: Vectors' bytes that are taken later, beside the sums of the splats' own blocks: the sums over views, and what the
 #: solution was before it was rounded; and of packed coefficients that go to other devices and come from them.
 _LATER, _EXCHANGED = 3, 3
@@ -172,9 +174,12 @@ class OwnViews(Owner):
                 for each, views in zip(launches, itertools.pairwise(ends), strict=True)
             ]
             most = max((len(each.numbers) for each in launches), default=0)
-            together = min(sweep.gathered, max(len(launches), 1)) if most == 1 and reach is None else 1
+            largest, together = max((each.size for each in launches), default=0), 1
+            if most == 1 and reach is None:
+                fitting = int(_AT_ONCE * room / ((_CHANGE + _TOTALS) * largest))
+                together = max(min(sweep.gathered, len(launches), fitting), 1)
             self._gathered = [self._launches[n : n + together] for n in range(0, len(self._launches), together)]
-            at_once = together * max((each.size for each in launches), default=0)
+            at_once = together * largest
             self._change = self._memory.allocate(_CHANGE * at_once, "the colours' change")
             self._totals = self._memory.allocate(_TOTALS * at_once, "the re-fit's sums")
             self._slots = [
