@@ -83,7 +83,8 @@ class Prune(Stage):
         SweepOptions.tolerance,
         Flag(
             "--tolerance",
-            "measure a tile again once this part of it has been removed; 0: after any removal",
+            "measure a tile again once this part of it has been removed, of large splats up to four times as much; 0: "
+            "after any removal",
             "X",
             float,
         ),
