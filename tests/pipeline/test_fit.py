@@ -20,7 +20,7 @@ from potr_cl.stages.fitting.fitted import Fitted, LeftOut
 from potr_cl.stages.stage import State
 
 #: Half of the splats, so that there is something to make up for; with coarser steps files would not show it.
-HALF = EncodeOptions(q=0.5).changed(prune={"keep": 0.5, "iterations": 8}, fit={"steps": 30, "rounds": 3})
+HALF = EncodeOptions(q=0.5).changed(prune={"keep": 0.5, "iterations": 8}, fit={"steps": 60, "rounds": 3})
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,7 @@ def test_time_is_told_only_of_a_fit_that_was_asked_for(device, plush_excerpt, pl
 @pytest.mark.slow
 def test_what_makes_up_for_splats_rounds_finer(device, plush_excerpt, plush_excerpt_cameras, half):
     options = EncodeOptions(q=0.3).changed(
-        prune={"delta_mse_max": 1e-7}, between={"views": 0.5}, fit={"steps": 80, "further": 0.2, "cycles": 1}
+        prune={"delta_mse_max": 1e-7}, between={"views": 0.5}, fit={"steps": 200, "further": 0.2, "cycles": 1}
     )
     encoded = encode(plush_excerpt, plush_excerpt_cameras, options, device=device)
     assert encoded.fitted.spared > 0
