@@ -75,6 +75,12 @@ def test_without_a_refit_colours_are_compacted_unless_told_otherwise(refit):
     assert EncodeOptions.for_preset("best", refit=refit, compact={"at": 0.5}).compact.on
 
 
+def test_steps_of_a_refit_are_a_number_or_auto():
+    with pytest.raises(UsageError, match="the re-fit's steps are 'many': give a number, or auto"):
+        EncodeOptions.for_preset("best", refit={"steps": "many"})
+    assert EncodeOptions.for_preset("fast", refit={"steps": "auto"}).refit.steps_on("cpu") == 6
+
+
 def test_a_refit_that_the_preset_does_not_have_stands_in_for_the_compaction():
     assert EncodeOptions.for_preset("paper").compact.on
     assert not EncodeOptions.for_preset("paper", refit={"steps": 8}).compact.on

@@ -13,7 +13,7 @@ from potr_cl.model.camera import train_views
 from potr_cl.opencl.memory import Memory
 from potr_cl.pipeline.encode import encode
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages import refit
+from potr_cl.stages import prune, refit
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.views import targets
 from potr_cl.views.targets import PicturesInPassing, RenderedTargets, target_bytes
@@ -91,12 +91,15 @@ def test_an_encode_takes_them_and_the_bytes_stay(cpu, monkeypatch, rendered, plu
     assert not taken
 
 
-def test_they_are_given_back_if_a_later_stage_fails(cpu, monkeypatch, plush_excerpt, small_views):
+@pytest.mark.parametrize(("module", "name"), [(prune, "prune_scene"), (refit, "refit_colours")])
+def test_they_are_given_back_if_pruning_or_a_later_stage_fails(
+    cpu, monkeypatch, plush_excerpt, small_views, module, name
+):
     def failing(*args, **more):
         assert cpu.allocated
         raise DeviceError("it failed")
 
-    monkeypatch.setattr(refit, "refit_colours", failing)
+    monkeypatch.setattr(module, name, failing)
     with pytest.raises(DeviceError, match="it failed"):
         encode(plush_excerpt, small_views, EncodeOptions.for_preset("fast", prune={"iterations": 1}), device=cpu)
     assert cpu.allocated == 0

@@ -74,7 +74,7 @@ class ViewErrors(Owner):
 
 #: Bytes a splat and view of a sweep's own buffers: the colours' change and the sums.
 _CHANGE, _TOTALS = 16, 32
-#: The most of a budget that these take of views that are gathered together, beyond those of one.
+#: So much of the room for views these take at the most where several views are gathered together.
 _AT_ONCE = 1 / 16
 #: Vectors' bytes that are taken later, beside the sums of the splats' own blocks: the sums over views, and what the
 #: solution was before it was rounded; and of packed coefficients that go to other devices and come from them.
