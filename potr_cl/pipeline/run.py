@@ -181,10 +181,13 @@ class Run:
         done = [stage for stage in self._options.stages if only is None or type(stage) in only]
         again = any(isinstance(stage, (Fit, Refit)) and stage.asked_for for stage in done)
         pictures = state.results.pictures
+        waiting = list(done)
         try:
             for stage in done:
                 if not self._is_wanted(stage, state):
                     continue
+                if not stage.serves_others:
+                    state, waiting = self._begun(waiting, state), []
                 after = self._done(stage, state, again)
                 pictures = after.results.pictures
                 after = as_they_were(after)
@@ -195,6 +198,14 @@ class Run:
         finally:
             if pictures is not None:
                 pictures.close()
+        return state
+
+    def _begun(self, stages: Sequence[Stage], state: State) -> State:
+        """The state once stages have begun what they can in the background."""
+        device = self.device or self._given
+        for stage in stages:
+            if device is not None and stage.needs_views and self._is_wanted(stage, state):
+                state = stage.begun(state, dataclasses.replace(self._bench(stage, state, False), device=device))
         return state
 
     def _is_wanted(self, stage: Stage, state: State) -> bool:

@@ -230,16 +230,22 @@ class Preparation(Owner):
         if not self.shares:
             self.memory.rest()
 
-    def in_sets(self, composite: Callable[[ViewSet], None], cameras: Sequence[Camera], most: int) -> None:
+    def in_sets(
+        self, composite: Callable[[ViewSet], None], cameras: Sequence[Camera], most: int, former: ViewSet | None = None
+    ) -> ViewSet | None:
         """Prepare and composite views, in sets of about one size: drivers take long to give memory and to take it back.
 
         Args:
             composite: enqueues the pictures of a set, and what becomes of them.
             cameras: of the views.
             most: how many a set has at most; fewer, where the device has no room.
+            former: a set whose memory is taken, or given back; of no use any more.
+
+        Returns:
+            The last set, the caller's to close.
         """
         number = 0
-        views: ViewSet | None = None
+        views = former
         try:
             while number < len(cameras):
                 left = len(cameras) - number
@@ -255,10 +261,11 @@ class Preparation(Owner):
                     continue
                 composite(views)
                 number += len(some)
-        finally:
+        except BaseException:
             if views is not None:
                 views.close()
-                self.close()
+            raise
+        return views
 
     def _instead_of(self, former: ViewSet | None, cameras: Sequence[Camera]) -> ViewSet:
         """Prepared views, in the memory of others that nobody needs any more, if they fit in there."""

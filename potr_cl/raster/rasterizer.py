@@ -157,6 +157,25 @@ class Rasterizer(Owner):
             target: takes (pixels, 3) float32.
             start: byte where they begin.
         """
+        try:
+            last = self.render_again(cameras, target, start)
+            if last is not None:
+                last.close()
+        finally:
+            if self._launcher.whole_sets:
+                self._preparation.close()
+
+    def render_again(
+        self, cameras: Sequence[Camera], target: cl.Buffer, start: int = 0, former: ViewSet | None = None
+    ) -> ViewSet | None:
+        """:meth:`render_into` for who renders again and again.
+
+        Args:
+            former: what the last call has returned, whose memory is taken; of no use any more.
+
+        Returns:
+            What the views were prepared in, for the next call, and the caller's to close at last; None on a CPU.
+        """
         device = self.device
 
         def copied(image: cl.Buffer, pixels: int) -> None:
@@ -171,11 +190,11 @@ class Rasterizer(Owner):
         if self._launcher.whole_sets:
             room = (device.info.memory - device.allocated) // 512
             most = int(max(min(room, _PROJECTED) // self.stride, 1))
-            self._preparation.in_sets(composited, cameras, most)
-            return
+            return self._preparation.in_sets(composited, cameras, most, former)
         for camera in cameras:
             image, _ = self.render_device(camera)
             copied(image, camera.width * camera.height)
+        return None
 
     def pictures_into(self, views: ViewSet, target: cl.Buffer, start: int = 0) -> None:
         """Enqueue the pictures of prepared views, one behind the other into a buffer from byte ``start`` on."""

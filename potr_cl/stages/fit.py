@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from concurrent.futures import Future
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -16,6 +17,7 @@ from typing import Literal
 
 from potr_cl.errors import UsageError
 from potr_cl.host.process import first_interrupt_asks
+from potr_cl.host.threads import in_background
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.model.views_between import views_between
@@ -77,6 +79,14 @@ _TOO_FEW_VIEWS = "it needs two training views or more, because one of them is he
 _NO_GAIN = "on the views that were held out it did not make up for the splats that were removed before it"
 _LITTLE_GAIN = "on the views that were held out it gained little beyond what the re-fit of the colours does"
 _INTERRUPTED = "it was interrupted before it had gained enough"
+
+
+@dataclass(frozen=True)
+class Sought:
+    """Views between for a fit, so many for each given one, that a thread of its own looks for."""
+
+    each: float
+    views: Future[list[Camera]]
 
 
 def _steps(text: str) -> int | Literal["auto"]:
@@ -189,6 +199,13 @@ class Fit(Stage):
         further = self.further * math.sqrt(price / _AT_THRESHOLD)
         return price * min(max(further, 1.0), _MOST_FURTHER)
 
+    def begun(self, state: State, bench: Workbench) -> State:
+        given, each = state.views[: len(state.views) - state.added], self._each(state, bench)
+        if len(given) < 2 or not each:
+            return state
+        seek = partial(views_between, known=state.results.known)
+        return state.with_results(sought=Sought(each, in_background(seek, state.source, given, each)))
+
     def run(self, state: State, bench: Workbench) -> State:
         """Remove splats, fit, and leave a :class:`potr_cl.stages.fitting.fitted.Fitted` in ``results``.
 
@@ -229,11 +246,20 @@ class Fit(Stage):
     def _looking_between(self, state: State, bench: Workbench) -> State:
         """The state with the views that the fit looks at."""
         given = state.views[: len(state.views) - state.added]
-        each = self.views_on(bench.opened.family)
-        if is_virtual(given) or each * len(given) <= state.added:
+        sought, each = state.results.sought, self._each(state, bench)
+        if not each:
             return state
-        added = views_between(state.source, given, each)  # with threads it takes twice as long
+        if sought is not None and sought.each == each:
+            added = sought.views.result()
+        else:  # with threads it takes twice as long
+            added = views_between(state.source, given, each, known=state.results.known)
         return dataclasses.replace(state, views=(*given, *added), added=len(added))
+
+    def _each(self, state: State, bench: Workbench) -> float:
+        """How many views between it looks at for each given one, where the state has fewer; else 0."""
+        given = state.views[: len(state.views) - state.added]
+        each = self.views_on(bench.opened.family)
+        return 0.0 if is_virtual(given) or each * len(given) <= state.added else each
 
     def _cycles(self, state: State, bench: Workbench, sight: Sight, asked: SupportsBool) -> State:
         """Remove splats and fit by turns, each time up to a higher threshold, and keep what costs least."""

@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 
     from potr_cl.codec.encoder import Coded
     from potr_cl.codec.quantize import HyperParameters
+    from potr_cl.model.given_views import GivenViews
+    from potr_cl.stages.fit import Sought
     from potr_cl.stages.fitting.fitted import Fitted, LeftOut
     from potr_cl.stages.held_out import PhotographChoice
     from potr_cl.stages.pruning.schedule import Pruned
@@ -57,7 +59,9 @@ class Results:
 
     Attributes:
         unresolved: splats that no view shows from near enough, which all stages leave alone.
+        known: what the given views show.
         between: the views that were added.
+        sought: views that a fit will look at besides, while they are sought.
         shown: which part of the views shows a splat, on the average, where that is known.
         unseen: splats that no view sees, or that stay though none resolves them.
         price: ΔMSE below which a splat has gone.
@@ -74,7 +78,9 @@ class Results:
     """
 
     unresolved: Unresolved | None = None
+    known: GivenViews | None = None
     between: Added | None = None
+    sought: Sought | None = None
     shown: float = 1.0
     unseen: Unseen | Unresolved | None = None
     price: float | None = None
@@ -303,6 +309,18 @@ class Stage(ABC):
             DeviceMemoryError: the device has too little memory; the stage is run again with less, or on a CPU.
             PotrError: the work cannot be done.
         """
+
+    def begun(self, state: State, bench: Workbench) -> State:
+        """Begin in the background what the stage needs and needs no results for, while other stages are at work.
+
+        Args:
+            state: the first one that has all views.
+            bench: as of :meth:`run`, of the device that will most likely do the work.
+
+        Returns:
+            The state that knows of it.
+        """
+        return state
 
     @property
     def asked_for(self) -> bool:

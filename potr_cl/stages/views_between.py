@@ -258,6 +258,7 @@ class Between(Stage):
         with thread_pool(min(bench.threads or _THREADS, _THREADS)) as pool:
             known = GivenViews(state.source, state.views, pool.map)
             parts = known.views_of_parts()
+            state = state.with_results(known=known)
             if self.weigh and (shown := known.part_of_views()) is not None:
                 state = state.with_results(shown=shown)
             each, shown_by = 0.0 if virtual and self.views == "auto" else self.views, None

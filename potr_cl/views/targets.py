@@ -42,7 +42,7 @@ from potr_cl.views.visibility import Visibility
 
 #: Pictures that are asked for together to be kept one by one, and their bytes at the most: a GPU prepares several views
 #: in one go. And bytes of those that go to the host together.
-_TOGETHER, _MOST_BYTES, _TO_HOST = 16, 1 << 28, 1 << 26
+_TOGETHER, _MOST_BYTES, _TO_HOST = 64, 1 << 28, 1 << 26
 #: Pictures ahead and in passing take no more than this part of a device's memory: those ahead lie there twice for a
 #: moment, the others beside all that pruning has.
 AHEAD = 1 / 16

@@ -7,13 +7,15 @@
 
    On GPUs: no macros. */
 
-/* count: of the numbers in each of the two. sums: work-item by work-item, beginning at first_sum. */
+/* first: number of the picture's first value. count: of the numbers in each of the two. sums: work-item by work-item,
+ * beginning at first_sum. */
 kernel void squared_error(
-    global const float *picture, global const float *target, ulong count, global float *sums, uint first_sum)
+    global const float *picture, ulong first, global const float *target, ulong count, global float *sums,
+    uint first_sum)
 {
     float sum = 0.0f;
     for (ulong i = get_global_id(0); i < count; i += get_global_size(0)) {
-        const float difference = picture[i] - target[i];
+        const float difference = picture[first + i] - target[i];
         sum += difference * difference;
     }
     sums[first_sum + get_global_id(0)] = sum;

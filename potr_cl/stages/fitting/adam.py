@@ -12,6 +12,7 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.codec.quantize import LEAST_LOGIT, ZERO_SCALE, canonical_rotations
+from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
@@ -41,6 +42,8 @@ UNROUNDED = Factors()
 #: How fast the moments forget (Kingma and Ba, 2015), and the averages: after about so many steps.
 _DECAY_MEAN, _DECAY_SQUARE = 0.9, 0.999
 _AVERAGED = 50
+#: Splats whose colours are turned from columns to rows at a time: few enough to stay in a cache.
+_TURNED = 1 << 12
 
 
 @dataclass(frozen=True)
@@ -110,11 +113,11 @@ class Adam(Owner):
         self._factors = factors
         # AC coefficients that stand still are left out: four fifths of all columns. Their average is what they are.
         self._moving = columns.count if rates.ac else columns.ac.start
-        self._start = _columns_of(scene, columns, buffers.stride)
         self._memory = Memory(device)
         with device.all_or_nothing():
-            self.values = self._memory.upload(self._start, "the parameters")
-            nbytes = self.values.size
+            nbytes = 4 * columns.count * buffers.stride
+            self.values = self._memory.allocate(nbytes, "the parameters")
+            self._write_scene()
             self._kept = self._memory.allocate(nbytes, "the best parameters")
             self._moments = [self._memory.allocate(nbytes, "the gradient's moments") for _ in range(2)]
             self._averages = self._memory.allocate(nbytes, "the averages")
@@ -124,9 +127,22 @@ class Adam(Owner):
 
     def restart(self) -> None:
         """Begin anew, and give the rasterizer its scene."""
-        self._device.copy(self.values, self._start)
+        self.buffers.write_sh(self.buffers.sh, self._scene.sh)
+        self._write_scene()
         self._begin()
         self.give()
+
+    def _write_scene(self) -> None:
+        """Set the parameters to the scene's; its colours lie in the rasterizer's buffers."""
+        scene, columns, stride = self._scene, self.columns, self.buffers.stride
+        geometry = np.zeros((columns.dc.start, stride), np.float32)
+        some = slice(0, len(scene))
+        geometry[columns.means, some] = scene.means.T
+        geometry[columns.log_scales, some] = scene.log_scales.T
+        geometry[columns.quaternions, some] = unit_quaternions(scene.quaternions).T
+        geometry[columns.opacity_logits, some] = scene.opacity_logits
+        self._device.copy(self.values, geometry)
+        self._device.copy(self.values, self.buffers.sh, 4 * columns.sh * stride, to=geometry.nbytes)
 
     def _begin(self) -> None:
         """The moments and averages of parameters that have not moved."""
@@ -168,7 +184,7 @@ class Adam(Owner):
 
     def state(self) -> list[FloatArray]:
         """All numbers that the next steps depend on, for :meth:`adopt`."""
-        shape = self._start.shape
+        shape = self.columns.count, self.buffers.stride
         return [self._device.download(buffer, shape, np.float32) for buffer in self._moving_buffers]
 
     def adopt(self, taken: int, state: Sequence[FloatArray]) -> None:
@@ -226,19 +242,31 @@ class Adam(Owner):
 
     def kept(self) -> Scene:
         """The scene as it was when :meth:`keep` was called last. Splats that have not moved are the same bit by bit."""
-        columns = self.columns
-        found = self._device.download(self._kept, self._start.shape, np.float32)
-        moved = np.flatnonzero((found != self._start)[:, : len(self._scene)].any(axis=0))
-        rows = found[:, moved].T
-        scene = self._scene
-        arrays = {}
-        for name in ("means", "log_scales", "quaternions", "opacity_logits"):
-            former = getattr(scene, name)
-            arrays[name] = former.copy()
-            arrays[name][moved] = rows[:, getattr(columns, name)].reshape(len(moved), *former.shape[1:])
-        sh = np.array(scene.sh, np.float32)
-        sh[moved] = rows[:, 11:].reshape(len(moved), *sh.shape[1:])
-        return Scene(**arrays, sh=sh, antialiased=scene.antialiased, low_pass=scene.low_pass)
+        scene, columns, splats = self._scene, self.columns, len(self._scene)
+        found = self._device.download(self._kept, (self._moving, self.buffers.stride), np.float32)[:, :splats]
+        quaternions = np.ascontiguousarray(found[columns.quaternions].T)
+        still = (quaternions == unit_quaternions(scene.quaternions).astype(np.float32)).all(axis=1)
+        quaternions[still] = scene.quaternions[still]  # of any length
+        sh = np.empty(scene.sh.shape, np.float32)
+        coefficients = sh.reshape(splats, -1)
+        moved = self._moving - columns.dc.start
+
+        def turn(first: int) -> None:
+            some = slice(first, first + _TURNED)
+            coefficients[some, :moved] = found[columns.dc.start :, some].T
+            coefficients[some, moved:] = scene.sh[some].reshape(-1, columns.sh)[:, moved:]
+
+        with thread_pool() as pool:
+            list(pool.map(turn, range(0, splats, _TURNED)))
+        return Scene(
+            np.ascontiguousarray(found[columns.means].T),
+            np.ascontiguousarray(found[columns.log_scales].T),
+            quaternions,
+            found[columns.opacity_logits].reshape(-1),
+            sh,
+            scene.antialiased,
+            scene.low_pass,
+        )
 
 
 def in_form_of_files(scene: Scene) -> Scene:
@@ -247,18 +275,6 @@ def in_form_of_files(scene: Scene) -> Scene:
     real = np.sqrt(np.maximum(1 - (imaginary**2).sum(axis=1), 0))
     quaternions = np.column_stack([real, imaginary]).astype(np.float32)
     return dataclasses.replace(scene, quaternions=quaternions, log_scales=log_scales)
-
-
-def _columns_of(scene: Scene, columns: Columns, stride: int) -> FloatArray:
-    """(columns, stride) the parameters of a scene; quaternions of length 1."""
-    result = np.zeros((columns.count, stride), np.float32)
-    some = slice(0, len(scene))
-    result[columns.means, some] = scene.means.T
-    result[columns.log_scales, some] = scene.log_scales.T
-    result[columns.quaternions, some] = unit_quaternions(scene.quaternions).T
-    result[columns.opacity_logits, some] = scene.opacity_logits
-    result[11:, some] = scene.sh.reshape(len(scene), -1).T
-    return result
 
 
 def _steps(columns: Columns, rates: Rates, limits: Limits) -> FloatArray:

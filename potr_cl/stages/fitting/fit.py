@@ -24,13 +24,15 @@ from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.opencl.memory import Memory, Owner
+from potr_cl.opencl.memory import Memory, Owner, Scratch
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import Drawable
+from potr_cl.raster.view_set import ViewSet
 from potr_cl.stages.fitting.adam import UNROUNDED, Adam, Factors, Limits, Rates
 from potr_cl.stages.fitting.fitted import Fitted, decibels
 from potr_cl.stages.fitting.together import Batch, DeviceFit, Ground, SharedFit, kept_pictures
 from potr_cl.stages.held_out import share_out
+from potr_cl.views.budget import target_bytes
 from potr_cl.views.shares import HelpFrom
 from potr_cl.views.targets import TargetPictures, Targets
 
@@ -299,8 +301,9 @@ def _run(
 
 def _usual_size(scene: Scene) -> float:
     """The median of the splats' middle standard deviations, world units."""
-    middle = np.sort(scene.log_scales.astype(np.float64), axis=1)[:, 1]
-    return math.exp(min(float(np.median(middle)), 80.0))
+    a, b, c = scene.log_scales.T
+    middle = np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
+    return math.exp(min(float(np.median(middle.astype(np.float64))), 80.0))
 
 
 def _limits(scene: Scene) -> Limits:
@@ -320,6 +323,8 @@ def _unit(error: float) -> float:
 
 #: Work-items that sum up a picture's squared differences, and those of a group.
 _ITEMS, _GROUP = 1 << 14, 64
+#: Values of the pictures that are rendered together, if it is not one: a GPU prepares several views in one go.
+_RENDERED = 1 << 24
 
 
 class Judges(Owner):
@@ -344,28 +349,58 @@ class Judges(Owner):
         self._kernel = device.shared_kernel("fit/squared_error.cl", "squared_error")
         self._memory = Memory(device)
         self._sums = self._memory.allocate(4 * _ITEMS * max(len(self), 1), "the judges' sums")
+        self._images = Scratch(device, "the judges' pictures")
+        self._views: ViewSet | None = None
 
     def __len__(self) -> int:
         return len(self._held_out)
 
     def error(self) -> float:
         """The mean squared error of the scene as it is now, all views the same."""
-        for place, number in enumerate(self._held_out):
-            image, _ = self._rasterizer.render_device(self._cameras[number])
-            self._kernel.bind(
-                picture=image,
-                target=self._pictures.of([number]),
-                count=self._values(number),
-                sums=self._sums,
-                first_sum=_ITEMS * place,
-            )
-            self._kernel.launch((_ITEMS,), (_GROUP,))
+        place = 0
+        for numbers in self._together():
+            cameras = [self._cameras[number] for number in numbers]
+            self._images.reserve(sum(map(target_bytes, cameras)))
+            self._views, former = None, self._views
+            self._views = self._rasterizer.render_again(cameras, self._images.buffer, former=former)
+            first = 0
+            for number in numbers:
+                self._kernel.bind(
+                    picture=self._images.buffer,
+                    first=first,
+                    target=self._pictures.of([number]),
+                    count=self._values(number),
+                    sums=self._sums,
+                    first_sum=_ITEMS * place,
+                )
+                self._kernel.launch((_ITEMS,), (_GROUP,))
+                first += self._values(number)
+                place += 1
         sums = self._device.download(self._sums, (len(self), _ITEMS), np.float32).sum(axis=1, dtype=np.float64)
         return float(np.mean(sums / [self._values(number) for number in self._held_out]))
+
+    def _together(self) -> Iterator[list[int]]:
+        """The views, some at a time."""
+        some: list[int] = []
+        for number in self._held_out:
+            if some and sum(map(self._values, (*some, number))) > _RENDERED:
+                yield some
+                some = []
+            some.append(number)
+        if some:
+            yield some
 
     def _values(self, number: int) -> int:
         camera = self._cameras[number]
         return 3 * camera.width * camera.height
+
+    def close(self) -> None:
+        """Give all device memory back."""
+        if self._views is not None:
+            self._views.close()
+            self._views = None
+        self._images.close()
+        self._memory.close()
 
 
 def batches(numbers: Sequence[int], size: int, seed: int) -> Iterator[list[int]]:
