@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from potr_cl.codec import container, octree, plain, quantize
 from potr_cl.codec.blocks import AnyGeometry, GeometryOfBlocks, quantise
 from potr_cl.codec.bundles import encoder as bundles
+from potr_cl.codec.bundles.layout import BUNDLE
 from potr_cl.codec.container import Block, CodedSection, EntropyCoder
 from potr_cl.codec.geometry import Geometry
 from potr_cl.codec.quantisers import QUANTISERS
@@ -133,7 +134,7 @@ def code_levels(
     ) -> tuple[Block, list[CodedSection]]:
         number, level, rows, geometry = each
         scene = level.scene if rows is None else level.scene.subset(rows)
-        with thread_pool(-(-threads // side_by_side)) as pool:
+        with thread_pool(_threads_for(len(geometry.order), -(-threads // side_by_side))) as pool:
             coded = _coded(number, level.error, scene, geometry, coder, pool)
         report.one_more()
         return coded
@@ -149,6 +150,12 @@ def code_levels(
                 future.cancel()
     own = [coder.section(Property.METADATA, metadata)] if metadata else []
     return Coded(container.assemble(blocks, own), levels[0].geometry.order)
+
+
+def _threads_for(splats: int, most: int) -> int:
+    """As few threads as go through a block's bundles in as many turns as the most would."""
+    bundles = -(-splats // BUNDLE)
+    return max(-(-bundles // -(-bundles // most)), min(most, _THREADS_A_BLOCK))
 
 
 def _blocks(level: Level) -> Iterable[tuple[NDArray[np.int64] | None, Geometry]]:
@@ -175,6 +182,7 @@ def _coded(
     raw = {prop: stream.tobytes() for prop, stream in octree_bytes.items() if len(stream)}
     if geometry.steps is not None:
         raw[Property.STEPS] = geometry.steps.to_bytes()
+    box = pool.submit(_box, geometry)
     others = [pool.submit(coder.section, prop, content) for prop, content in raw.items()]
     classes = geometry.colour_classes()
     levels = colour_levels(scene.sh, geometry.order, parameters, classes, pool.map)
@@ -198,7 +206,7 @@ def _coded(
     factors = (parameters.sf_scale, parameters.sf_rotation, parameters.sf_opacity, parameters.sf_dc, parameters.sf_sh)
     block = Block(
         len(scene), scene.sh_degree, tree.origin, tree.side, tree.depth, *factors, parameters.quantiser, kind,
-        _box(geometry), level, error, scene.antialiased, scene.low_pass,
+        box.result(), level, error, scene.antialiased, scene.low_pass,
     )  # fmt: skip
     return block, coded
 

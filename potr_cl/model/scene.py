@@ -19,7 +19,7 @@ FloatArray = NDArray[np.float32]
 #: Splats looked at at a time where values are checked, and where threads do it, which wait for the interpreter.
 _BLOCK, _THREAD_BLOCK = 1 << 14, 1 << 17
 #: So many splats are copied by threads, an eighth of them at a time.
-_LARGE = 1 << 19
+_LARGE = 1 << 17
 
 #: The logit of an opacity that single precision cannot tell from 1.
 _OPAQUE = np.float32(20)
@@ -223,8 +223,9 @@ class Scene:
         fast = numbers.dtype.kind in "iu" and self.sh.flags.c_contiguous
         if fast and len(numbers) >= _LARGE and numbers.min() >= 0 and numbers.max() < len(self):
             return self._rows(numbers.astype(np.intp, copy=False))
-        sh = self.sh.take(numbers.astype(np.intp, copy=False), axis=0) if fast else self.sh[index]
-        return self.of_arrays([*(each[index] for each in self.arrays[:-1]), sh])
+        if fast:
+            return self.of_arrays([each.take(numbers.astype(np.intp, copy=False), axis=0) for each in self.arrays])
+        return self.of_arrays([each[index] for each in self.arrays])
 
     def _rows(self, numbers: NDArray[np.intp]) -> Scene:
         """:meth:`subset` of many splats: the memory that is new takes longer than the copy, and threads share it."""

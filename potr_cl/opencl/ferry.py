@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner, Staging
 
-#: Fewer bytes go as fast without; pieces of so many bytes are on their way at a time.
-LEAST, PIECE = 1 << 22, 1 << 24
+#: Fewer bytes at a time go as fast without, and so do those before so many have gone: drivers take long to give that
+#: memory. Pieces of so many bytes are on their way at a time.
+LEAST, PAYS, PIECE = 1 << 22, 1 << 26, 1 << 24
 _AT_A_TIME = 8
 
 
@@ -61,7 +62,7 @@ class Ferry(Owner):
         self._staging = [Staging(device) for _ in range(self._places)]
         #: What was sent from each place last, if that may still be on its way.
         self._sent: list[cl.Event | None] = [None] * self._places
-        self._turn = 0
+        self._turn = self._gone = 0
         self._threads: ThreadPoolExecutor | None = None
 
     def to_device(self, buffer: cl.Buffer, cargo: Sequence[Cargo], pitch: int = 0) -> None:
@@ -126,7 +127,9 @@ class Ferry(Owner):
             event.wait()
 
     def _few(self, cargo: Sequence[Cargo]) -> bool:
-        return self._direct or sum(each.part.nbytes for each in cargo) < LEAST
+        nbytes = sum(each.part.nbytes for each in cargo)
+        self._gone += nbytes
+        return self._direct or nbytes < LEAST or self._gone < PAYS
 
     def _in_thread(self, work: Any, *args: Any) -> Future[Any]:
         if self._threads is None:

@@ -33,6 +33,7 @@ def carrier(request, monkeypatch):
     device = open_device("gpu")
     if request.param:
         monkeypatch.setattr(ferry, "LEAST", 0)
+        monkeypatch.setattr(ferry, "PAYS", 0)
         monkeypatch.setattr(ferry, "PIECE", 400)
         device = Device(dataclasses.replace(device.info, kind="gpu", integrated=False), family="gpu")
     yield device

@@ -39,10 +39,10 @@ from potr_cl.codec.bundles.streams import (
     tokens_of,
 )
 from potr_cl.codec.native.bundles_encode import BundleEncoder
-from potr_cl.codec.native.declarations import CFunctions, fits
-from potr_cl.codec.native.table import definition
 from potr_cl.codec.sections import Property
 from potr_cl.host.threads import Run
+from potr_cl.native.declarations import CFunctions, fits
+from potr_cl.native.table import definition
 
 I64 = NDArray[np.int64]
 Values = Sequence[NDArray[np.integer]]
@@ -233,8 +233,8 @@ def encode_natively(
     encoder.take_numbers([some.tolist() for some in numbers])
     deque(run(encoder.count, range(bundles.number)), 0)
     alphabets = tokens_of(encoder.largest().astype(np.int64)).astype(int) + 1
-    jobs = enumerate(alphabets.tolist())
-    found = run(lambda job: _fitted_model(encoder, *job), jobs)
+    # Each takes so little that threads would wait for each other.
+    found = [_fitted_model(encoder, *job) for job in enumerate(alphabets.tolist())]
     models = [model if own is None else own.model for model, own in zip(found, without, strict=True)]
     encoder.take_models(models)
     coded = list(run(encoder.code, range(bundles.number)))

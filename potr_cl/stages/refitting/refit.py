@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.quantize import nonzero_levels, to_ycocg
-from potr_cl.host.threads import in_background
+from potr_cl.host.threads import in_background, thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
@@ -46,6 +46,8 @@ _WORTH = 0.4
 _DENSE = 150
 #: What is nearer to 0 than this was 0 before it was made R, G and B.
 _ZERO = 1e-6
+#: Splats whose coefficients a thread looks at.
+_LOOKED_AT = 1 << 14
 
 
 def refit_colours(
@@ -224,12 +226,18 @@ def chosen_coefficients(sh: FloatArray) -> NDArray[np.bool_]:
     Args:
         sh: (N, M, 3) R, G, B.
     """
-    found = np.empty(sh.shape, bool)
-    for m in range(sh.shape[1]):
-        for channel, values in enumerate(to_ycocg(sh[:, m].astype(np.float64))):
-            found[:, m, channel] = np.abs(values) > _ZERO
-    found[:, 0] = True
-    return found
+    planar = np.empty((*sh.shape[1:], len(sh)), bool)
+
+    def look(first: int) -> None:
+        some = slice(first, first + _LOOKED_AT)
+        for m in range(1, sh.shape[1]):
+            for channel, values in enumerate(to_ycocg(sh[some, m].astype(np.float64))):
+                np.greater(np.abs(values), _ZERO, out=planar[m, channel, some])
+
+    with thread_pool() as pool:
+        list(pool.map(look, range(0, len(sh), _LOOKED_AT)))
+    planar[0] = True
+    return planar.transpose(2, 0, 1)
 
 
 def active_coefficients(sh: FloatArray, sf_sh: float) -> NDArray[np.bool_]:
