@@ -9,7 +9,7 @@ from pathlib import Path
 
 from setuptools import Extension, setup
 
-NATIVE = Path("potr_cl", "codec", "native")
+NATIVE = Path("potr_cl", "native")
 # Vectors; and each operation on floats rounded by itself, so that every machine decodes the same numbers.
 OPTIONS = ["-std=c11", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden"]
 OPTIONS_OF_MSVC = ["/std:c11", "/O2", "/fp:precise"]
@@ -17,7 +17,7 @@ OPTIONS_OF_MSVC = ["/std:c11", "/O2", "/fp:precise"]
 setup(
     ext_modules=[
         Extension(
-            "potr_cl.codec.native._library",
+            "potr_cl.native._library",
             sources=sorted(str(source) for source in NATIVE.glob("*.c")),
             depends=sorted(str(header) for header in NATIVE.glob("*.h")),
             extra_compile_args=OPTIONS_OF_MSVC if sys.platform == "win32" else OPTIONS,

@@ -21,13 +21,13 @@ from potr_cl.codec.bundles.sections import MAIN
 from potr_cl.codec.bundles.streams import largest_integer
 from potr_cl.codec.container import Block
 from potr_cl.codec.native.bundles import BEYOND_TABLE
-from potr_cl.codec.native.declarations import CFunctions
-from potr_cl.codec.native.table import definition
 from potr_cl.codec.native.values import BundleShare, Tables, ValueArrays
 from potr_cl.codec.sections import Property
 from potr_cl.codec.steps import prediction
 from potr_cl.codec.steps.rule import CLASSES, ColourSteps, factors
 from potr_cl.errors import DataError
+from potr_cl.native.declarations import CFunctions
+from potr_cl.native.table import definition
 
 if TYPE_CHECKING:
     from potr_cl.codec.dequantizer import Activation, BundleTaker

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from potr_cl.codec import octree, quantize
 from potr_cl.codec.native import quantising
-from potr_cl.codec.native.declarations import CFunctions
-from potr_cl.codec.native.table import definition
 from potr_cl.codec.quantisers import QUANTISERS
 from potr_cl.codec.splat_levels import BLOCK, SplatLevels, splat_levels
 from potr_cl.codec.steps.fitting import fit_steps
@@ -25,6 +23,8 @@ from potr_cl.errors import DataError
 from potr_cl.host.threads import Run, in_background
 from potr_cl.model.camera import Camera, camera_centres
 from potr_cl.model.scene import Scene
+from potr_cl.native.declarations import CFunctions
+from potr_cl.native.table import definition
 
 #: An octree that is no deeper has cells fine enough for its tolerances, and float64 tells them apart.
 _SAFE_DEPTH = 44

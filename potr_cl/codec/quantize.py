@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.codec.native import quantising
-from potr_cl.codec.native.declarations import CFunctions
-from potr_cl.codec.native.table import definition
 from potr_cl.errors import DataError, UsageError
 from potr_cl.model.spherical_harmonics import rotation_matrices
+from potr_cl.native.declarations import CFunctions
+from potr_cl.native.table import definition
 
 Integers = NDArray[np.signedinteger]
 F32 = NDArray[np.float32]

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from potr_cl.codec import quantize
 from potr_cl.codec.native import quantising
-from potr_cl.codec.native.declarations import CFunctions
-from potr_cl.codec.native.table import definition
 from potr_cl.codec.quantisers import QUANTISERS, Balanced
 from potr_cl.codec.steps.rule import factors
 from potr_cl.host.threads import Run
 from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.native.declarations import CFunctions
+from potr_cl.native.table import definition
 
 #: Splats worked on at a time: a few arrays of them fit a second-level cache.
 BLOCK = 1 << 14

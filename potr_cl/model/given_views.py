@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
-from itertools import chain
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera, camera_centres
-from potr_cl.model.matter import CROWDED, Matter, cell_of, frame_of, matter_of, surroundings_of
+from potr_cl.model.matter import CROWDED, Matter, frame_of, horizons_of, matter_of, shown_of
 from potr_cl.model.sampling import F64
 from potr_cl.model.scene import Scene
 from potr_cl.model.spherical_harmonics import energy
 
 F32 = NDArray[np.float32]
+S = TypeVar("S")
+T = TypeVar("T")
 
 #: So many splats, evenly taken, tell where a scene is; views are judged by so many of them, and points that hide them.
 _TAKEN, _TARGETS, _OCCLUDERS = 20_000, 1_000, 8_000
-#: Views that are looked at together, so that threads wait for each other seldom.
-_AT_ONCE = 24
+#: Views that a thread looks at before the next one gets its turn.
+_AT_ONCE = 16
 #: Part of what a new view shows that some given view must show, too.
 _KNOWN = 0.9
 #: A new view shows at least this part of what the view shows that it lies beside, by number of splats.
@@ -47,22 +49,21 @@ class GivenViews:
         matter = matter_of(some, self._frame, _TARGETS, _OCCLUDERS)
         # Each point stands for the surface of the splats that were not taken, too.
         self._matter = dataclasses.replace(matter, areas=matter.areas * np.float32(every))
-        parts = [cameras[first : first + _AT_ONCE] for first in range(0, len(cameras), _AT_ONCE)]
-        shown, blocked = zip(*run(self._look, parts), strict=True)
-        self._shown: F32 = np.concatenate(shown)
+        shown, blocked = zip(*some_at_a_time(self._look, cameras, run), strict=True)
+        self._shown: F32 = np.stack(shown)
         self._known: F32 = self._shown.max(axis=0)
         # Whoever photographs indoors, stands close to things.
-        self._crowded = max(CROWDED, max(map(max, blocked)))
+        self._crowded = max(CROWDED, *blocked)
         self._places = (camera_centres(cameras) - self._frame.centre) / self._frame.unit
         self._fields = np.array([c.width * c.height / (c.fx * c.fy) for c in cameras])
 
     @cached_property
-    def _memory(self) -> tuple[ColourMemory, float]:
+    def memory(self) -> tuple[ColourMemory, float]:
         """What colours remember of given places, and the least that they must remember of others."""
         memory = ColourMemory(self._places, self._matter)
         if not memory.tells:
             return memory, 0.0
-        return memory, _REMEMBERED * min(memory.of_known(*given) for given in enumerate(self._shown))
+        return memory, _REMEMBERED * float(memory.of_known(self._shown).min())
 
     def views_of_parts(self) -> NDArray[np.int64]:
         """(K,) how many given views show each of some splats, evenly taken; those that none shows are left out."""
@@ -83,66 +84,48 @@ class GivenViews:
             return None
         return float((sizes.sum(axis=0) ** 2 / (len(sizes) * (sizes**2).sum(axis=0))).mean())
 
-    def allow(self, cameras: Sequence[Camera], beside: Sequence[int], run: Run = map) -> list[bool]:
-        """Whether cameras might have been where they are.
+    def allows(self, camera: Camera, beside: int) -> bool:
+        """Whether a camera might have been where it is.
 
         That is: not in matter, not where the colours do not remember that they were looked at from there, and not where
-        they would show what no given view shows.
+        it would show what no given view shows.
 
         Args:
-            cameras: the views. To look at many together takes a small part of the time.
-            beside: number of the given view that each lies beside.
-            run: in place of :func:`map`, to work with several threads.
+            beside: number of the given view that it lies beside.
         """
-        _ = self._memory  # before several threads ask for it
-        finite = [number for number, camera in enumerate(cameras) if np.isfinite(camera.translation).all()]
-
-        def allowed(first: int) -> list[bool]:
-            some = finite[first : first + _AT_ONCE]
-            shown, blocked = self._look([cameras[number] for number in some])
-            return [
-                self._allows(cameras[number], beside[number], *seen)
-                for number, *seen in zip(some, shown, blocked, strict=True)
-            ]
-
-        found = [False] * len(cameras)
-        fits = chain.from_iterable(run(allowed, range(0, len(finite), _AT_ONCE)))
-        for number, fit in zip(finite, fits, strict=True):
-            found[number] = fit
-        return found
-
-    def _allows(self, camera: Camera, beside: int, shown: F32, blocked: float) -> bool:
+        if not np.isfinite(camera.translation).all():
+            return False
+        shown, blocked = self._look(camera)
         total = float(shown.sum())
         if blocked > self._crowded or total < _FULL * float(self._shown[beside].sum()):
             return False
         if total > 0 and float((shown * self._known).sum()) < _KNOWN * total:
             return False
-        place = (camera.centre - self._frame.centre) / self._frame.unit
-        memory, least = self._memory
-        return not memory.tells or memory.of(place, shown) >= least
+        memory, least = self.memory
+        return not memory.tells or memory.of(self._place(camera), shown) >= least
 
-    def _look(self, cameras: Sequence[Camera]) -> tuple[F32, list[float]]:
-        """(V, K) 1 for each target that a view shows, else 0; and how much matter there is close by each view."""
-        matter, frame = self._matter, self._frame
-        places = (camera_centres(cameras) - frame.centre) / frame.unit
-        horizons, blocked = surroundings_of(places, matter)
-        rays = matter.targets - places[:, None]
-        distance = np.linalg.norm(rays, axis=2)
-        rotations = np.stack([camera.rotation for camera in cameras])
-        x, y, z = np.matmul(rotations, rays.transpose(0, 2, 1)).transpose(1, 0, 2)
-        fx, fy, cx, cy, width, height = np.array(
-            [(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in cameras], np.float64
-        ).T[:, :, None]
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            u, v = fx * x / z + cx, fy * y / z + cy
-            inside = (z > frame.near) & (u > 0) & (u < width) & (v > 0) & (v < height)
-        cells = cell_of(rays.transpose(2, 0, 1).astype(np.float32))
-        visible = distance <= 1.1 * np.take_along_axis(horizons, cells, axis=1) + 0.02
-        return (inside & visible).astype(np.float32), blocked
+    def _look(self, camera: Camera) -> tuple[F32, float]:
+        """(K,) 1 for each target that a view shows, else 0; and how much matter there is close by it."""
+        frame, place = self._frame, self._place(camera)
+        horizons, blocked = horizons_of(place, self._matter)
+        lens = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, frame.near)
+        return shown_of(np.array([*place, *camera.rotation.flat, *lens]), horizons, self._matter), blocked
+
+    def _place(self, camera: Camera) -> F64:
+        place: F64 = (camera.centre - self._frame.centre) / self._frame.unit
+        return place
+
+
+def some_at_a_time(work: Callable[[S], T], of: Sequence[S], run: Run) -> list[T]:
+    """What comes of each: threads wait for each other longer than one takes."""
+    parts = [of[first : first + _AT_ONCE] for first in range(0, len(of), _AT_ONCE)]
+    return [each for found in run(lambda some: [work(one) for one in some], parts) for each in found]
 
 
 #: Targets with coefficients to speak of, below which that is not asked.
 _INFORMATIVE = 100
+#: The best of the known places are those at this quantile.
+_BEST = 0.95
 
 
 class ColourMemory:
@@ -175,19 +158,19 @@ class ColourMemory:
         own = float(weights @ self._energy(place)) / total
         return own / self._best(weights, total)
 
-    def of_known(self, number: int, shown: F32) -> float:
-        """The same of one of the places that are known, by its number."""
+    def of_known(self, shown: F32) -> F64:
+        """(P,) the same of the places that are known; ``shown``: (P, K)."""
         assert self._energies is not None
-        weights = shown * self._informative
-        total = max(float(weights.sum()), 1e-6)
-        return float(weights @ self._energies[number]) / total / self._best(weights, total)
+        weights = (shown * self._informative).astype(np.float64)
+        energies: F64 = self._energies @ weights.T / np.maximum(weights.sum(axis=1), 1e-6)  # by place, and seen there
+        known: F64 = np.diagonal(energies) / np.maximum(np.quantile(energies, _BEST, axis=0), 1e-12)
+        return known
 
     def _best(self, weights: F32, total: float) -> float:
         """How well the best of the known places are remembered by the same splats."""
         assert self._energies is not None
         # Without BLAS, whose threads would wait for each other where several threads ask.
-        best = float(np.quantile(np.einsum("pk,k->p", self._energies, weights) / total, 0.95))
-        return max(best, 1e-12)
+        return max(float(np.quantile(np.einsum("pk,k->p", self._energies, weights) / total, _BEST)), 1e-12)
 
     def _energy(self, place: F64) -> F32:
         """(K,) of the targets' colours, as they are seen from a place."""

@@ -12,6 +12,8 @@ from potr_cl.host.threads import Run
 from potr_cl.model.sampling import F64, low_discrepancy, points_on_splats
 from potr_cl.model.scene import Scene
 from potr_cl.model.spherical_harmonics import unit_coefficients
+from potr_cl.native.declarations import CFunctions, address
+from potr_cl.native.table import definition
 
 F32 = NDArray[np.float32]
 
@@ -113,39 +115,84 @@ def matter_of(scene: Scene, frame: Frame, targets: int = _TARGETS, occluders: in
     # Haze and backdrops: of so wide a splat it means nothing that one of its few points is near.
     areas[areas > _ELBOW_ROOM**2] = 0
     return Matter(
-        means[chosen],
+        np.ascontiguousarray(means[chosen]),
         _REACH * relative.clip(0.5, 4),
         unit_coefficients(scene.sh[solid[chosen], 1:]).astype(np.float32),
-        points.T.astype(np.float32),
+        np.ascontiguousarray(points.T, np.float32),
         areas.astype(np.float32),
     )
 
 
-def surroundings_of(places: F64, matter: Matter) -> tuple[F32, list[float]]:
-    """What is around some places, (V, 3).
+@definition
+def horizons_of(place: F64, matter: Matter) -> tuple[F32, float]:
+    """What is around a place, (3,).
 
     Returns:
-        (V, cells) distance of the nearest point in each cell of the cube map, infinite where there is none; and of each
-        place the part of all directions that matter within arm's length takes up.
+        (cells,) distance of the nearest point in each cell of the cube map, infinite where there is none; and the part
+        of all directions that matter within arm's length takes up.
     """
-    rays = matter.occluders[:, None] - places.T.astype(np.float32)[:, :, None]
+    rays = matter.occluders - place.astype(np.float32)[:, None]
     x, y, z = rays
-    squared = x * x
-    squared += y * y
-    squared += z * z
-    cells = 6 * _CELLS * _CELLS
-    horizons = np.full((len(places), cells), np.inf, np.float32)
-    at = cell_of(rays) + np.arange(0, horizons.size, cells)[:, None]
-    np.minimum.at(horizons.reshape(-1), at.reshape(-1), np.sqrt(squared).reshape(-1))
-    blocked = []
-    for row in squared:
-        near = row < _ELBOW_ROOM**2
-        parts = np.minimum(matter.areas[near] / np.maximum(4 * np.pi * row[near], 1e-30), 1)
-        blocked.append(float(parts.sum(dtype=np.float64)))
+    squared = x * x + y * y + z * z
+    horizons = np.full(6 * _CELLS * _CELLS, np.inf, np.float32)
+    np.minimum.at(horizons, _cells_of(rays), np.sqrt(squared))
+    reach = np.float32(_ELBOW_ROOM)
+    near = np.flatnonzero(squared < reach * reach)
+    parts = np.minimum(matter.areas[near] / np.maximum(4 * np.pi * squared[near], 1e-30), 1)
+    return horizons, sum(parts.tolist(), 0.0)
+
+
+def _horizons_by_c(c: CFunctions, place: F64, matter: Matter) -> tuple[F32, float]:
+    horizons, n = np.empty(6 * _CELLS * _CELLS, np.float32), len(matter.areas)
+    at = place.astype(np.float32)
+    blocked: float = c["potr_horizons"](
+        address(matter.occluders, np.float32, 3 * n),
+        address(matter.areas, np.float32, n),
+        n,
+        address(at, np.float32, 3),
+        _ELBOW_ROOM,
+        _CELLS,
+        address(horizons, np.float32, len(horizons), True),
+    )
     return horizons, blocked
 
 
-def cell_of(rays: F32) -> NDArray[np.int64]:
+@definition
+def shown_of(camera: F64, horizons: F32, matter: Matter) -> F32:
+    """(K,) 1 for each target that a camera sees and nothing around it hides, else 0.
+
+    Args:
+        camera: (19,) its centre and the rows of its rotation; fx, fy, cx, cy; width, height; and the nearest depth that
+            it sees.
+        horizons: around it (:func:`horizons_of`).
+    """
+    fx, fy, cx, cy, width, height, near = camera[12:].tolist()
+    ways = matter.targets - camera[:3]
+    dx, dy, dz = ways.T
+    x, y, z = (a * dx + b * dy + c * dz for a, b, c in camera[3:12].reshape(3, 3).tolist())
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        u, v = fx * x / z + cx, fy * y / z + cy
+        inside = (z > near) & (u > 0) & (u < width) & (v > 0) & (v < height)
+    horizon = np.float32(1.1) * horizons[_cells_of(ways.T.astype(np.float32))] + np.float32(0.02)
+    shown: F32 = (inside & (np.sqrt(dx * dx + dy * dy + dz * dz) <= horizon)).astype(np.float32)
+    return shown
+
+
+def _shown_by_c(c: CFunctions, camera: F64, horizons: F32, matter: Matter) -> F32:
+    n = len(matter.targets)
+    shown = np.empty(n, np.float32)
+    c["potr_shown"](
+        address(matter.targets, np.float64, 3 * n),
+        n,
+        address(camera, np.float64, 19),
+        _CELLS,
+        address(horizons, np.float32, 6 * _CELLS * _CELLS),
+        address(shown, np.float32, n, True),
+    )
+    return shown
+
+
+def _cells_of(rays: F32) -> NDArray[np.int64]:
     """Number of the cube map's cell in each direction, (3, …), of any length but 0."""
     x, y, z = rays
     sizes = np.abs(rays)

@@ -5,12 +5,14 @@ from its mean in a direction (:func:`energy`), and what rotations do to them (:f
 from __future__ import annotations
 
 import itertools
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray
+from potr_cl.native.declarations import CFunctions, address
+from potr_cl.native.table import definition
 
 F64 = NDArray[np.float64]
 _Floats = TypeVar("_Floats", NDArray[np.float32], NDArray[np.float64])
@@ -53,6 +55,7 @@ def unit_coefficients(ac: NDArray[np.floating]) -> F64:
     return colours
 
 
+@definition
 def energy(rays: F64, colours: _Floats) -> _Floats:
     """(n,) squared deviation of colours from their mean over all directions, each in its own direction.
 
@@ -63,11 +66,30 @@ def energy(rays: F64, colours: _Floats) -> _Floats:
         rays: (n, 3) from the camera to the splats, of any length.
         colours: (n, M - 1, 3) AC coefficients.
     """
-    towards = rays / np.maximum(np.linalg.norm(rays, axis=1), 1e-300)[:, None]
-    basis = ac_basis(towards)[:, : colours.shape[1]].astype(colours.dtype, copy=False)
-    deviation = np.einsum("km,kmc->kc", basis, colours)
-    squared: _Floats = np.einsum("kc,kc->k", deviation, deviation)
+    x, y, z = rays.T
+    towards = rays / np.maximum(np.sqrt(x * x + y * y + z * z), 1e-300)[:, None]
+    basis = ac_basis(towards).astype(colours.dtype, copy=False)
+    deviation = np.zeros((len(colours), 3), colours.dtype)
+    for m in range(colours.shape[1]):
+        deviation += basis[:, m, None] * colours[:, m]
+    red, green, blue = deviation.T
+    squared: _Floats = red * red + green * green + blue * blue
     return squared
+
+
+def _energy_by_c(c: CFunctions, rays: F64, colours: _Floats) -> Any:
+    n, count = len(rays), colours.shape[1]
+    if colours.dtype != np.float32 or count > 15 or not (rays.flags.c_contiguous and colours.flags.c_contiguous):
+        return NotImplemented
+    energies = np.empty(n, np.float32)
+    c["potr_energies"](
+        address(rays, np.float64, 3 * n),
+        n,
+        address(colours, np.float32, 3 * count * n),
+        count,
+        address(energies, np.float32, n, True),
+    )
+    return energies
 
 
 def rotation_matrices(quaternions: F64) -> F64:

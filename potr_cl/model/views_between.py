@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from potr_cl.errors import UsageError
 from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera, camera_centres
-from potr_cl.model.given_views import GivenViews
+from potr_cl.model.given_views import GivenViews, some_at_a_time
 from potr_cl.model.scene import Scene
 
 F64 = NDArray[np.float64]
@@ -85,17 +85,18 @@ def views_between(
         draws.append((cameras[number], cameras[others[draw.neighbour]], draw))
     found: list[Camera | None] = [None] * len(wanted)
     left, off = list(range(len(wanted))), spread
+    _ = known.memory  # before several threads ask for it
     for _ in range(_TRIES):
-        views = [
-            dataclasses.replace(
-                _between(*draws[place], off), name=f"{_PREFIX}{wanted[place][0]}_{wanted[place][1]:04d}", split="train"
-            )
-            for place in left
-        ]
-        fits = known.allow(views, [wanted[place][1] for place in left], run)
-        for place, view, fit in zip(left, views, fits, strict=True):
-            found[place] = view if fit else None
-        left = [place for place, fit in zip(left, fits, strict=True) if not fit]
+
+        def tried(place: int, off: float = off) -> Camera | None:
+            turn, number = wanted[place]
+            view = _between(*draws[place], off)
+            view = dataclasses.replace(view, name=f"{_PREFIX}{turn}_{number:04d}", split="train")
+            return view if known.allows(view, number) else None
+
+        for place, view in zip(left, some_at_a_time(tried, left, run), strict=True):
+            found[place] = view
+        left = [place for place in left if found[place] is None]
         off *= _NEARER
     return [view for view in found if view is not None]
 

@@ -16,10 +16,10 @@ from collections.abc import Callable
 import numpy as np
 
 from potr_cl.codec.native import quantising
-from potr_cl.codec.native.declarations import CFunctions
-from potr_cl.codec.native.table import definition
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray
+from potr_cl.native.declarations import CFunctions
+from potr_cl.native.table import definition
 
 #: Added to a block's diagonal, as a part of its mean: what no view tells apart is not moved far.
 DAMPING = 1e-2

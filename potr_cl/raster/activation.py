@@ -24,7 +24,7 @@ def activated_scales(log_scales: FloatArray) -> F64:
 def unit_quaternions(quaternions: FloatArray) -> F64:
     """(N, 4) quaternions w, x, y, z of unit length, of such of any length; the identity for those of length 0."""
     units = quaternions.astype(np.float64)
-    # In this order on every processor, as codec/native/quantise.c has it.
+    # In this order on every processor, as native/quantise.c has it.
     w, x, y, z = (units * units).T
     length = np.sqrt(w + x + y + z)[:, None]
     nothing = np.flatnonzero(length == 0)

@@ -19,11 +19,11 @@ from potr_cl.codec.bundles.streams import SIZES as TOKEN_SIZES
 from potr_cl.codec.bundles.streams import TOTAL, normalise
 from potr_cl.codec.decoder import open_file
 from potr_cl.codec.encoder import code_scene
-from potr_cl.codec.native.library import VARIABLE, VECTORS_VARIABLE, native
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.codec.sections import SH, Coder, Property
 from potr_cl.codec.steps.rule import KNOTS, ColourSteps
 from potr_cl.errors import DataError
+from potr_cl.native.library import VARIABLE, VECTORS_VARIABLE, native
 
 DEGREES = {prop: prop.streams for prop in SH[1:]}
 #: Around where bundles and lanes begin and end.

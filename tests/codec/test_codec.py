@@ -19,11 +19,11 @@ from numpy._core import _multiarray_umath as umath
 from potr_cl.codec import quantize
 from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import decode, open_file
-from potr_cl.codec.native.library import VARIABLE, native
 from potr_cl.codec.sections import SH, Coder, Property
 from potr_cl.errors import DataError, UsageError
 from potr_cl.model.camera import camera_centres, train_views
 from potr_cl.model.scene import SH_COEFFICIENTS, Scene
+from potr_cl.native.library import VARIABLE, native
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from tests.cases.decoded_bits import decoded_bits

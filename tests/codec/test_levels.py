@@ -14,9 +14,9 @@ from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import decode, open_file
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.levels import joined_levels, level_within, splats_of_levels
-from potr_cl.codec.native.library import VARIABLE
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.codec.sections import ORDER, Coder, Property
+from potr_cl.native.library import VARIABLE
 from tests.reference.scenes import random_scene
 
 SIZES = (400, 150, 60)

@@ -14,12 +14,12 @@ from potr_cl.codec import block_values
 from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import decode, open_file
 from potr_cl.codec.encoder import code_scene
-from potr_cl.codec.native import library
-from potr_cl.codec.native.library import LIBRARY_VARIABLE, VARIABLE, native
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.codec.sections import Property
 from potr_cl.errors import DataError, UsageError
 from potr_cl.model.scene import Scene
+from potr_cl.native import library
+from potr_cl.native.library import LIBRARY_VARIABLE, VARIABLE, native
 from tests.reference.file_parts import STREAMS, File, sealed
 from tests.reference.scenes import random_scene
 

@@ -12,10 +12,10 @@ from hypothesis.extra import numpy as hnp
 
 from potr_cl.codec import octree
 from potr_cl.codec.native import octree as native_octree
-from potr_cl.codec.native.library import VARIABLE, native
 from potr_cl.errors import DataError
 from potr_cl.host.threads import thread_pool
 from potr_cl.model import order as morton
+from potr_cl.native.library import VARIABLE, native
 
 FIELDS = ("occupancy", "several", "multiplicities", "leaf_levels", "tails")
 NEEDS_LIBRARY = pytest.mark.skipif(native() is None, reason="the compiled library is not there")

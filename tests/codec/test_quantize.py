@@ -14,11 +14,11 @@ from hypothesis.extra import numpy as hnp
 from potr_cl.codec import quantize
 from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.codec.native import quantising
-from potr_cl.codec.native.library import VARIABLE, native
 from potr_cl.codec.quantisers import median
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.codec.splat_levels import splat_levels
 from potr_cl.errors import DataError, UsageError
+from potr_cl.native.library import VARIABLE, native
 from potr_cl.raster.activation import unit_quaternions
 from potr_cl.stages.refitting.refit import active_coefficients
 from tests.reference.raster import rotation_matrices

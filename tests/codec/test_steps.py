@@ -12,13 +12,13 @@ from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import decode, open_file
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.geometry import Geometry, quantise_geometry
-from potr_cl.codec.native.library import VARIABLE, native
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.codec.sections import SH, Property
 from potr_cl.codec.steps import prediction
 from potr_cl.codec.steps.fitting import FEWEST, fit_steps
 from potr_cl.codec.steps.rule import KNOTS, ColourSteps
 from potr_cl.errors import DataError
+from potr_cl.native.library import VARIABLE, native
 from potr_cl.report.file import file_report, format_report
 from tests.oracles import decoder as oracle
 from tests.reference.file_parts import File

@@ -18,11 +18,11 @@ from potr_cl.codec.body import Body
 from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import PotrFile, open_file
 from potr_cl.codec.encoder import code_scene
-from potr_cl.codec.native.library import native
 from potr_cl.codec.native.values import BundleShare
 from potr_cl.codec.quantize import HyperParameters, Preset
 from potr_cl.errors import DataError, DeviceError, DeviceMemoryError, UsageError
 from potr_cl.model.sightings import looked_at
+from potr_cl.native.library import native
 from potr_cl.ondevice import decode
 from potr_cl.ondevice.decode import StagedBundles, decode_to_device
 from potr_cl.opencl.device import Device

@@ -27,9 +27,9 @@ from pathlib import Path
 
 from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import open_file
-from potr_cl.codec.native.library import VARIABLE
 from potr_cl.codec.quantize import Preset
 from potr_cl.formats import load_cameras, load_scene
+from potr_cl.native.library import VARIABLE
 from potr_cl.ondevice.decode import decode_to_device
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode as encode_scene

@@ -21,7 +21,7 @@ from typing import Any
 from unittest import mock
 
 from potr_cl.codec.decoder import open_file
-from potr_cl.codec.native.library import VECTORS_VARIABLE
+from potr_cl.native.library import VECTORS_VARIABLE
 from tools.bench.paired import Asked
 from tools.results import ROOT, Results
 from tools.workloads import plain_parser, resident

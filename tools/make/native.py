@@ -1,4 +1,4 @@
-"""Compile the decoder's native path (potr_cl/codec/native) in the checkout, without installing the package.
+"""Compile the decoder's native path (potr_cl/native) in the checkout, without installing the package.
 
     python -m tools.make.native [--sanitize] [-o FILE] [--compiler CC]
 
@@ -16,9 +16,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import potr_cl.codec.native
+import potr_cl.native
 
-SOURCES = Path(potr_cl.codec.native.__file__).parent
+SOURCES = Path(potr_cl.native.__file__).parent
 PLAIN = ["-O3"]
 _SANITIZED = [
     "-O2", "-g", "-fno-omit-frame-pointer", "-fsanitize=address,undefined", "-fno-sanitize-recover=all",

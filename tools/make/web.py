@@ -18,10 +18,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import potr_cl.codec.native
+import potr_cl.native
 
 WEB = Path(__file__).parents[2] / "web"
-_NATIVE = Path(potr_cl.codec.native.__file__).parent
+_NATIVE = Path(potr_cl.native.__file__).parent
 #: bundles_tokens.c is part of web/src/tokens.c.
 _SOURCES = ("bundles", "bundles_values", "steps", "octree", "quantise")
 _ALWAYS = (

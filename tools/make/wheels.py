@@ -22,7 +22,7 @@ from pathlib import Path
 from tools.make.native import ALWAYS, PLAIN, compile_by
 from tools.results import ROOT
 
-_FOLDER = "potr_cl/codec/native"
+_FOLDER = "potr_cl/native"
 
 
 @dataclass(frozen=True)

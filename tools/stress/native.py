@@ -2,7 +2,7 @@
 
     python -m tools.stress.native [--count N] [--seconds S] [--seed SEED] [--processes P] [--json FILE] …
 
-As tools.stress.fuzz, whose options it has, with potr_cl/codec/native compiled with AddressSanitizer and
+As tools.stress.fuzz, whose options it has, with potr_cl/native compiled with AddressSanitizer and
 UndefinedBehaviorSanitizer (gcc or clang). Files are those of its format potr, and some of more splats. A process that a
 sanitizer ends is a finding; so is a file that NumPy, or the way by packed bundles that devices take, reads to other
 bits or refuses for another reason.
@@ -29,13 +29,14 @@ from potr_cl.codec import block_values
 from potr_cl.codec.body import Body
 from potr_cl.codec.decoder import PotrFile, open_file
 from potr_cl.codec.dequantizer import BundleTaker, SceneArrays
-from potr_cl.codec.native import bundles, declarations, library, octree, values
-from potr_cl.codec.native.library import LIBRARY_VARIABLE, VARIABLE, VECTORS_VARIABLE
+from potr_cl.codec.native import bundles, octree, values
 from potr_cl.codec.native.values import BUNDLE, PackedValues
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.codec.sections import Coder
 from potr_cl.errors import DataError
 from potr_cl.model.scene import Scene
+from potr_cl.native import declarations, library
+from potr_cl.native.library import LIBRARY_VARIABLE, VARIABLE, VECTORS_VARIABLE
 from tests.reference.scenes import random_scene
 from tools.make.native import compile_library
 from tools.stress.fuzz import campaign, fuzz_parser

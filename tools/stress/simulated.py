@@ -36,11 +36,11 @@ from potr_cl.clustering.kmeans import cluster
 from potr_cl.codec.bundles import encoder
 from potr_cl.codec.decoder import open_file
 from potr_cl.codec.encoder import code_scene
-from potr_cl.codec.native.library import VARIABLE
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.model import splat_groups
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
+from potr_cl.native.library import VARIABLE
 from potr_cl.ondevice.decode import decode_to_device
 from potr_cl.opencl import device as opencl_device
 from potr_cl.opencl.device import Device

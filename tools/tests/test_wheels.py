@@ -14,7 +14,7 @@ from platform import machine
 
 import pytest
 
-from potr_cl.codec.native.declarations import _DECLARATIONS, declared
+from potr_cl.native.declarations import _DECLARATIONS, declared
 from tools.make import wheels
 from tools.make.wheels import PLATFORMS, wheel_for
 
@@ -27,7 +27,7 @@ def wheel(tmp_path: Path) -> Path:
     path = tmp_path / "potr_cl-1-cp310-abi3-linux_riscv64.whl"
     with zipfile.ZipFile(path, "w") as made:
         made.writestr("potr_cl/__init__.py", "")
-        made.writestr("potr_cl/codec/native/_library.abi3.so", "another's")
+        made.writestr("potr_cl/native/_library.abi3.so", "another's")
         made.writestr(f"{_ABOUT}/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: false\nTag: cp310-abi3-linux_riscv64\n")
         made.writestr(f"{_ABOUT}/RECORD", "")
     return path
@@ -48,7 +48,7 @@ def test_a_wheel_has_its_library_its_tags_and_its_record(
         assert path.name == f"potr_cl-1-py3-none-{platform.tag}.whl"
         parts = contents(path)
         libraries = [name for name in parts if "_library" in name]
-        assert libraries == [f"potr_cl/codec/native/{platform.library}"]
+        assert libraries == [f"potr_cl/native/{platform.library}"]
         assert parts[libraries[0]] == platform.target.encode()
         tags = re.findall(r"^Tag: (.*)$", parts[f"{_ABOUT}/WHEEL"].decode(), re.MULTILINE)
         assert tags == [f"py3-none-{tag}" for tag in platform.tag.split(".")]

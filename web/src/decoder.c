@@ -1,4 +1,4 @@
-/* What WebAssembly adds to the decoder's C (potr_cl/codec/native): a block's sections as JavaScript hands them over, and
+/* What WebAssembly adds to the decoder's C (potr_cl/native): a block's sections as JavaScript hands them over, and
  * values that nobody looks up. JavaScript has checked all sizes and reserved all memory; nothing here allocates.
  *
  * There is one block at a time, and one bundle's values at a time: `potr_out` says where they stand. */

@@ -1,4 +1,4 @@
-/* The tokens of a stream, by vectors of WebAssembly: four lanes at a time, in the way of potr_cl/codec/native's
+/* The tokens of a stream, by vectors of WebAssembly: four lanes at a time, in the way of potr_cl/native's
  * bundles_tokens.c, which does what vectors cannot. Both give the same integers. */
 
 #define decode_tokens decode_without_vectors

@@ -19,12 +19,12 @@ from potr_cl.codec.bundles.ranges import Words, decode_stream, integer_type
 from potr_cl.codec.bundles.sections import MAIN, ORDER, ROTATION, Section
 from potr_cl.codec.bundles.streams import LOWEST, band, check_end, differences, no_words_left, step_terms, streams_of
 from potr_cl.codec.native.bundles import FINE, TOO_FEW_WORDS, BundledFile
-from potr_cl.codec.native.declarations import CFunctions
-from potr_cl.codec.native.library import vectors
-from potr_cl.codec.native.table import definition
 from potr_cl.codec.sections import Property
 from potr_cl.codec.steps.rule import ColourSteps
 from potr_cl.errors import DataError
+from potr_cl.native.declarations import CFunctions
+from potr_cl.native.library import vectors
+from potr_cl.native.table import definition
 
 I16 = NDArray[np.int16]
 I32 = NDArray[np.int32]

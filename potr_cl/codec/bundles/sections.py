@@ -18,9 +18,9 @@ from potr_cl.codec.bundles.description import Fitted, read_description, write_de
 from potr_cl.codec.bundles.layout import Bundles
 from potr_cl.codec.bundles.ranges import Words
 from potr_cl.codec.bundles.streams import LOWEST, largest_integer, streams_of
-from potr_cl.codec.native.declarations import fits
 from potr_cl.codec.sections import SH, Property
 from potr_cl.errors import DataError
+from potr_cl.native.declarations import fits
 
 #: Of a section's bytes: how many describe its streams.
 _HEAD = struct.Struct("<I")

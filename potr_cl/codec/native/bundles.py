@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from potr_cl.codec.bundles.description import Fitted
 from potr_cl.codec.bundles.layout import Items, Levels
 from potr_cl.codec.bundles.sections import Section
-from potr_cl.codec.native.declarations import LARGEST, CFunctions, address
 from potr_cl.codec.steps.rule import KNOTS, ColourSteps
+from potr_cl.native.declarations import LARGEST, CFunctions, address
 
 I8 = NDArray[np.int8]
 I32 = NDArray[np.int32]

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from potr_cl.codec.bundles.description import Model
 from potr_cl.codec.bundles.streams import Stream
 from potr_cl.codec.native.bundles import SECTIONS, STREAMS
-from potr_cl.codec.native.declarations import CFunctions, address
 from potr_cl.codec.sections import SH, Property
 from potr_cl.host.threads import Spare
+from potr_cl.native.declarations import CFunctions, address
 
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
@@ -178,8 +178,9 @@ class BundleEncoder:
 
     def counts(self, stream: int, alphabet: int) -> U32:
         """(256, 256) how often each expected size of a stream has each token, which are fewer than ``alphabet``."""
-        total = np.zeros((_TOKENS, _TOKENS), np.uint32)
-        for counts in self._counts.all():
+        first, *others = self._counts.all()
+        total: U32 = first[stream].copy()
+        for counts in others:
             total[:, :alphabet] += counts[stream, :, :alphabet]
         return total
 

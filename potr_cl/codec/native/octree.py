@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.native.declarations import CFunctions, address
 from potr_cl.host.threads import Run
 from potr_cl.model.order import are_many, over_ranges
+from potr_cl.native.declarations import CFunctions, address
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.native.declarations import CFunctions, address
+from potr_cl.native.declarations import CFunctions, address
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.native.declarations import CFunctions, address
 from potr_cl.codec.steps.rule import CLASSES
 from potr_cl.host.threads import Spare
+from potr_cl.native.declarations import CFunctions, address
 
 if TYPE_CHECKING:
     from potr_cl.codec.native.bundles import BundledFile

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.native import octree as native_octree
-from potr_cl.codec.native.declarations import CFunctions
-from potr_cl.codec.native.table import definition
 from potr_cl.codec.octree.parser import DEEPEST_LEVEL, U8, U64, OctreeStreams, check_centres, parse
 from potr_cl.host.threads import Run
 from potr_cl.model.order import spread
+from potr_cl.native.declarations import CFunctions
+from potr_cl.native.table import definition
 
 #: Splats worked on at a time where each stands for itself: the temporaries of a block stay in the cache.
 _BLOCK = 1 << 15

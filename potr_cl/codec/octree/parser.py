@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.native import octree as native_octree
-from potr_cl.codec.native.declarations import CFunctions
-from potr_cl.codec.native.table import definition
 from potr_cl.errors import DataError
 from potr_cl.host.threads import Run
+from potr_cl.native.declarations import CFunctions
+from potr_cl.native.table import definition
 
 #: Levels that float64 arithmetic on the root cube can tell apart.
 DEEPEST_LEVEL = 52

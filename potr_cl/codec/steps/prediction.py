@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.native import quantising
-from potr_cl.codec.native.declarations import CFunctions
-from potr_cl.codec.native.table import definition
 from potr_cl.codec.steps.rule import CLASSES
+from potr_cl.native.declarations import CFunctions
+from potr_cl.native.table import definition
 
 I64 = NDArray[np.int64]
 I8 = NDArray[np.int8]

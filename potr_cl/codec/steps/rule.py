@@ -17,8 +17,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.native.table import definition
 from potr_cl.errors import DataError
+from potr_cl.native.table import definition
 
 I64 = NDArray[np.int64]
 I8 = NDArray[np.int8]

@@ -1,4 +1,4 @@
-/* The module potr_cl.codec.native._library: empty for Python, which only builds and finds it. Its functions are those
+/* The module potr_cl.native._library: empty for Python, which only builds and finds it. Its functions are those
  * of the other sources, and are called through ctypes. So it needs next to nothing of Python's C interface, and one
  * library serves all versions of Python. */
 
@@ -6,7 +6,7 @@
 #include <Python.h>
 
 static struct PyModuleDef definition = {
-    PyModuleDef_HEAD_INIT, "_library", "Native parts of the decoder; see potr_cl.codec.native.", 0, NULL, NULL, NULL,
+    PyModuleDef_HEAD_INIT, "_library", "Native parts of the decoder; see potr_cl.native.", 0, NULL, NULL, NULL,
     NULL, NULL
 };
 

@@ -76,6 +76,9 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
     ),
     "potr_predicted": (None, [_POINTER, _SIZE, _SIZE, _SIZE, *[_POINTER] * 4]),
     "potr_nonzero_levels": (_NUMBER, [_POINTER, _SIZE, _SIZE, ctypes.c_double, ctypes.c_double, _POINTER]),
+    "potr_horizons": (ctypes.c_double, [_POINTER, _POINTER, _SIZE, _POINTER, _REAL, ctypes.c_int32, _POINTER]),
+    "potr_shown": (None, [_POINTER, _SIZE, _POINTER, ctypes.c_int32, _POINTER, _POINTER]),
+    "potr_energies": (None, [_POINTER, _SIZE, _POINTER, _SIZE, _POINTER]),
     "potr_unit_factors": (None, [_POINTER, _SIZE, _SIZE, _SIZE, _SIZE, _REAL, _POINTER]),
 }
 #: Those that take some microseconds, however large a file is. They keep the interpreter: to get it back among threads

@@ -12,7 +12,7 @@ from functools import cache, wraps
 from importlib import import_module
 from typing import Any, ParamSpec, TypeVar
 
-from potr_cl.codec.native.library import native
+from potr_cl.native.library import native
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -32,6 +32,9 @@ TABLE = {
     "codec.splat_levels:splat_levels": "codec.splat_levels:_splat_levels_by_c",
     "codec.steps.rule:colour_classes": "codec.native.bundles:colour_classes",
     "codec.steps.prediction:to_residuals": "codec.steps.prediction:_to_residuals_by_c",
+    "model.matter:horizons_of": "model.matter:_horizons_by_c",
+    "model.matter:shown_of": "model.matter:_shown_by_c",
+    "model.spherical_harmonics:energy": "model.spherical_harmonics:_energy_by_c",
     "outputs.feedback:unit_factors": "outputs.feedback:_unit_factors_by_c",
 }
 

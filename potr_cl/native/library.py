@@ -9,8 +9,8 @@ import sys
 from functools import lru_cache
 from pathlib import Path
 
-from potr_cl.codec.native.declarations import CFunctions, declared
 from potr_cl.errors import UsageError
+from potr_cl.native.declarations import CFunctions, declared
 
 _log = logging.getLogger("potr_cl")
 

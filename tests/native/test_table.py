@@ -14,13 +14,15 @@ import pytest
 from potr_cl.codec import geometry, octree, quantize
 from potr_cl.codec.bundles import encoder
 from potr_cl.codec.bundles.encoder import narrow
-from potr_cl.codec.native.library import VARIABLE, native
-from potr_cl.codec.native.table import TABLE, resolved
 from potr_cl.codec.octree.builder import Begun
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.codec.splat_levels import colour_levels, splat_levels
 from potr_cl.codec.steps.prediction import to_residuals
 from potr_cl.codec.steps.rule import colour_classes
+from potr_cl.model.matter import Matter, horizons_of, shown_of
+from potr_cl.model.spherical_harmonics import energy
+from potr_cl.native.library import VARIABLE, native
+from potr_cl.native.table import TABLE, resolved
 from potr_cl.outputs.feedback import unit_factors
 from tests.codec.test_bundles import classes_of, integers, steps_of
 from tests.reference.scenes import random_scene
@@ -153,6 +155,28 @@ def _bundles() -> Iterator[Case]:
         yield f"{splats}, {spread}, {known}", encoder.coded, arguments
 
 
+def _sights() -> Iterator[Case]:
+    """Also of points at the camera, straight ahead, behind it and on the edges of the cube map's faces."""
+    for number in (1, 255, 256, 3000):
+        rng = _rng(number)
+        targets = rng.normal(size=(number, 3)) * 2
+        targets[::7] = np.round(targets[::7])
+        occluders = (rng.normal(size=(3, 2 * number)) * rng.lognormal(0, 1, 2 * number)).astype(np.float32)
+        occluders[:, ::5] = np.round(occluders[:, ::5])
+        areas = rng.lognormal(-4, 2, 2 * number).astype(np.float32)
+        for count in (3, 8, 15):
+            colours = rng.normal(size=(number, count, 3)).astype(np.float32)
+            yield f"{number} of {count}", energy, (targets, colours)
+            yield f"{number} of {count}, double", energy, (targets, colours.astype(np.float64))
+        matter = Matter(targets, np.ones(number), colours, occluders, areas)
+        for place in (np.zeros(3), np.ones(3), rng.normal(size=3)):
+            yield f"{number} around {place}", horizons_of, (place, matter)
+            horizons, _ = horizons_of(place, matter)
+            for rotation in (np.eye(3), np.linalg.qr(rng.normal(size=(3, 3)))[0]):
+                camera = np.array([*place, *rotation.flat, 300, 280, 150, 140, 320, 240, 0.01])
+                yield f"{number} from {place}", shown_of, (camera, horizons, matter)
+
+
 #: Where the cases of each entry are; None: there in C alone, which tests of whole files compare.
 CASES: dict[str, Callable[[], Iterator[Case]] | None] = {
     "codec.block_values:bundle_share": None,
@@ -168,6 +192,9 @@ CASES: dict[str, Callable[[], Iterator[Case]] | None] = {
     "codec.splat_levels:splat_levels": _splats,
     "codec.steps.rule:colour_classes": _steps,
     "codec.steps.prediction:to_residuals": _steps,
+    "model.matter:horizons_of": _sights,
+    "model.matter:shown_of": _sights,
+    "model.spherical_harmonics:energy": _sights,
     "outputs.feedback:unit_factors": _factors,
 }
 
