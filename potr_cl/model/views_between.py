@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from potr_cl.errors import UsageError
 from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera, camera_centres
-from potr_cl.model.given_views import GivenViews, some_at_a_time
+from potr_cl.model.given_views import GivenViews
 from potr_cl.model.scene import Scene
 
 F64 = NDArray[np.float64]
@@ -88,13 +88,13 @@ def views_between(
     _ = known.memory  # before several threads ask for it
     for _ in range(_TRIES):
 
-        def tried(place: int, off: float = off) -> Camera | None:
+        def made(place: int, off: float = off) -> tuple[Camera, int]:
             turn, number = wanted[place]
-            view = _between(*draws[place], off)
-            view = dataclasses.replace(view, name=f"{_PREFIX}{turn}_{number:04d}", split="train")
-            return view if known.allows(view, number) else None
+            return _between(*draws[place], off, f"{_PREFIX}{turn}_{number:04d}"), number
 
-        for place, view in zip(left, some_at_a_time(tried, left, run), strict=True):
+        # One by one, so that whoever does this beside other work lets that go on in between.
+        fits = run(lambda each: each[0] if known.allows(*each) else None, map(made, left))
+        for place, view in zip(left, fits, strict=True):
             found[place] = view
         left = [place for place in left if found[place] is None]
         off *= _NEARER
@@ -138,8 +138,8 @@ class _Draw:
         )
 
 
-def _between(camera: Camera, other: Camera, draw: _Draw, spread: float) -> Camera:
-    """The view at a part of the way from one camera to another, with the intrinsics of the first."""
+def _between(camera: Camera, other: Camera, draw: _Draw, spread: float, name: str) -> Camera:
+    """The training view at a part of the way from one camera to another, with the intrinsics of the first."""
     start, end = camera.centre, other.centre
     way = float(np.linalg.norm(end - start))
     deviate = spread * way * draw.deviate
@@ -158,7 +158,9 @@ def _between(camera: Camera, other: Camera, draw: _Draw, spread: float) -> Camer
         position = focus + (position - focus) * max(kept + across, 0.1 * kept) / np.linalg.norm(position - focus)
     rotation = _rotation(draw.turn) @ _rotation(draw.part * _rotation_vector(other.rotation @ camera.rotation.T))
     rotation = rotation @ camera.rotation
-    return dataclasses.replace(camera, rotation=rotation, translation=-rotation @ position, image_path=None)
+    return dataclasses.replace(
+        camera, name=name, split="train", image_path=None, rotation=rotation, translation=-rotation @ position
+    )
 
 
 def _focus(camera: Camera, other: Camera) -> F64 | None:
