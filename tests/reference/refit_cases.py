@@ -103,9 +103,18 @@ class Linearised:
         """(N, M, 3) in Y, Co, Cg: the coefficients that may change."""
         self._refit.coefficients.activate(active)
 
-    def error_alone(self, targets: Targets) -> float:
-        """|pictures - targets|^2 by W, without a gradient."""
-        return self._refit.colour_map.error(self._at, targets)
+    def error_alone(self, targets: Targets, every: int = 1) -> float:
+        """|pictures - targets|^2 by W, without a gradient, by one of so many blocks of pixels."""
+        return self._refit.colour_map.error(self._at, targets, every)
+
+    def gradient_of_dc(self, targets: Targets, every: int) -> tuple[Array, float]:
+        """(N, 3) in Y, Co, Cg, the gradient of the constant coefficients, and the error; by one of so many blocks."""
+        vectors = self._refit.coefficients
+        result = vectors.vector()
+        vectors.zero(result)
+        error = self._refit.colour_map.gradient(self._at, targets, result, constant=True, every=every)
+        found: Array = as_rows(vectors, result)[:, 0]
+        return found, error
 
     def __enter__(self) -> Linearised:
         return self

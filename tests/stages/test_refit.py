@@ -188,6 +188,34 @@ def test_some_blocks_of_pixels_stand_for_all(device, scene, every, size, monkeyp
     assert relative(some, whole) > 1e-2
 
 
+@pytest.mark.parametrize("every", [2, 4])
+def test_a_gradient_by_some_blocks(device, every, monkeypatch):
+    """With its error; a GPU looks at all pixels for it."""
+    monkeypatch.setattr("potr_cl.stages.refitting.colour_map.ENOUGH", 5)
+    cameras = ring_of_cameras(5, size=37)
+    scene = visible_scene(60, 1)
+    with Case(device, scene, visible_scene(60, 3), cameras) as case, Linearised(case) as linear:
+        found, error = linear.gradient_of_dc(case.targets, every)
+        again, alone = linear.gradient_of_dc(case.targets, every), linear.error_alone(case.targets, every)
+        whole, all_error = linear.gradient[:, 0], linear.error
+        reference = case.reference()
+        images = [-residual for residual in reference.residuals()]
+        for number, (camera, image) in enumerate(zip(cameras, images, strict=True)):
+            rows, columns = np.divmod(np.arange(len(image)), camera.width)
+            image[(columns // 4 + every // 2 * (rows // 4) + number) % every != 0] = 0
+        wanted = every * reference.transposed(images)[:, 0]
+        squares = [view.weight * (image**2).sum() for view, image in zip(reference.views, images, strict=True)]
+    assert np.array_equal(found, again[0])
+    assert error == again[1] == pytest.approx(alone, rel=1e-6)
+    if device.family == "gpu":
+        assert np.array_equal(found, whole)
+        assert error == all_error
+        return
+    assert relative(found, wanted) < 1e-5
+    assert relative(found, whole) > 1e-2
+    assert error == pytest.approx(every * sum(squares), rel=1e-5)
+
+
 @pytest.mark.one_family
 @pytest.mark.parametrize(("splats", "rounds", "wanted"), [(20, True, {2, 4}), (60, True, {1, 4}), (20, False, {1, 4})])
 def test_steps_by_half_of_the_pixels_are_for_many_of_them_and_rounds_that_follow(

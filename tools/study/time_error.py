@@ -28,7 +28,7 @@ from tools.workloads import scene_parser
 
 #: What is turned, by name: the preset, the option, and its values.
 KNOBS: dict[str, tuple[str, str, tuple[Any, ...]]] = {
-    "pruning iterations": ("best", "prune.iterations", (12, 24, 96)),
+    "pruning iterations": ("best", "prune.iterations", (12, 24, 32, 96)),
     "part of a tile that may be gone before it is measured again": ("best", "prune.tolerance", (0.0, 0.01, 0.04, 0.08)),
     "views between, for each given one": ("best", "between.views", (0, 0.25, 1)),
     "steps of the re-fit": ("best", "refit.steps", (2, 4, 6, 12, 16)),

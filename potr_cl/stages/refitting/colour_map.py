@@ -45,7 +45,13 @@ class ColourMap:
         self.total_weight = 3 * REFERENCE_PIXELS * own.count
 
     def gradient(
-        self, x: Vector, targets: Targets, result: Vector, blocks: SplatBlocks | None = None, constant: bool = False
+        self,
+        x: Vector,
+        targets: Targets,
+        result: Vector,
+        blocks: SplatBlocks | None = None,
+        constant: bool = False,
+        every: int = 1,
     ) -> float:
         """result += Aᵀ W (pictures(x) - targets), half the gradient of the squared error at x.
 
@@ -57,22 +63,24 @@ class ColourMap:
             result: a vector.
             blocks: become the splats' own blocks of Aᵀ W A; cuts are left out of account there.
             constant: leave the result's AC coefficients alone. Not together with blocks.
+            every: of so many blocks of pixels one stands for all, on CPUs and where views are many; not together with
+                blocks.
 
         Returns:
             The squared error |pictures(x) - targets|² by W.
         """
-        own, coefficients, unit = self.own, self._coefficients, 1 / self.own.one
+        own, coefficients, unit, every = self.own, self._coefficients, 1 / self.own.one, self._sampled(every)
         ranges = [] if blocks is None else blocks.ranges
         with Memory(coefficients.device) as memory:
             sums = self._block_sums(memory, ranges[0]) if ranges else None
             on_device = coefficients.on_device(x)
             if self._helpers is not None:
                 own.prepare(targets)  # it waits for this device, from which the others then read x
-                self._helpers.begin_gradient(on_device, ranges[0] if ranges else None, constant)
-            own.add_up(Look(on_device, targets, constant=constant, blocks=sums))
+                self._helpers.begin_gradient(on_device, ranges[0] if ranges else None, constant, every)
+            own.add_up(Look(on_device, targets, constant=constant, every=every, blocks=sums))
             errors = {} if self._helpers is None else self._helpers.add(own.sums, sums)
             errors |= own.found_errors()
-            coefficients.add_sums(result, own.sums, unit, constant)
+            coefficients.add_sums(result, own.sums, every * unit, constant)
             if blocks is not None:
                 blocks.set_fixed(ranges[0], sums, unit)
                 coefficients.device.finish()  # before their memory is given back
@@ -87,21 +95,25 @@ class ColourMap:
                 assert blocks is not None
                 blocks.set_fixed(splats, sums, unit)
                 coefficients.device.finish()
-        return math.fsum(errors[number] for number in sorted(errors))
+        return every * math.fsum(errors[number] for number in sorted(errors))
 
-    def error(self, x: Vector, targets: Targets) -> float:
+    def _sampled(self, every: int) -> int:
+        """By how many blocks of pixels a gradient looks at one: on GPUs the errors of others would count too."""
+        return every if self.own.count >= ENOUGH and self._coefficients.device.family == "cpu" else 1
+
+    def error(self, x: Vector, targets: Targets, every: int = 1) -> float:
         """The squared error by W at x, as :meth:`gradient` returns it, which takes nearly twice as long.
 
         Colours that are cut at 0 at x are settled here too.
         """
-        own, on_device = self.own, self._coefficients.on_device(x)
+        own, on_device, every = self.own, self._coefficients.on_device(x), self._sampled(every)
         if self._helpers is not None:
             own.prepare(targets)
-            self._helpers.begin_gradient(on_device, None, False, back=False)
-        own.add_up(Look(on_device, targets, back=False))
+            self._helpers.begin_gradient(on_device, None, False, every, back=False)
+        own.add_up(Look(on_device, targets, every=every, back=False))
         errors = {} if self._helpers is None else self._helpers.add(own.sums, None)
         errors |= own.found_errors()
-        return math.fsum(errors[number] for number in sorted(errors))
+        return every * math.fsum(errors[number] for number in sorted(errors))
 
     def normal(
         self,

@@ -125,6 +125,7 @@ class ColourPart(Part):
         constant: bool,
         tell_drawn: bool = False,
         back: bool = True,
+        every: int = 1,
     ) -> Gradient:
         """What these views add to :meth:`~potr_cl.stages.refitting.colour_map.ColourMap.gradient`.
 
@@ -135,6 +136,7 @@ class ColourPart(Part):
             constant: whether only the constant coefficients are active.
             tell_drawn: whether it is asked which splats the views draw.
             back: whether sums are wanted, and not only errors.
+            every: of so many blocks of the views' pixels one is looked at.
         """
         layout = self._coefficients.layout
         self._exchange.take_flags(flags)
@@ -150,6 +152,7 @@ class ColourPart(Part):
                 self._x,
                 self._targets,
                 constant=constant,
+                every=every,
                 blocks=self._block_sums,
                 first_block=first_block,
                 drawn=marks,
@@ -262,7 +265,7 @@ class ColourHelpers(Owner):
         self._ask_drawn = not in_process and len(others) > 1
         self._drawn: DrawnRows | None = None
 
-    def begin_gradient(self, x: cl.Buffer, blocks: range | None, constant: bool, back: bool = True) -> None:
+    def begin_gradient(self, x: cl.Buffer, blocks: range | None, constant: bool, every: int, back: bool = True) -> None:
         """Have them begin with a gradient at x and the own blocks of some splats; or only with the error there."""
         flags: Lent | Each | NDArray[np.uint32]
         flags = (
@@ -270,7 +273,8 @@ class ColourHelpers(Owner):
         )
         sent = self._exchange.send_vector(x)
         self._x = sent if isinstance(sent, Lent) else None
-        self._pending = self._others.begin("gradient", sent, flags, blocks, constant, self._ask_drawn, back, anew=True)
+        given = (sent, flags, blocks, constant, self._ask_drawn, back, every)
+        self._pending = self._others.begin("gradient", *given, anew=True)
         self._exchange.settle()
 
     def begin_normal(self, direction: cl.Buffer, at: cl.Buffer, unit: float, constant: bool, every: int) -> None:

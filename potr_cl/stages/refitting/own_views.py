@@ -90,7 +90,7 @@ class Look:
         targets: what pictures of coefficients should show; None: x is a direction.
         at: the coefficients, where x is a direction. unit: it is multiplied by this.
         constant: only constant coefficients: leave the sums of others alone; a direction's others are all 0.
-        every: of so many blocks of pixels one is looked at, where x is a direction (:meth:`RefitSweep.run`).
+        every: of so many blocks of pixels one is looked at (:meth:`RefitSweep.run`).
         back: whether sums are wanted, and not only errors.
         blocks: (M (M + 1) / 2, n) int64, to which n splats' own blocks are added. first_block: the first of these.
         drawn: (stride,) uint8, becomes 1 for each splat that any of the views draws; not where each view has splats of

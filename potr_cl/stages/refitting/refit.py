@@ -98,9 +98,10 @@ def refit_colours(
     with ColourRefit(
         device, scene, cameras, background=background, memory=options.memory, help_from=help_from, slices=options.slices
     ) as refit:
+        dense = sum(camera.width * camera.height for camera in cameras) >= _DENSE * len(scene)
         way: _Rounding
         if colour_grid is not None:
-            way = _OnGrid(refit, targets, options, colour_grid, lambda: report(steps + _OF_FIRST_ROUNDS))
+            way = _OnGrid(refit, targets, options, colour_grid, lambda: report(steps + _OF_FIRST_ROUNDS), dense)
         elif fix_ac is not None:
             way = _AsTheFileDoes(refit, targets, options, fix_ac)
         else:
@@ -111,7 +112,6 @@ def refit_colours(
             report(0)
 
         # What steps by half of the pixels leave, the rounds take away; a file that rounds in its own way has none.
-        dense = sum(camera.width * camera.height for camera in cameras) >= _DENSE * len(scene)
         quick = replace(options.descent, every=HALF) if dense and colour_grid is not None else options.descent
         how = (options.selection, report)
         refit.start_from(scene.sh, active)
@@ -152,6 +152,7 @@ class _OnGrid:
     options: RefitOptions
     colour_grid: Callable[[FloatArray], ColourGrid]
     after_first: Callable[[], None]
+    dense: bool
     _steps: Future[Steps] | None = None
     _unrounded: Vector | None = None
 
@@ -180,7 +181,9 @@ class _OnGrid:
                 errors.append(gone_on.start)
             self.after_first()
             rounding.round(solver.x, solver.blocks, last, worth)
-            again = solver.solve(colour_map, self.targets, Descent(last.steps, 0.0, ridge, QUARTER), constant=True)
+            # Half of many pixels are enough for the constant coefficients alone.
+            how, every = Descent(last.steps, 0.0, ridge, QUARTER), HALF if self.dense else 1
+            again = solver.solve(colour_map, self.targets, how, constant=True, every=every)
         # But for the last constant coefficients, which are rounded as the file is made.
         return Refitted(self.refit.colours(), (solved.errors[0], again.errors[1]), steps + again.steps), errors[0]
 

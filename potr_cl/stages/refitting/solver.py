@@ -141,11 +141,15 @@ class Solved:
 
 @dataclass(frozen=True)
 class _Problem:
-    """The map, the pictures to come near to, and whether DC alone may change."""
+    """The map, the pictures to come near to, whether DC alone may change, and by how many blocks of pixels one counts.
+
+    That is for what is measured; steps have their own.
+    """
 
     colour_map: ColourMap
     targets: Targets
     constant: bool
+    every: int = 1
 
 
 @dataclass(frozen=True)
@@ -185,6 +189,7 @@ class ColourSolver:
         constant: bool = False,
         check: bool = True,
         after_start: Callable[[], None] = lambda: None,
+        every: int = 1,
     ) -> Solved:
         """Solve for the active coefficients, after choosing among them if there is to be a choice.
 
@@ -199,8 +204,10 @@ class ColourSolver:
             check: measure the true error of the result, and go back if the start was better. If not, the error after
                 the solution is not a number.
             after_start: called when the blocks are those of the start.
+            every: of so many blocks of pixels one is looked at all the way, on CPUs and where views are many; if DC
+                alone may change.
         """
-        problem = _Problem(colour_map, targets, constant)
+        problem = _Problem(colour_map, targets, constant, every)
         vectors, ridge, whole = self._coefficients, descent.ridge, colour_map.total_weight
         vectors.copy(self._start, self.x)
         first_ridge = selection.descent.ridge if selection else ridge
@@ -250,7 +257,8 @@ class ColourSolver:
         """Settle which colours are cut, and make the residual: minus half the objective's gradient at x."""
         vectors, residual = self._coefficients, self._residual
         vectors.zero(residual)
-        error = problem.colour_map.gradient(self.x, problem.targets, residual, blocks, problem.constant)
+        given = (self.x, problem.targets, residual, blocks, problem.constant, problem.every)
+        error = problem.colour_map.gradient(*given)
         vectors.add_ridge(residual, self.x, replace(ridge, prior=0.0))
         penalty, change = self._penalty(ridge)
         vectors.combine(-1.0, residual, -ridge.prior, change)
@@ -258,7 +266,7 @@ class ColourSolver:
 
     def _measured(self, problem: _Problem, ridge: Ridge) -> _State:
         """What :meth:`_linearise` would return at x."""
-        error = problem.colour_map.error(self.x, problem.targets)
+        error = problem.colour_map.error(self.x, problem.targets, problem.every)
         return _State(error, error + self._penalty(ridge)[0])
 
     def _penalty(self, ridge: Ridge) -> tuple[float, Vector]:

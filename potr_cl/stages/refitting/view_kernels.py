@@ -108,8 +108,8 @@ class RefitSweep:
             target: (pixels, 3) float32, view after view: subtracted from the pixels; None: nothing is.
             scale: the views' fixed point.
             numbers: uint32, of views among all. first: place there of the first of these.
-            every: of so many blocks of pixels one is looked at (cl/refit/samples.clh), 1, 2 or 4; not with a target or
-                a background, for which other blocks' errors would count.
+            every: of so many blocks of pixels one is looked at (cl/refit/samples.clh), 1, 2 or 4; on GPUs not with a
+                target or a background, for which other blocks' errors would count.
             back: whether sums are wanted, and not only errors.
             errors: (tiles,) float32, becomes each tile's sum of squared pixel values.
             totals: (views, stride, 4) int64: weight times value, three channels, and the squared weights are added.
