@@ -115,6 +115,8 @@ class BundleEncoder:
         self._work = Spare(lambda: np.zeros(c["potr_bundles_encoding"](), np.uint8))
         self._sums = Spare(lambda: (np.zeros((STREAMS, COLUMNS, COLUMNS), np.int64), np.zeros(STREAMS, np.uint32)))
         self._counts = Spare(lambda: np.zeros((STREAMS, _TOKENS, _TOKENS), np.uint32))
+        self._total = np.empty((_TOKENS, _TOKENS), np.uint32)
+        self._grouping = np.empty(c["potr_bundles_grouping"](), np.uint8)
         self._words = Spare(lambda: np.empty(_WORDS * _BUNDLE + 2, np.uint16))
         for place, stream in zip(self._streams, streams, strict=True):
             number, some = len(stream.terms), stream.coefficients
@@ -177,15 +179,18 @@ class BundleEncoder:
             )
 
     def counts(self, stream: int, alphabet: int) -> U32:
-        """(256, 256) how often each expected size of a stream has each token, which are fewer than ``alphabet``."""
+        """(256, 256) how often each expected size of a stream has each token, which are fewer than ``alphabet``.
+
+        Valid until the next call.
+        """
         first, *others = self._counts.all()
-        total: U32 = first[stream].copy()
+        np.copyto(self._total, first[stream])
         for counts in others:
-            total[:, :alphabet] += counts[stream, :, :alphabet]
-        return total
+            self._total[:, :alphabet] += counts[stream, :, :alphabet]
+        return self._total
 
     def contexts(self, counts: U32, alphabet: int, logs: I64) -> Model:
-        """Contexts of a stream and their frequencies.
+        """Contexts of a stream and their frequencies, for one thread at a time.
 
         Args:
             counts: (256, 256), at least one.
@@ -194,13 +199,12 @@ class BundleEncoder:
         """
         if not 0 < alphabet <= _MOST_ALPHABET or not counts.any():
             raise TypeError("the native path was given no tokens, or too many")
-        room = np.empty(self._c["potr_bundles_grouping"](), np.uint8)
         classes, frequencies = np.empty(_TOKENS, np.uint8), np.empty(_GROUPS * alphabet, np.uint16)
         number = self._c["potr_bundles_contexts"](
             address(counts, np.uint32, _TOKENS * _TOKENS),
             alphabet,
             address(logs, np.int64, _LOGS),
-            room.ctypes.data,
+            self._grouping.ctypes.data,
             address(classes, np.uint8, _TOKENS, True),
             address(frequencies, np.uint16, len(frequencies), True),
         )
