@@ -483,3 +483,47 @@ def test_what_is_told_of_both():
     assert files.facts["without"] == {"bytes": 100_000, "psnr": pytest.approx(50)}
     assert files.facts["with"] == {"bytes": 90_000, "psnr": pytest.approx(49.5)}
     assert "90,000 bytes and 49.50 dB with it, 100,000 bytes and 50.00 dB without" in str(files)
+
+
+@pytest.mark.parametrize("together", [1 << 24, 1])
+def test_judges_see_the_same_every_time(device, together, monkeypatch):
+    """All in one go or one after the other, of several sizes, as often as they are asked."""
+    monkeypatch.setattr("potr_cl.stages.fitting.fit._RENDERED", together)
+    source = visible_scene(60, 2, seed=3)
+    cameras = [*ring_of_cameras(3, size=48), *ring_of_cameras(2, size=131)]
+    every = range(len(cameras))
+    scene = shaken(source)
+    with Rasterizer(device, source) as rasterizer, Rasterizer(device, scene) as own:
+        sight = Sight(cameras, RenderedTargets(rasterizer, cameras))
+        with sight.pictures(device, None) as pictures, Judges(device, own, cameras, pictures, every) as judges:
+            errors = {judges.error() for _ in range(3)}
+            held = device.allocated
+        assert device.allocated < held
+    assert len(errors) == 1
+    assert errors.pop() == pytest.approx(mean_error(device, source, scene, cameras), rel=1e-5)
+
+
+@pytest.mark.one_family
+def test_views_between_are_those_that_were_sought_meanwhile(device, plush_excerpt, plush_excerpt_cameras):
+    state = State.of(plush_excerpt, plush_excerpt_cameras)
+    bench = bench_of(device)
+    begun = Fit(steps=10, between=2.0).begun(state, bench)
+    assert begun.results.sought is not None
+    found = [
+        [
+            (view.name, view.translation.tolist())
+            for view in Fit(steps=10, between=each)._looking_between(known, bench).views
+        ]
+        for known, each in ((begun, 2.0), (state, 2.0), (begun, 1.0), (state, 1.0))
+    ]
+    assert found[0] == found[1] != found[2] == found[3]
+    assert len(found[0]) > len(found[2]) > len(plush_excerpt_cameras)
+
+
+@pytest.mark.one_family
+def test_nothing_is_sought_where_no_views_are_added(device, plush_excerpt, plush_excerpt_cameras):
+    bench = bench_of(device)
+    one = State.of(plush_excerpt, plush_excerpt_cameras[:1])
+    enough = dataclasses.replace(State.of(plush_excerpt, plush_excerpt_cameras), added=len(plush_excerpt_cameras) // 2)
+    for state in (one, enough):
+        assert Fit(steps=10, between=1.0).begun(state, bench) is state

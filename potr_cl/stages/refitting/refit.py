@@ -44,6 +44,9 @@ _WORTH = 0.4
 #: Pixels of all views for each splat from which on half of them make the normal equations of all steps. With 199 and
 #: more that costs at most 0.3 % of the bytes at equal PSNR, with 145 0.3 %, with 121 0.7 %, with 43 1.4 %.
 _DENSE = 150
+#: With so many, half of them tell the constant coefficients that the last rounding leaves: with 121 and 145 that costs
+#: less than 0.1 % of the bytes at equal PSNR.
+_ENOUGH = 100
 #: What is nearer to 0 than this was 0 before it was made R, G and B.
 _ZERO = 1e-6
 #: Splats whose coefficients a thread looks at.
@@ -98,10 +101,11 @@ def refit_colours(
     with ColourRefit(
         device, scene, cameras, background=background, memory=options.memory, help_from=help_from, slices=options.slices
     ) as refit:
-        dense = sum(camera.width * camera.height for camera in cameras) >= _DENSE * len(scene)
+        each = sum(camera.width * camera.height for camera in cameras) / len(scene)
         way: _Rounding
         if colour_grid is not None:
-            way = _OnGrid(refit, targets, options, colour_grid, lambda: report(steps + _OF_FIRST_ROUNDS), dense)
+            half = each >= _ENOUGH
+            way = _OnGrid(refit, targets, options, colour_grid, lambda: report(steps + _OF_FIRST_ROUNDS), half)
         elif fix_ac is not None:
             way = _AsTheFileDoes(refit, targets, options, fix_ac)
         else:
@@ -112,7 +116,7 @@ def refit_colours(
             report(0)
 
         # What steps by half of the pixels leave, the rounds take away; a file that rounds in its own way has none.
-        quick = replace(options.descent, every=HALF) if dense and colour_grid is not None else options.descent
+        quick = replace(options.descent, every=HALF) if each >= _DENSE and colour_grid is not None else options.descent
         how = (options.selection, report)
         refit.start_from(scene.sh, active)
         solved = refit.solver.solve(refit.colour_map, targets, quick, *how, check=False, after_start=begin)
@@ -152,7 +156,7 @@ class _OnGrid:
     options: RefitOptions
     colour_grid: Callable[[FloatArray], ColourGrid]
     after_first: Callable[[], None]
-    dense: bool
+    half: bool
     _steps: Future[Steps] | None = None
     _unrounded: Vector | None = None
 
@@ -181,8 +185,7 @@ class _OnGrid:
                 errors.append(gone_on.start)
             self.after_first()
             rounding.round(solver.x, solver.blocks, last, worth)
-            # Half of many pixels are enough for the constant coefficients alone.
-            how, every = Descent(last.steps, 0.0, ridge, QUARTER), HALF if self.dense else 1
+            how, every = Descent(last.steps, 0.0, ridge, QUARTER), HALF if self.half else 1
             again = solver.solve(colour_map, self.targets, how, constant=True, every=every)
         # But for the last constant coefficients, which are rounded as the file is made.
         return Refitted(self.refit.colours(), (solved.errors[0], again.errors[1]), steps + again.steps), errors[0]
