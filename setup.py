@@ -1,7 +1,7 @@
-"""Adds the compiled part of the decoder to what pyproject.toml says.
+"""Adds the compiled library to what pyproject.toml says.
 
-It is optional: without a compiler the package is installed all the same, and decodes with NumPy, more slowly. It stands
-here and not in pyproject.toml because compilers take different options.
+It is optional: without a compiler the package is installed all the same, and NumPy does its work, more slowly. It
+stands here and not in pyproject.toml because compilers take different options.
 """
 
 import sys

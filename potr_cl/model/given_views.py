@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.host.threads import Run
-from potr_cl.model.camera import Camera, camera_centres
+from potr_cl.model.camera import Camera
 from potr_cl.model.matter import CROWDED, Matter, frame_of, horizons_of, matter_of, shown_of
 from potr_cl.model.sampling import F64
 from potr_cl.model.scene import Scene
@@ -23,6 +23,8 @@ T = TypeVar("T")
 
 #: So many splats, evenly taken, tell where a scene is; views are judged by so many of them, and points that hide them.
 _TAKEN, _TARGETS, _OCCLUDERS = 20_000, 1_000, 8_000
+#: Nothing is taken to be farther away, in the frame's units: squares of it are finite in single precision.
+_FARTHEST = 1e18
 #: Views that a thread looks at before the next one gets its turn.
 _AT_ONCE = 16
 #: Part of what a new view shows that some given view must show, too.
@@ -54,7 +56,7 @@ class GivenViews:
         self._known: F32 = self._shown.max(axis=0)
         # Whoever photographs indoors, stands close to things.
         self._crowded = max(CROWDED, *blocked)
-        self._places = (camera_centres(cameras) - self._frame.centre) / self._frame.unit
+        self._places = np.stack([self._place(camera) for camera in cameras])
         self._fields = np.array([c.width * c.height / (c.fx * c.fy) for c in cameras])
 
     @cached_property
@@ -63,7 +65,7 @@ class GivenViews:
         memory = ColourMemory(self._places, self._matter)
         if not memory.tells:
             return memory, 0.0
-        return memory, _REMEMBERED * float(memory.of_known(self._shown).min())
+        return memory, _REMEMBERED * min(memory.of_known(*given) for given in enumerate(self._shown))
 
     def views_of_parts(self) -> NDArray[np.int64]:
         """(K,) how many given views show each of some splats, evenly taken; those that none shows are left out."""
@@ -91,6 +93,7 @@ class GivenViews:
         it would show what no given view shows.
 
         Args:
+            camera: the view.
             beside: number of the given view that it lies beside.
         """
         if not np.isfinite(camera.translation).all():
@@ -112,7 +115,7 @@ class GivenViews:
         return shown_of(np.array([*place, *camera.rotation.flat, *lens]), horizons, self._matter), blocked
 
     def _place(self, camera: Camera) -> F64:
-        place: F64 = (camera.centre - self._frame.centre) / self._frame.unit
+        place: F64 = np.clip((camera.centre - self._frame.centre) / self._frame.unit, -_FARTHEST, _FARTHEST)
         return place
 
 
@@ -158,13 +161,12 @@ class ColourMemory:
         own = float(weights @ self._energy(place)) / total
         return own / self._best(weights, total)
 
-    def of_known(self, shown: F32) -> F64:
-        """(P,) the same of the places that are known; ``shown``: (P, K)."""
+    def of_known(self, number: int, shown: F32) -> float:
+        """The same of one of the places that are known, by its number."""
         assert self._energies is not None
-        weights = (shown * self._informative).astype(np.float64)
-        energies: F64 = self._energies @ weights.T / np.maximum(weights.sum(axis=1), 1e-6)  # by place, and seen there
-        known: F64 = np.diagonal(energies) / np.maximum(np.quantile(energies, _BEST, axis=0), 1e-12)
-        return known
+        weights = shown * self._informative
+        total = max(float(weights.sum()), 1e-6)
+        return float(weights @ self._energies[number]) / total / self._best(weights, total)
 
     def _best(self, weights: F32, total: float) -> float:
         """How well the best of the known places are remembered by the same splats."""

@@ -139,7 +139,8 @@ def horizons_of(place: F64, matter: Matter) -> tuple[F32, float]:
     reach = np.float32(_ELBOW_ROOM)
     near = np.flatnonzero(squared < reach * reach)
     parts = np.minimum(matter.areas[near] / np.maximum(4 * np.pi * squared[near], 1e-30), 1)
-    return horizons, sum(parts.tolist(), 0.0)
+    # One after the other, as C adds.
+    return horizons, float(np.cumsum(parts, dtype=np.float64)[-1]) if len(parts) else 0.0
 
 
 def _horizons_by_c(c: CFunctions, place: F64, matter: Matter) -> tuple[F32, float]:
@@ -165,6 +166,7 @@ def shown_of(camera: F64, horizons: F32, matter: Matter) -> F32:
         camera: (19,) its centre and the rows of its rotation; fx, fy, cx, cy; width, height; and the nearest depth that
             it sees.
         horizons: around it (:func:`horizons_of`).
+        matter: of the scene.
     """
     fx, fy, cx, cy, width, height, near = camera[12:].tolist()
     ways = matter.targets - camera[:3]
@@ -193,7 +195,7 @@ def _shown_by_c(c: CFunctions, camera: F64, horizons: F32, matter: Matter) -> F3
 
 
 def _cells_of(rays: F32) -> NDArray[np.int64]:
-    """Number of the cube map's cell in each direction, (3, …), of any length but 0."""
+    """Number of the cube map's cell in each direction, (3, …), of any finite length but 0."""
     x, y, z = rays
     sizes = np.abs(rays)
     largest = np.maximum(np.maximum(sizes[0], sizes[1]), sizes[2])
@@ -201,7 +203,7 @@ def _cells_of(rays: F32) -> NDArray[np.int64]:
     along_z = ~(along_x | (sizes[1] == largest))
     scale = np.float32(_CELLS / 2) / np.maximum(largest, np.float32(1e-30))
     u, v = (
-        np.minimum((side * scale + np.float32(_CELLS / 2)).astype(np.int32), _CELLS - 1)
+        np.clip((side * scale + np.float32(_CELLS / 2)).astype(np.int32), 0, _CELLS - 1)
         for side in (np.where(along_x, y, x), np.where(along_z, y, z))
     )
     face = np.where(along_x, x > 0, np.where(along_z, z > 0, y > 0) + np.where(along_z, np.int32(4), np.int32(2)))

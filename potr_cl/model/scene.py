@@ -224,7 +224,8 @@ class Scene:
         if fast and len(numbers) >= _LARGE and numbers.min() >= 0 and numbers.max() < len(self):
             return self._rows(numbers.astype(np.intp, copy=False))
         if fast:
-            return self.of_arrays([each.take(numbers.astype(np.intp, copy=False), axis=0) for each in self.arrays])
+            rows = numbers.astype(np.intp, copy=False)
+            return self.of_arrays([each.take(rows, axis=0) for each in self.arrays])
         return self.of_arrays([each[index] for each in self.arrays])
 
     def _rows(self, numbers: NDArray[np.intp]) -> Scene:

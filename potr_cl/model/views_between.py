@@ -6,7 +6,7 @@ spoils what lies between them. The pictures that it compares with are renders, s
 it, and looks where the two look. Where cameras orbit something, the way is the orbit and not the chord: the distance to
 what they look at is kept.
 
-A view is only added where a camera might have been (:meth:`potr_cl.model.given_views.GivenViews.allow`).
+A view is only added where a camera might have been (:meth:`potr_cl.model.given_views.GivenViews.allows`).
 """
 
 from __future__ import annotations

@@ -20,5 +20,6 @@ It gives the same bits as the NumPy that is its definition, and what runs where 
 ``module.c``          nothing: it makes a Python module of the library, so that it is built and found as one
 ====================  =========================================================================================
 
-The modules beside them give each C function NumPy arrays whose sizes they have checked; ``library`` finds the library.
+Who calls a function, beside its definition or in :mod:`potr_cl.codec.native`, gives it NumPy arrays whose sizes have
+been checked; ``library`` finds the library.
 """

@@ -1,4 +1,4 @@
-"""Which path the codec takes (:func:`native`): the compiled library if there is one, unless the user says otherwise."""
+"""Which path is taken (:func:`native`): the compiled library if there is one, unless the user says otherwise."""
 
 from __future__ import annotations
 

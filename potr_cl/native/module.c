@@ -6,7 +6,7 @@
 #include <Python.h>
 
 static struct PyModuleDef definition = {
-    PyModuleDef_HEAD_INIT, "_library", "Native parts of the decoder; see potr_cl.native.", 0, NULL, NULL, NULL,
+    PyModuleDef_HEAD_INIT, "_library", "The native path; see potr_cl.native.", 0, NULL, NULL, NULL,
     NULL, NULL
 };
 

@@ -1,5 +1,5 @@
-/* What the native path's sources share. docs/format.md is the normative description of all that they compute, and the
- * NumPy modules beside this folder are the reference: both give the same integers and floats, bit for bit.
+/* What the native path's sources share. NumPy functions are the reference (table.py): both give the same integers and
+ * floats, bit for bit. What files hold, docs/format.md describes.
  *
  * Rules: nothing that comes from a file is trusted; every function is told how long its arrays are, and the Python
  * that calls it has checked that they are as long as it says. No function allocates memory, keeps state

@@ -9,14 +9,15 @@
 
 enum { BLOCK = 256, DEGREE_3 = 15 };
 
-/* The number of the cell, of 6 * cells * cells, in a direction of any length but 0. */
+/* The number of the cell, of 6 * cells * cells, in a direction of any finite length but 0. */
 static INLINE int32_t cell_of(float x, float y, float z, int32_t cells)
 {
     const float ax = fabsf(x), ay = fabsf(y), az = fabsf(z);
     const float wider = ax > ay ? ax : ay, largest = wider > az ? wider : az;
     const int along_x = ax == largest, along_z = !along_x && ay != largest;
     const float half = 0.5f * (float)cells, scale = half / (largest > 1e-30f ? largest : 1e-30f);
-    int32_t u = (int32_t)((along_x ? y : x) * scale + half), v = (int32_t)((along_z ? y : z) * scale + half);
+    const float across = (along_x ? y : x) * scale + half, down = (along_z ? y : z) * scale + half;
+    int32_t u = across >= 0 ? (int32_t)across : 0, v = down >= 0 ? (int32_t)down : 0; /* not a number: 0 */
     u = u < cells - 1 ? u : cells - 1;
     v = v < cells - 1 ? v : cells - 1;
     const int32_t face = along_x ? x > 0 : along_z ? (z > 0) + 4 : (y > 0) + 2;

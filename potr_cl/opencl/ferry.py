@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner, Staging
 
-#: Fewer bytes at a time go as fast without, and so do those before so many have gone: drivers take long to give that
-#: memory. Pieces of so many bytes are on their way at a time.
+#: Copies of fewer bytes go as fast without that memory, and so do the first ones, until so many bytes have gone:
+#: drivers take long to give it. Pieces of so many bytes are on their way at a time.
 LEAST, PAYS, PIECE = 1 << 22, 1 << 26, 1 << 24
 _AT_A_TIME = 8
 

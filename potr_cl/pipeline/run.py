@@ -195,6 +195,10 @@ class Run:
                 state = self._fit_that_pays(state, after) if isinstance(stage, Fit) else after
                 if self._follow is not None:
                     self._follow(stage, state)
+        except BaseException:
+            if state.results.sought is not None:
+                state.results.sought.stop()
+            raise
         finally:
             if pictures is not None:
                 pictures.close()

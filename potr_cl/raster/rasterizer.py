@@ -168,7 +168,7 @@ class Rasterizer(Owner):
     def render_again(
         self, cameras: Sequence[Camera], target: cl.Buffer, start: int = 0, former: ViewSet | None = None
     ) -> ViewSet | None:
-        """:meth:`render_into` for who renders again and again.
+        """:meth:`render_into` for callers that render again and again.
 
         Args:
             former: what the last call has returned, whose memory is taken; of no use any more.
@@ -188,8 +188,8 @@ class Rasterizer(Owner):
             copied(self._image.buffer, views.pixels)
 
         if self._launcher.whole_sets:
-            room = (device.info.memory - device.allocated) // 512
-            most = int(max(min(room, _PROJECTED) // self.stride, 1))
+            left = device.info.memory - device.allocated + (0 if former is None else former.nbytes)
+            most = int(max(min(left // 512, _PROJECTED) // self.stride, 1))
             return self._preparation.in_sets(composited, cameras, most, former)
         for camera in cameras:
             image, _ = self.render_device(camera)

@@ -153,6 +153,11 @@ class ViewSet(Owner):
         return [int(last[0])]
 
     @property
+    def nbytes(self) -> int:
+        """Bytes of all."""
+        return self._memory.nbytes
+
+    @property
     def nbytes_cached(self) -> int:
         """Bytes of all but shapes and colours."""
         nbytes: int = self._memory.nbytes - sum(buffer.size for buffer in self._geometry)

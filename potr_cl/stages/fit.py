@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from concurrent.futures import Future
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import CancelledError, Future
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from threading import Event
+from typing import Any, Literal
 
 from potr_cl.errors import UsageError
 from potr_cl.host.process import first_interrupt_asks
@@ -81,12 +82,28 @@ _LITTLE_GAIN = "on the views that were held out it gained little beyond what the
 _INTERRUPTED = "it was interrupted before it had gained enough"
 
 
-@dataclass(frozen=True)
 class Sought:
-    """Views between for a fit, so many for each given one, that a thread of its own looks for."""
+    """Views between for a fit, which a thread of its own looks for.
 
-    each: float
-    views: Future[list[Camera]]
+    Args:
+        state: whose given views they lie between.
+        each: so many for each of these.
+    """
+
+    def __init__(self, state: State, given: Sequence[Camera], each: float) -> None:
+        self.each, self._stopped = each, Event()
+        seek = partial(views_between, known=state.results.known, run=self._until_stopped)
+        self.views: Future[list[Camera]] = in_background(seek, state.source, given, each)
+
+    def stop(self) -> None:
+        """Look no further: nobody wants them any more."""
+        self._stopped.set()
+
+    def _until_stopped(self, work: Callable[[Any], Any], of: Iterable[Any]) -> Iterator[Any]:
+        for each in of:
+            if self._stopped.is_set():
+                raise CancelledError
+            yield work(each)
 
 
 def _steps(text: str) -> int | Literal["auto"]:
@@ -203,8 +220,7 @@ class Fit(Stage):
         given, each = state.views[: len(state.views) - state.added], self._each(state, bench)
         if len(given) < 2 or not each:
             return state
-        seek = partial(views_between, known=state.results.known)
-        return state.with_results(sought=Sought(each, in_background(seek, state.source, given, each)))
+        return state.with_results(sought=Sought(state, given, each))
 
     def run(self, state: State, bench: Workbench) -> State:
         """Remove splats, fit, and leave a :class:`potr_cl.stages.fitting.fitted.Fitted` in ``results``.

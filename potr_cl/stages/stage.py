@@ -311,10 +311,10 @@ class Stage(ABC):
         """
 
     def begun(self, state: State, bench: Workbench) -> State:
-        """Begin in the background what the stage needs and needs no results for, while other stages are at work.
+        """Begin in the background what the stage will need and what depends on no stage still to come.
 
         Args:
-            state: the first one that has all views.
+            state: before the first stage that does not only serve others.
             bench: as of :meth:`run`, of the device that will most likely do the work.
 
         Returns:

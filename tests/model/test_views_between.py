@@ -159,3 +159,14 @@ def test_threads_find_the_same_views():
         assert one.name == other.name
         assert np.array_equal(one.rotation, other.rotation)
         assert np.array_equal(one.translation, other.translation)
+
+
+@pytest.mark.parametrize("far", [1e30, 1e300])
+def test_cameras_beyond_all_bounds_do_no_harm(far):
+    """On all axes, so that their directions have no largest one in single precision."""
+    out = [
+        dataclasses.replace(view, name=f"{number}", translation=np.full(3, far)) for number, view in enumerate(ORBIT)
+    ]
+    known = GivenViews(BALL, [*ORBIT, *out])
+    assert not any(known.allows(view, 0) for view in out)
+    assert len(known.views_of_parts())

@@ -163,7 +163,7 @@ def _sights() -> Iterator[Case]:
         targets[::7] = np.round(targets[::7])
         occluders = (rng.normal(size=(3, 2 * number)) * rng.lognormal(0, 1, 2 * number)).astype(np.float32)
         occluders[:, ::5] = np.round(occluders[:, ::5])
-        areas = rng.lognormal(-4, 2, 2 * number).astype(np.float32)
+        areas = rng.lognormal(-12, 8, 2 * number).astype(np.float32)  # whose sums are rounded
         for count in (3, 8, 15):
             colours = rng.normal(size=(number, count, 3)).astype(np.float32)
             yield f"{number} of {count}", energy, (targets, colours)

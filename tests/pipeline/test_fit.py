@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from types import SimpleNamespace
 
 import pytest
 
+from potr_cl.host.threads import BACKGROUND
 from potr_cl.model.camera import resized
+from potr_cl.model.views_between import views_between
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
@@ -59,6 +62,20 @@ def test_a_fit_pays(device, plush_excerpt, plush_excerpt_cameras):
     assert fitted.nbytes < 1.02 * plain.nbytes
     better, before = (psnr(device, plush_excerpt, each, plush_excerpt_cameras) for each in (fitted, plain))
     assert better > before + 0.5
+
+
+def test_views_between_are_sought_beside_other_stages(device, plush_excerpt, plush_excerpt_cameras, monkeypatch):
+    threads = []
+
+    def noted(*args, **how):
+        threads.append(threading.current_thread().name)
+        return views_between(*args, **how)
+
+    monkeypatch.setattr("potr_cl.stages.fit.views_between", noted)
+    options = HALF.changed(fit={"steps": 2, "rounds": 1, "between": 2.0, "compared": False})
+    encode(plush_excerpt, plush_excerpt_cameras, options, device=device)
+    assert len(threads) == 1
+    assert threads[0].startswith(BACKGROUND)
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from concurrent.futures import CancelledError
 
 import numpy as np
 import pytest
@@ -485,9 +486,10 @@ def test_what_is_told_of_both():
     assert "90,000 bytes and 49.50 dB with it, 100,000 bytes and 50.00 dB without" in str(files)
 
 
+@pytest.mark.parametrize("keeps", [True, False])
 @pytest.mark.parametrize("together", [1 << 24, 1])
-def test_judges_see_the_same_every_time(device, together, monkeypatch):
-    """All in one go or one after the other, of several sizes, as often as they are asked."""
+def test_judges_see_the_same_every_time(device, together, keeps, monkeypatch):
+    """All in one go or one after the other, of several sizes, as often as they are asked; nothing is left behind."""
     monkeypatch.setattr("potr_cl.stages.fitting.fit._RENDERED", together)
     source = visible_scene(60, 2, seed=3)
     cameras = [*ring_of_cameras(3, size=48), *ring_of_cameras(2, size=131)]
@@ -495,29 +497,40 @@ def test_judges_see_the_same_every_time(device, together, monkeypatch):
     scene = shaken(source)
     with Rasterizer(device, source) as rasterizer, Rasterizer(device, scene) as own:
         sight = Sight(cameras, RenderedTargets(rasterizer, cameras))
-        with sight.pictures(device, None) as pictures, Judges(device, own, cameras, pictures, every) as judges:
-            errors = {judges.error() for _ in range(3)}
-            held = device.allocated
-        assert device.allocated < held
+        with sight.pictures(device, None) as pictures:
+            pictures.fill([(number,) for number in every])
+            before = device.allocated
+            with Judges(device, own, cameras, pictures, every, keeps) as judges:
+                errors = {judges.error() for _ in range(3)}
+            own.rest()
+            assert device.allocated == before
     assert len(errors) == 1
     assert errors.pop() == pytest.approx(mean_error(device, source, scene, cameras), rel=1e-5)
 
 
 @pytest.mark.one_family
 def test_views_between_are_those_that_were_sought_meanwhile(device, plush_excerpt, plush_excerpt_cameras):
-    state = State.of(plush_excerpt, plush_excerpt_cameras)
-    bench = bench_of(device)
+    state, bench, own = State.of(plush_excerpt, plush_excerpt_cameras), bench_of(device), len(plush_excerpt_cameras)
     begun = Fit(steps=10, between=2.0).begun(state, bench)
     assert begun.results.sought is not None
-    found = [
-        [
-            (view.name, view.translation.tolist())
-            for view in Fit(steps=10, between=each)._looking_between(known, bench).views
-        ]
-        for known, each in ((begun, 2.0), (state, 2.0), (begun, 1.0), (state, 1.0))
-    ]
-    assert found[0] == found[1] != found[2] == found[3]
-    assert len(found[0]) > len(found[2]) > len(plush_excerpt_cameras)
+    sought = begun.results.sought.views.result()
+    # Those themselves; for another number of them others are looked for.
+    seen = Fit(steps=10, between=2.0)._looking_between(begun, bench).views
+    assert list(map(id, seen[own:])) == list(map(id, sought))
+    fewer = Fit(steps=10, between=1.0)._looking_between(begun, bench).views
+    assert 0 < len(fewer) - own < len(sought)
+    alone = Fit(steps=10, between=2.0)._looking_between(state, bench).views
+    assert [(v.name, v.translation.tolist()) for v in alone] == [(v.name, v.translation.tolist()) for v in seen]
+
+
+@pytest.mark.one_family
+def test_nobody_looks_on_after_a_stop(device, plush_excerpt, plush_excerpt_cameras):
+    begun = Fit(steps=10, between=100).begun(State.of(plush_excerpt, plush_excerpt_cameras), bench_of(device))
+    sought = begun.results.sought
+    assert sought is not None
+    sought.stop()
+    with pytest.raises(CancelledError):
+        sought.views.result(timeout=60)
 
 
 @pytest.mark.one_family

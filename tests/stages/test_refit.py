@@ -237,6 +237,33 @@ def test_steps_by_half_of_the_pixels_are_for_many_of_them_and_rounds_that_follow
     assert asked == wanted
 
 
+@pytest.mark.one_family
+@pytest.mark.parametrize(("splats", "wanted"), [(40, {1, 2}), (60, {1})])
+def test_the_last_gradient_is_by_half_of_many_pixels(device, splats, wanted, monkeypatch):
+    """3 views of 40 x 40 pixels are 120 for each of 40 splats, and 80 of 60."""
+    asked, ends, gradient, error = list[int](), list[int](), ColourMap.gradient, ColourMap.error
+
+    def noted(self, x, targets, result, blocks=None, constant=False, every=1):
+        assert constant or every == 1
+        asked.append(every)
+        return gradient(self, x, targets, result, blocks, constant, every)
+
+    def measured(self, x, targets, every=1):
+        ends.append(every)
+        return error(self, x, targets, every)
+
+    monkeypatch.setattr(ColourMap, "gradient", noted)
+    monkeypatch.setattr(ColourMap, "error", measured)
+    options, scene = RefitOptions(steps=2, gain=0, drop=1e-9), visible_scene(splats, 1)
+    with Case(device, scene, scene, ring_of_cameras(3, size=40)) as case:
+        refit_colours(
+            device, scene, case.cameras, case.targets, options, colour_grid=lambda effects: grid_of(splats)
+        )  # fmt: skip
+    assert set(asked) == wanted
+    assert max(wanted) in ends
+    assert max(ends) == max(wanted)
+
+
 def test_few_views_are_looked_at_whole(device):
     scene = visible_scene(40, 1)
     direction = np.random.default_rng(1).normal(size=scene.sh.shape)

@@ -1,4 +1,4 @@
-"""Compile the decoder's native path (potr_cl/native) in the checkout, without installing the package.
+"""Compile the native path (potr_cl/native) in the checkout, without installing the package.
 
     python -m tools.make.native [--sanitize] [-o FILE] [--compiler CC]
 

@@ -4,8 +4,9 @@
 
 Error is the bytes that a file takes more or fewer than one of its preset's defaults with the same PSNR on the test
 views, in percent, the mean of two qualities; what the defaults take there is read off their own curve. Time is that of
-an encode, without judging, in that of the defaults: by the clock on a GPU, by the processor's time on a CPU, which
-others may use. Some encodes with each preset come before those that are measured.
+an encode, without judging, in that of the defaults (of two, before and after the others, the faster one): by the clock
+on a GPU, by the processor's time on a CPU, which others may use. Some encodes with each preset come before those that
+are measured.
 """
 
 from __future__ import annotations
@@ -94,7 +95,7 @@ def study(results: Results, folder: Path, device: Device, knobs: Sequence[str], 
                 if KNOBS[name][0] == preset
                 for value in KNOBS[name][2]
             }
-            # Encodes become faster for long: those before and after the others count, the faster of the two.
+            # Encodes go on getting faster for a long time: of those before and after the others the faster one counts.
             usual = [min(curve[q]["seconds"], encode_once(q, {})["seconds"]) for q in qualities]
             table.add(f"all of {preset}", "default", 1.0, 0.0, float(np.mean(usual)))
             for (name, value), points in turned.items():

@@ -262,7 +262,7 @@ class Adam(Owner):
             np.ascontiguousarray(found[columns.means].T),
             np.ascontiguousarray(found[columns.log_scales].T),
             quaternions,
-            found[columns.opacity_logits].reshape(-1),
+            found[columns.opacity_logits][0].copy(),
             sh,
             scene.antialiased,
             scene.low_pass,

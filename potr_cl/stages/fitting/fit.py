@@ -192,7 +192,9 @@ def fit_scene(
 
         with (
             DeviceFit(device, ground, pictures) as descent,
-            Judges(device, descent.derivatives.rasterizer, cameras, pictures, held_out) as judges,
+            Judges(
+                device, descent.derivatives.rasterizer, cameras, pictures, held_out, options.memory is None
+            ) as judges,
         ):
 
             def run(options: FitOptions, following: Following, tried: bool = False) -> Fitted:
@@ -334,6 +336,7 @@ class Judges(Owner):
         rasterizer: of the scene, which may change between two calls.
         pictures: what they should show.
         held_out: the numbers of those that judge.
+        keeps: whether memory that their views are prepared in is kept from one time to the next.
     """
 
     def __init__(
@@ -343,7 +346,9 @@ class Judges(Owner):
         cameras: Sequence[Camera],
         pictures: TargetPictures,
         held_out: Sequence[int],
+        keeps: bool = True,
     ) -> None:
+        self._keeps = keeps
         self._device, self._rasterizer, self._cameras, self._pictures = device, rasterizer, cameras, pictures
         self._held_out = list(held_out)
         self._kernel = device.shared_kernel("fit/squared_error.cl", "squared_error")
@@ -361,8 +366,11 @@ class Judges(Owner):
         for numbers in self._together():
             cameras = [self._cameras[number] for number in numbers]
             self._images.reserve(sum(map(target_bytes, cameras)))
-            self._views, former = None, self._views
-            self._views = self._rasterizer.render_again(cameras, self._images.buffer, former=former)
+            if self._keeps:
+                self._views, former = None, self._views
+                self._views = self._rasterizer.render_again(cameras, self._images.buffer, former=former)
+            else:
+                self._rasterizer.render_into(cameras, self._images.buffer)
             first = 0
             for number in numbers:
                 self._kernel.bind(

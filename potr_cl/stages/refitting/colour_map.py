@@ -98,13 +98,16 @@ class ColourMap:
         return every * math.fsum(errors[number] for number in sorted(errors))
 
     def _sampled(self, every: int) -> int:
-        """By how many blocks of pixels a gradient looks at one: on GPUs the errors of others would count too."""
+        """Of how many blocks of pixels a gradient looks at one: on GPUs the errors of others would count too."""
         return every if self.own.count >= ENOUGH and self._coefficients.device.family == "cpu" else 1
 
     def error(self, x: Vector, targets: Targets, every: int = 1) -> float:
         """The squared error by W at x, as :meth:`gradient` returns it, which takes nearly twice as long.
 
         Colours that are cut at 0 at x are settled here too.
+
+        Args:
+            x, targets, every: as of :meth:`gradient`.
         """
         own, on_device, every = self.own, self._coefficients.on_device(x), self._sampled(every)
         if self._helpers is not None:

@@ -266,7 +266,11 @@ class ColourHelpers(Owner):
         self._drawn: DrawnRows | None = None
 
     def begin_gradient(self, x: cl.Buffer, blocks: range | None, constant: bool, every: int, back: bool = True) -> None:
-        """Have them begin with a gradient at x and the own blocks of some splats; or only with the error there."""
+        """Have them begin with a gradient at x and the own blocks of some splats; or only with the error there.
+
+        Args:
+            every: as of :meth:`ColourPart.gradient`.
+        """
         flags: Lent | Each | NDArray[np.uint32]
         flags = (
             self._exchange.send_flags() if self._drawn is None else Each(self._drawn.take_flags(self._exchange.flags()))

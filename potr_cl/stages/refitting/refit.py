@@ -46,7 +46,7 @@ _WORTH = 0.4
 _DENSE = 150
 #: With so many, half of them tell the constant coefficients that the last rounding leaves: with 121 and 145 that costs
 #: less than 0.1 % of the bytes at equal PSNR.
-_ENOUGH = 100
+_HALF_OF = 100
 #: What is nearer to 0 than this was 0 before it was made R, G and B.
 _ZERO = 1e-6
 #: Splats whose coefficients a thread looks at.
@@ -104,7 +104,7 @@ def refit_colours(
         each = sum(camera.width * camera.height for camera in cameras) / len(scene)
         way: _Rounding
         if colour_grid is not None:
-            half = each >= _ENOUGH
+            half = each >= _HALF_OF
             way = _OnGrid(refit, targets, options, colour_grid, lambda: report(steps + _OF_FIRST_ROUNDS), half)
         elif fix_ac is not None:
             way = _AsTheFileDoes(refit, targets, options, fix_ac)

@@ -141,9 +141,9 @@ class Solved:
 
 @dataclass(frozen=True)
 class _Problem:
-    """The map, the pictures to come near to, whether DC alone may change, and by how many blocks of pixels one counts.
+    """The map, the pictures to come near to, whether DC alone may change, and of how many blocks of pixels one counts.
 
-    That is for what is measured; steps have their own.
+    That is where errors are measured; steps have their own.
     """
 
     colour_map: ColourMap
