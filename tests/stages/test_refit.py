@@ -433,7 +433,7 @@ def test_nobody_waits_for_a_device_that_others_read_from(case, monkeypatch):
 
         busy = False
 
-        def begin_gradient(self, x, blocks, constant):
+        def begin_gradient(self, x, blocks, constant, every):
             self.busy = True
 
         def add(self, sums, blocks):
