@@ -75,3 +75,8 @@ def shared_device(kernels: str, number: int = 0) -> Device:
     So its programs are built once; who takes memory there gives it back.
     """
     return open_device(kernels)
+
+
+def another_like(device: Device, number: int) -> Device:
+    """One more of the same runtime and family: others round differently."""
+    return shared_device(f"{device.family}{'-pocl' if device.info == _POCL else ''}", number)

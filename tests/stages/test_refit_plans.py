@@ -28,7 +28,7 @@ from tests.cases.elsewhere import ElsewherePool
 from tests.cases.memory import taken_of
 from tests.cases.noting import noted
 from tests.cases.streets import street
-from tests.devices import shared_device
+from tests.devices import another_like
 from tests.reference.refit_cases import Case, Linearised, Pictures
 from tests.reference.rounding import grid_of
 from tests.reference.scenes import ring_of_cameras, visible_scene
@@ -111,7 +111,7 @@ def fitted(device, way: str, slices=None, memory=None, workers=1, elsewhere=Fals
     with case, ExitStack() as stack:
         help_from = None
         if workers > 1:
-            devices = [device, *(shared_device(device.family, number) for number in range(1, workers))]
+            devices = [device, *(another_like(device, number) for number in range(1, workers))]
             help_from = HelpFrom(stack.enter_context((ElsewherePool if elsewhere else HostPool)(devices)), other)
         return refit_colours(
             device, case.scene, case.cameras, case.targets, options, active, case.background,

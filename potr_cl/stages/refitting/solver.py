@@ -34,6 +34,8 @@ _CONVERGED = 1e-14
 #: Steps that take off more than there is, by this part of the objective at the start, go by rounding alone: so it ends
 #: where equations say nothing of some coefficients, and nobody stops it in time.
 _IMPOSSIBLE = 1e-3
+#: So do steps whose residual's square has shrunk by the first and grown again to the second.
+_SMALL, _LARGE = 1e-6, 1e-3
 
 
 @dataclass(frozen=True)
@@ -89,13 +91,16 @@ class ConjugateGradients:
         """
         vectors, direction, product, preconditioned = self._vectors, self.direction, self.product, self.preconditioned
         vectors.zero(direction)
-        slope, least, lost = 0.0, 0.0, -_IMPOSSIBLE * objective
+        slope, first, small, lost = 0.0, 0.0, False, -_IMPOSSIBLE * objective
         for step in range(steps):
             system.precondition(residual, preconditioned)
             new_slope = vectors.dot(preconditioned, residual)
-            least = _CONVERGED * new_slope if step == 0 else least
-            if not (new_slope > least and math.isfinite(new_slope)):
+            first = new_slope if step == 0 else first
+            if not (new_slope > _CONVERGED * first and math.isfinite(new_slope)):
                 return step
+            small = small or new_slope < _SMALL * first
+            if small and new_slope > _LARGE * first:
+                return -1
             vectors.combine(new_slope / slope if step else 0.0, direction, 1.0, preconditioned)
             slope = new_slope
             system.product(direction, product)
