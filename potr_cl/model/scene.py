@@ -221,12 +221,12 @@ class Scene:
             return self.of_arrays([*(each[numbers] for each in self.arrays[:-1]), sh])
         # Much quicker for whole rows than indexing.
         fast = numbers.dtype.kind in "iu" and self.sh.flags.c_contiguous
-        if fast and len(numbers) >= _LARGE and numbers.min() >= 0 and numbers.max() < len(self):
-            return self._rows(numbers.astype(np.intp, copy=False))
-        if fast:
-            rows = numbers.astype(np.intp, copy=False)
-            return self.of_arrays([each.take(rows, axis=0) for each in self.arrays])
-        return self.of_arrays([each[index] for each in self.arrays])
+        if not fast:
+            return self.of_arrays([each[index] for each in self.arrays])
+        rows = numbers.astype(np.intp, copy=False)
+        if len(rows) >= _LARGE and rows.min() >= 0 and rows.max() < len(self):
+            return self._rows(rows)
+        return self.of_arrays([each.take(rows, axis=0) for each in self.arrays])
 
     def _rows(self, numbers: NDArray[np.intp]) -> Scene:
         """:meth:`subset` of many splats: the memory that is new takes longer than the copy, and threads share it."""

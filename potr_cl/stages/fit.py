@@ -90,10 +90,10 @@ class Sought:
         each: so many for each of these.
     """
 
-    def __init__(self, state: State, given: Sequence[Camera], each: float) -> None:
+    def __init__(self, state: State, each: float) -> None:
         self.each, self._stopped = each, Event()
         seek = partial(views_between, known=state.results.known, run=self._until_stopped)
-        self.views: Future[list[Camera]] = in_background(seek, state.source, given, each)
+        self.views: Future[list[Camera]] = in_background(seek, state.source, state.given, each)
 
     def stop(self) -> None:
         """Look no further: nobody wants them any more."""
@@ -217,10 +217,8 @@ class Fit(Stage):
         return price * min(max(further, 1.0), _MOST_FURTHER)
 
     def begun(self, state: State, bench: Workbench) -> State:
-        given, each = state.views[: len(state.views) - state.added], self._each(state, bench)
-        if len(given) < 2 or not each:
-            return state
-        return state.with_results(sought=Sought(state, given, each))
+        each = self._each(state, bench)
+        return state.with_results(sought=Sought(state, each)) if len(state.given) > 1 and each else state
 
     def run(self, state: State, bench: Workbench) -> State:
         """Remove splats, fit, and leave a :class:`potr_cl.stages.fitting.fitted.Fitted` in ``results``.
@@ -261,7 +259,7 @@ class Fit(Stage):
 
     def _looking_between(self, state: State, bench: Workbench) -> State:
         """The state with the views that the fit looks at."""
-        given = state.views[: len(state.views) - state.added]
+        given = state.given
         sought, each = state.results.sought, self._each(state, bench)
         if not each:
             return state
@@ -273,9 +271,8 @@ class Fit(Stage):
 
     def _each(self, state: State, bench: Workbench) -> float:
         """How many views between it looks at for each given one, where the state has fewer; else 0."""
-        given = state.views[: len(state.views) - state.added]
         each = self.views_on(bench.opened.family)
-        return 0.0 if is_virtual(given) or each * len(given) <= state.added else each
+        return 0.0 if is_virtual(state.given) or each * len(state.given) <= state.added else each
 
     def _cycles(self, state: State, bench: Workbench, sight: Sight, asked: SupportsBool) -> State:
         """Remove splats and fit by turns, each time up to a higher threshold, and keep what costs least."""
@@ -350,7 +347,7 @@ class Fit(Stage):
     def _to_photographs(self, state: State, bench: Workbench, asked: SupportsBool) -> State:
         """Go on with photographs as the targets, if others that are held out agree; and so do later stages."""
         assert bench.photographs is not None
-        given = state.views[: len(state.views) - state.added]
+        given = state.given
         photographs = GroundTruth(bench.photographs, given, bench.background)
         views, family = photographs.of(given), bench.opened.family
         options = dataclasses.replace(

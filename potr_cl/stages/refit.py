@@ -175,7 +175,7 @@ class Refit(Stage):
             # With photographs nobody helps: these lie where the master reads them.
             fits: list[tuple[Sequence[Camera], Targets, HelpFrom | None]] = [(state.views, pictures, help_from)]
             if folder is not None:
-                given = state.views[: len(state.views) - state.added]
+                given = state.given
                 photographs = GroundTruth(folder, given, bench.background)
                 fit_to, judging = hold_out(photographs.of(given))
                 # Nobody photographed added views. Renders of them beside photographs would ask for colours that leap

@@ -134,6 +134,11 @@ class State:
     visibility: Visibility | None = None
 
     @property
+    def given(self) -> tuple[Camera, ...]:
+        """The views that no stage has added."""
+        return self.views[: len(self.views) - self.added]
+
+    @property
     def goal(self) -> Scene:
         """Whose pictures colours are re-fitted to: the uncompressed scene's, or those of what is nearer to truth."""
         return self.source if self.truth is None else self.truth

@@ -152,7 +152,7 @@ def find_unseen(
         surely_seen: finds quickly which splats some views see, (N,) :class:`potr_cl.views.reached.Seen`; those
             that it leaves undecided are looked at here.
     """
-    views, scene = state.views[: len(state.views) - state.added], state.scene
+    views, scene = state.given, state.scene
     if surely_seen is None:
         unseen = unseen_splats(scene, views, groups, run)
     else:
