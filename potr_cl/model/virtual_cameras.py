@@ -19,9 +19,9 @@ F64 = NDArray[np.float64]
 
 #: Training views that are placed unless told otherwise, and pixels along a side of each, on a GPU and on a CPU: so many
 #: up to so many splats, and more with the root of the splats. Colours want many directions, so the views are many.
-_VIEWS, _VIEWS_ON_CPU, MOST = 240, 200, 1600
+_VIEWS, _VIEWS_ON_CPU, MOST = 240, 150, 1600
 _SIZE, _SIZE_ON_CPU, _SPLATS = 600, 480, 300_000
-#: An eighth as many judge, but no more than so many.
+#: A sixth as many judge, but no more than so many.
 _MOST_TESTS = 32
 #: Degrees from side to side, as photographs have.
 FIELD = 50.0
@@ -38,7 +38,7 @@ _AROUND = 0.35
 
 @dataclass(frozen=True)
 class Plan:
-    """:func:`potr_cl.placement.virtual.place_cameras` will place: known before anything is computed.
+    """What :func:`potr_cl.placement.virtual.place_cameras` places.
 
     Attributes:
         training: views that an encoder looks at.
@@ -50,13 +50,10 @@ class Plan:
     test: int
     size: int
 
-    @property
-    def pixels(self) -> int:
-        """Of all training views together: what time and memory of an encode grow with."""
-        return self.training * self.size**2
-
-    def __str__(self) -> str:
-        return f"{self.training} views of {self.size} x {self.size} pixels"
+    def sharper(self, times: float) -> Plan:
+        """Fewer views in larger pictures: so many times as wide, but no wider than on a GPU."""
+        size = max(min(round(self.size * times), _SIZE), self.size)
+        return Plan(round(self.training * self.size / size), self.test, size)
 
 
 def plan(splats: int, count: int | None = None, size: int | None = None, slow: bool = False) -> Plan:
@@ -79,7 +76,7 @@ def plan(splats: int, count: int | None = None, size: int | None = None, slow: b
             f"{count} virtual views of {size} x {size} pixels: both must be at least 1, the views at most "
             f"{MOST_ASKED}, a side at most {WIDEST_ASKED}"
         )
-    return Plan(count, min(count // 8, _MOST_TESTS), size)
+    return Plan(count, min(count // 6, _MOST_TESTS), size)
 
 
 def is_virtual(cameras: Sequence[Camera]) -> bool:

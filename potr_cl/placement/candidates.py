@@ -7,7 +7,6 @@ in matter. How far from the point follows from the size of the splats there: nea
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -104,13 +103,13 @@ class ViewMemory:
 
 #: Pixels that the larger standard deviation of a splat of median size has in photographs, as a rule.
 USUAL = 3.0
-#: Where colours tell from how far photographs were taken: their width, pixels, and what is asked for at most and least.
-_PHOTOGRAPH, _COARSEST, _FINEST = 1000, 2.0, 4.5
+#: What is asked for at most and least where colours tell from how far photographs were taken.
+_COARSEST, _FINEST = 2.0, 4.5
 #: The most that small pictures are asked for, as a part of the focal length: with more, each would show too little.
 _OF_PICTURE = 0.0076
-#: The distances that are tried, in those at which splats are resolved; rays; and how well, as a part of the best, a
-#: distance is remembered at which photographs were taken.
-_DISTANCES, _TRIED, _AS_WELL = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0), 600, 0.95
+#: The distances that are tried, in those at which splats are resolved; rays for each; how well, as a part of the best,
+#: the farthest is remembered at which photographs were taken; and how far the median of these is, in that.
+_DISTANCES, _TRIED, _AS_WELL, _MEDIAN = tuple(2.0 ** (step / 4) for step in range(-4, 9)), 600, 0.95, 0.85
 #: The part of the targets that is spread over area.
 _OVER_AREA = 0.25
 #: Directions from which seeing a point counts as new.
@@ -207,7 +206,7 @@ def candidates_of(
         space, targets: of the scene.
         focal: of the views, in pixels, where no lens has to be longer.
         half_view: tan of half the field of view.
-        pixels, memory: as of :func:`resolution`.
+        pixels, memory: as of :class:`Resolution`.
         first: which places of a sequence without end are tried.
     """
     places, seeds, tangents = _places(space, targets, count, focal / pixels, half_view, first)
@@ -305,13 +304,26 @@ def _dense(place: NDArray[np.int64], target: NDArray[np.int64], worth: F32, plac
     return found
 
 
-def resolution(
-    device: Device, scene: Scene, space: Space, targets: SurfacePoints, focal: float
-) -> tuple[float, ViewMemory | None]:
-    """How many pixels the larger standard deviation of a splat of median size should have; and what colours remember.
+@dataclass(frozen=True)
+class Resolution:
+    """From how near to look at a scene.
 
-    Where colours remember from how far photographs were taken, as many as these showed, if they were of a usual size;
-    else as many as photographs usually show.
+    Attributes:
+        pixels: that the larger standard deviation of a splat of median size should have.
+        limited: whether colours tell that photographs were not taken from any farther.
+        memory: what colours remember; None: nothing.
+    """
+
+    pixels: float
+    limited: bool
+    memory: ViewMemory | None
+
+
+def resolution(device: Device, scene: Scene, space: Space, targets: SurfacePoints, focal: float) -> Resolution:
+    """From as near as photographs were taken, where colours remember it; else as near as they usually are.
+
+    Args:
+        focal: of the views, in pixels.
     """
     spread = low_discrepancy(_TRIED, 3)
     seeds = (spread[:, 0] * len(targets.targets)).astype(np.int64)
@@ -326,11 +338,11 @@ def resolution(
     every = np.concatenate(rings)
     asked = slice(None, None, targets.asked)
     if not len(every):
-        return USUAL, None
+        return Resolution(USUAL, False, None)
     compared = every[:: max(len(every) // _COMPARED, 1)]
     memory = ViewMemory.of(device, space, targets.targets[asked], scene.sh[targets.rows[asked]], compared)
     if memory is None or scene.sh_degree < 3:  # too smooth to tell distances
-        return USUAL, memory
+        return Resolution(USUAL, False, memory)
     place, target, worth = shown_from(
         device,
         space,
@@ -345,8 +357,7 @@ def resolution(
     shown[place, target] = worth
     known = np.split(memory.of_places(every, shown), np.cumsum([len(ring) for ring in rings])[:-1])
     usual = np.array([np.quantile(ring, 0.75) if len(ring) else 0.0 for ring in known])
-    good = np.flatnonzero(usual >= _AS_WELL * usual.max())
-    farthest = _DISTANCES[good[-1]]
-    photographs = _PHOTOGRAPH / (2 * math.tan(math.radians(32.5)))
+    farthest = int(np.flatnonzero(usual >= _AS_WELL * usual.max())[-1])
     finest = max(min(_FINEST, _OF_PICTURE * focal), USUAL)
-    return float(np.clip(USUAL * photographs / focal / farthest, _COARSEST, finest)), memory
+    pixels = float(np.clip(USUAL / (_MEDIAN * _DISTANCES[farthest]), _COARSEST, finest))
+    return Resolution(pixels, farthest < len(_DISTANCES) - 1, memory)

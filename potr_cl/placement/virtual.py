@@ -85,6 +85,9 @@ def drawn(candidates: Candidates, count: int) -> list[int]:
 _TARGETS, _LEAST_TARGETS, _PLACES, _JUDGED = 32, 2000, 6, 16
 #: So many at most, for the memory that all pairs of them take.
 _MOST_TARGETS, _MOST_PLACES, _MOST_JUDGED = 20_000, 6000, 1024
+#: Pixels that the larger standard deviation of a splat of median size needs: where it has fewer from as far as
+#: photographs were taken, larger pictures of fewer views come nearer to these.
+_SHARP = 3.7
 #: Views that tell where a scene was looked at from, and so which way is up in it.
 _STANDPOINTS = 32
 #: Where in the sequence of places those begin that judge: far behind those that are tried to place views.
@@ -98,9 +101,9 @@ def place_cameras(
 
     Args:
         scene: clean, at least one splat.
-        count: training views; by default 200 to 1600, the more the more splats there are. An eighth as many test views,
+        count: training views; by default 120 to 1600, the more the more splats there are. An eighth as many test views,
             32 at most, come on top (:func:`judging_views`).
-        size: of their square images, in pixels; by default 480 on a CPU, 600 on a GPU.
+        size: of their square images, in pixels; by default 480 to 600 on a CPU, 600 on a GPU.
         field: of view from side to side, in degrees; less where the renderer's near plane would cut a small scene off.
         device: finds what is seen from where; by default the one that should be fastest.
 
@@ -166,8 +169,12 @@ class Ground:
         space = Space.of(scene)
         wanted = min(_TARGETS * plan(len(scene)).training, max(len(scene) // 10, _LEAST_TARGETS), _MOST_TARGETS)
         targets = SurfacePoints.of(scene, space, wanted)
-        pixels, memory = resolution(opened, scene, space, targets, planned.size / 2 / half_view)
-        return Ground(scene, opened, planned, space, targets, half_view, pixels, memory)
+        found = resolution(opened, scene, space, targets, planned.size / 2 / half_view)
+        pixels = found.pixels
+        if count is None and size is None and found.limited and pixels < _SHARP:
+            usual, planned = planned, planned.sharper(_SHARP / pixels)
+            pixels *= planned.size / usual.size
+        return Ground(scene, opened, planned, space, targets, half_view, pixels, found.memory)
 
     @cached_property
     def up(self) -> F64:

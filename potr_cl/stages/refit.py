@@ -15,6 +15,7 @@ from potr_cl.errors import UsageError
 from potr_cl.host.threads import in_background, thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import Family
 from potr_cl.outputs.output import ColourGrid, Rounded
@@ -33,6 +34,8 @@ from potr_cl.views.targets import HostTargets, PhotographTargets, PicturesAhead,
 
 #: The most steps that "auto" stands for: on a GPU further ones take little time (docs/benchmarks/time_error.md).
 STEPS: dict[Family, int] = {"cpu": 6, "gpu": 12}
+#: The prior where cameras were placed: people stand elsewhere, so colours should not follow these views too closely.
+_PLACED_PRIOR = 0.3
 #: A scene that takes more than this part of the memory that is given makes room for the re-fit.
 _LARGE = 1 / 16
 #: Threads that make of rounded geometry what a decoder sees; with 32 it takes half as long again.
@@ -58,7 +61,8 @@ class Refit(Stage):
         at: parts of the pruning iterations after which colours are re-fitted too, so that later iterations see colours
             that make up for the splats that went.
         at_steps: steps of each of these.
-        prior: see :class:`potr_cl.stages.refitting.refit_options.RefitOptions`.
+        prior: see :class:`potr_cl.stages.refitting.refit_options.RefitOptions`; None: the usual one, or a larger one
+            where cameras were placed.
         ground_truth: folder of the views' photographs, named after the views. The colours are then fitted to the
             photographs instead of the uncompressed scene's pictures, if photographs that are held out agree that this
             is better; but not if a fit of all parameters has come near to them before.
@@ -102,7 +106,7 @@ class Refit(Stage):
         ),
     )
     at_steps: int = option(3)
-    prior: float = option(RefitOptions.prior)
+    prior: float | None = option(None)
     ground_truth: Path | None = option(
         None,
         Flag(
@@ -121,7 +125,7 @@ class Refit(Stage):
                 raise UsageError(f"--refit-at is {part:g}, it must lie between 0 and 1")
         if isinstance(self.steps, str) and self.steps != "auto":
             raise UsageError(f"the re-fit's steps are '{self.steps}': give a number, or auto")
-        _ = RefitOptions(steps=self.steps_on("gpu"), prior=self.prior), RefitOptions(steps=self.at_steps)
+        _ = RefitOptions(steps=self.steps_on("gpu"), prior=self._prior([])), RefitOptions(steps=self.at_steps)
 
     @classmethod
     def from_flags(cls, given: dict[str, Any]) -> dict[str, Any]:
@@ -134,6 +138,11 @@ class Refit(Stage):
     def steps_on(self, family: Family) -> int:
         """The most steps on a device of a family."""
         return STEPS[family] if self.steps == "auto" else self.steps
+
+    def _prior(self, views: Sequence[Camera]) -> float:
+        if self.prior is not None:
+            return self.prior
+        return _PLACED_PRIOR if is_virtual(views) else RefitOptions.prior
 
     def interludes(self, iterations: int) -> Sequence[Interlude]:
         times = sorted({max(round(part * iterations), 1) for part in self.at})
@@ -150,9 +159,8 @@ class Refit(Stage):
         active = active_coefficients(state.scene.sh, parameters.sf_sh) if compacted else None
         if state.results.chosen == parameters:
             active = chosen_coefficients(state.scene.sh)
-        options = RefitOptions(
-            steps=self.steps_on(bench.opened.family), drop=parameters.drop, memory=bench.memory, prior=self.prior
-        )
+        steps, prior = self.steps_on(bench.opened.family), self._prior(state.views)
+        options = RefitOptions(steps=steps, drop=parameters.drop, memory=bench.memory, prior=prior)
         on_grid = bench.output.on_grid(bench.request(state))
         # What has been fitted to photographs already is what the colours should show again once all else is rounded.
         folder = self.ground_truth if state.truth is None else None

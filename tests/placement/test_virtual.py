@@ -12,7 +12,7 @@ from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model.camera import camera_centres, test_views, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.model.spherical_harmonics import ac_basis
-from potr_cl.model.virtual_cameras import MOST, describe, is_virtual, plan, standpoints
+from potr_cl.model.virtual_cameras import MOST, Plan, describe, is_virtual, plan, standpoints
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.placement.upright import guess_up
@@ -90,13 +90,13 @@ def test_an_object_is_seen_from_all_sides(around_ball):
 
 
 def test_names_and_splits(around_ball):
-    assert (len(train_views(around_ball)), len(test_views(around_ball))) == (128, 16)
-    assert len({c.name for c in around_ball}) == 144
+    assert (len(train_views(around_ball)), len(test_views(around_ball))) == (128, 21)
+    assert len({c.name for c in around_ball}) == 149
     assert {(c.width, c.height) for c in around_ball} == {(480, 480)}, "on a CPU"
     assert is_virtual(around_ball)
     assert not is_virtual([])
     assert not is_virtual([dataclasses.replace(around_ball[0], name="photo")])
-    assert describe(around_ball).startswith("128 virtual views and 16 to judge by, ")
+    assert describe(around_ball).startswith("128 virtual views and 21 to judge by, ")
     few = place_cameras(FEW, 5, 64)
     assert [c.split for c in few] == ["train"] * 5
     assert few[0].width == 64
@@ -118,8 +118,10 @@ def test_the_median_splat_is_resolved(around_ball):
 def test_a_plan_says_beforehand_what_is_placed(around_ball):
     planned = plan(len(BALL), 128, slow=True)
     assert (planned.training, planned.test) == (len(train_views(around_ball)), len(test_views(around_ball)))
-    assert planned.pixels == sum(c.width * c.height for c in train_views(around_ball))
-    assert str(planned) == f"{planned.training} views of {planned.size} x {planned.size} pixels"
+    assert {planned.size} == {c.width for c in around_ball}
+    assert plan(len(BALL), slow=True).sharper(1.1) == Plan(136, 25, 528), "as many pixels along all sides together"
+    assert plan(len(BALL), slow=True).sharper(3.0).size == plan(len(BALL)).size
+    assert plan(len(BALL)).sharper(3.0) == plan(len(BALL))
 
 
 def test_large_scenes_get_more_views_and_cpus_fewer_and_smaller_ones():
@@ -129,7 +131,9 @@ def test_large_scenes_get_more_views_and_cpus_fewer_and_smaller_ones():
     assert len(set(sizes)) == 1
     assert counts[0] == counts[1] < counts[2] < counts[3] <= counts[4] == MOST
     for splats in (1, 1_000_000):
-        assert plan(splats, slow=True).pixels < plan(splats).pixels
+        slow, fast = plan(splats, slow=True), plan(splats)
+        assert slow.training < fast.training
+        assert slow.size < fast.size
 
 
 @pytest.mark.slow
@@ -137,7 +141,7 @@ def test_judges_stand_elsewhere_and_fewer_are_the_first_of_more(around_ball):
     tests = test_views(around_ball)
     apart = np.linalg.norm(camera_centres(tests)[:, None] - camera_centres(train_views(around_ball)), axis=2)
     assert apart.min() > 0
-    alone = judging_views(BALL, 16)
+    alone = judging_views(BALL, 21)
     assert np.array_equal(camera_centres(alone), camera_centres(tests))
     assert np.array_equal(camera_centres(judging_views(BALL, 5, 64)), camera_centres(tests)[:5]), "whatever their size"
     # Near and far.
@@ -149,7 +153,7 @@ def test_standpoints(around_ball):
     given = [dataclasses.replace(c, name="photo") for c in around_ball]
     assert np.array_equal(standpoints(given, BALL.means), camera_centres(given))
     places = standpoints(around_ball, BALL.means)
-    assert places.shape == (144, 4, 3)
+    assert places.shape == (149, 4, 3)
     assert np.allclose(places.mean(axis=1), camera_centres(around_ball))
     away = np.linalg.norm(places - camera_centres(around_ball)[:, None], axis=2)
     assert np.allclose(away, away[:, :1])
@@ -225,6 +229,22 @@ def test_colours_tell_a_room_from_an_object():
     assert len(inside_room(views)) < 0.0625 * len(views)
 
 
+@pytest.mark.slow
+def test_pictures_are_larger_where_splats_are_small_from_where_photographs_were_taken():
+    rng = np.random.default_rng(4)
+    fine = dataclasses.replace(ROOM, log_scales=ROOM.log_scales + np.float32(np.log(0.1)))
+    from_inside = trained(fine, -WALLS, rng.uniform(-0.6, 0.6, (60, 3)) * INSIDE_ROOM)
+    usual, views = plan(len(fine), slow=True), place_cameras(from_inside)
+    (size,) = {camera.width for camera in views}
+    assert usual.size < size <= plan(len(fine)).size
+    assert len(train_views(views)) == round(usual.training * usual.size / size)
+    assert len(test_views(views)) == usual.test
+    # Who asks for a number of views, or for a size, gets it; and who has no colours that tell gets the usual ones.
+    assert {camera.width for camera in place_cameras(from_inside, 20)} == {usual.size}
+    assert {camera.width for camera in place_cameras(fine, size=100)} == {100}
+    assert len(train_views(place_cameras(fine))) == usual.training
+
+
 def scaled(scene: Scene, factor: float) -> Scene:
     return dataclasses.replace(
         scene, means=(scene.means * np.float32(factor)), log_scales=scene.log_scales + np.float32(np.log(factor))
@@ -287,6 +307,19 @@ def test_encode_places_them_itself(monkeypatch):
     given = encode(scene, place_cameras(scene, 6, 64), options)
     assert encode(scene, None, options).data == given.data
     assert given.pruned is not None
+
+
+@pytest.mark.slow
+def test_colours_are_held_more_where_cameras_were_placed():
+    scene = random_scene(150, 2)
+    own = place_cameras(scene, 6, 64)
+    photographs = [dataclasses.replace(camera, name=f"photo_{number}") for number, camera in enumerate(own)]
+
+    def encoded(cameras, **refit):
+        return encode(scene, cameras, EncodeOptions.for_preset("best", prune={"iterations": 2}, refit=refit)).data
+
+    assert encoded(own) == encoded(own, prior=0.3) != encoded(own, prior=0.1)
+    assert encoded(photographs) == encoded(photographs, prior=0.1)
 
 
 def assert_up(scene: Scene, cameras, up) -> None:
