@@ -98,7 +98,7 @@ def add_cameras_options(p: argparse.ArgumentParser) -> None:
         "--virtual-views",
         type=whole_number,
         metavar="N",
-        help="number of virtual views without --cameras (default: 200 to 1600, more for larger scenes)",
+        help="number of virtual views without --cameras (default: 120 to 1600, more for larger scenes)",
     )
     p.add_argument(
         "--cameras-anyway",

@@ -18,8 +18,9 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 #: Training views that are placed unless told otherwise, and pixels along a side of each, on a GPU and on a CPU: so many
-#: up to so many splats, and more with the root of the splats. Colours want many directions, so the views are many.
-_VIEWS, _VIEWS_ON_CPU, MOST = 240, 150, 1600
+#: up to so many splats, and more with the root of the splats. Colours want many directions, so the views are many; and
+#: each room wants views of its own.
+_VIEWS, _VIEWS_ON_CPU, _IN_ROOMS_ON_CPU, MOST = 240, 150, 200, 1600
 _SIZE, _SIZE_ON_CPU, _SPLATS = 600, 480, 300_000
 #: A sixth as many judge, but no more than so many.
 _MOST_TESTS = 32
@@ -42,18 +43,21 @@ class Plan:
 
     Attributes:
         training: views that an encoder looks at.
+        in_rooms: the same where a scene has rooms.
         test: views besides that only judge.
         size: width and height of each, in pixels.
     """
 
     training: int
+    in_rooms: int
     test: int
     size: int
 
     def sharper(self, times: float) -> Plan:
-        """Fewer views in larger pictures: so many times as wide, but no wider than on a GPU."""
+        """Pictures so many times as wide, but no wider than on a GPU, and fewer in proportion."""
         size = max(min(round(self.size * times), _SIZE), self.size)
-        return Plan(round(self.training * self.size / size), self.test, size)
+        training, in_rooms = (round(each * self.size / size) for each in (self.training, self.in_rooms))
+        return Plan(training, in_rooms, self.test, size)
 
 
 def plan(splats: int, count: int | None = None, size: int | None = None, slow: bool = False) -> Plan:
@@ -67,8 +71,11 @@ def plan(splats: int, count: int | None = None, size: int | None = None, slow: b
     Raises:
         UsageError: ``count`` or ``size`` below 1, or above what can be placed and rendered.
     """
-    if count is None:
-        count = min(round((_VIEWS_ON_CPU if slow else _VIEWS) * math.sqrt(max(splats / _SPLATS, 1.0))), MOST)
+    in_rooms = count
+    if count is None or in_rooms is None:
+        more = math.sqrt(max(splats / _SPLATS, 1.0))
+        usual = (_VIEWS_ON_CPU, _IN_ROOMS_ON_CPU) if slow else (_VIEWS, _VIEWS)
+        count, in_rooms = (min(round(each * more), MOST) for each in usual)
     if size is None:
         size = _SIZE_ON_CPU if slow else _SIZE
     if not (1 <= count <= MOST_ASKED and 1 <= size <= WIDEST_ASKED):
@@ -76,7 +83,7 @@ def plan(splats: int, count: int | None = None, size: int | None = None, slow: b
             f"{count} virtual views of {size} x {size} pixels: both must be at least 1, the views at most "
             f"{MOST_ASKED}, a side at most {WIDEST_ASKED}"
         )
-    return Plan(count, min(count // 6, _MOST_TESTS), size)
+    return Plan(count, in_rooms, min(count // 6, _MOST_TESTS), size)
 
 
 def is_virtual(cameras: Sequence[Camera]) -> bool:

@@ -130,6 +130,8 @@ _UNTRAINED, _TRAINED, _COMPARED, _ASKED = 0.6, 0.8, 300, 1500
 
 #: Directions that are looked in, and the part of them in which there must be matter, where a place counts as enclosed.
 _AROUND, _ENCLOSED = on_sphere(low_discrepancy(24, 2)), 0.8
+#: The part of the places that are enclosed where a scene has rooms.
+_ROOMS = 0.15
 _BIN_DIRECTIONS = on_sphere(low_discrepancy(BINS, 2)).astype(np.float32)
 
 
@@ -186,6 +188,12 @@ class Candidates:
     worth: F32
     bins: NDArray[np.int64]
     enclosed: NDArray[np.bool_]
+
+    @property
+    def has_rooms(self) -> bool:
+        """Whether a good part of the places is enclosed."""
+        places = len(self.enclosed) // AIMS
+        return bool(np.count_nonzero(self.enclosed[:places]) >= _ROOMS * places)
 
 
 def candidates_of(

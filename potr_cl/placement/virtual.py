@@ -23,8 +23,8 @@ from potr_cl.placement.upright import guess_up, level_rotation, levelled
 _ENOUGH = 4.0
 #: What a view counts from inside a room: it shows less than one from outside, and people stand there.
 _INDOORS = 1.5
-#: Where this part of the places is enclosed, this part of the views judge from there.
-_ROOMS, _JUDGE_ROOMS = 0.15, 0.75
+#: Where there are rooms, this part of the views judge from there.
+_JUDGE_ROOMS = 0.75
 #: A view that shows less than this part of what the median one shows judges nothing.
 _PLAIN = 0.5
 
@@ -65,7 +65,7 @@ def drawn(candidates: Candidates, count: int) -> list[int]:
     seen = worth[worth > 0]
     plain = (worth >= _PLAIN * np.median(seen) if len(seen) else np.ones(len(worth), bool)).reshape(AIMS, -1)
     places = plain.shape[1]
-    rooms = bool(np.count_nonzero(candidates.enclosed[:places]) >= _ROOMS * places)
+    rooms = candidates.has_rooms
     waiting: dict[bool, deque[int]] = {True: deque(), False: deque()}
     for place in range(places):
         good = [aim for aim in ((place + turn) % AIMS for turn in range(AIMS)) if plain[aim, place]]
@@ -171,9 +171,10 @@ class Ground:
         targets = SurfacePoints.of(scene, space, wanted)
         found = resolution(opened, scene, space, targets, planned.size / 2 / half_view)
         pixels = found.pixels
-        if count is None and size is None and found.limited and pixels < _SHARP:
-            usual, planned = planned, planned.sharper(_SHARP / pixels)
-            pixels *= planned.size / usual.size
+        if size is None and found.limited and pixels < _SHARP:
+            sharper = planned.sharper(_SHARP / pixels)
+            pixels *= sharper.size / planned.size
+            planned = sharper if count is None else replace(planned, size=sharper.size)
         return Ground(scene, opened, planned, space, targets, half_view, pixels, found.memory)
 
     @cached_property
@@ -183,8 +184,9 @@ class Ground:
 
     def training(self) -> list[Camera]:
         """The training views that are planned."""
-        count = self.planned.training
+        count = self.planned.in_rooms
         candidates = self._candidates(max(min(_PLACES * count, _MOST_PLACES), 2 * count), 0)
+        count = count if candidates.has_rooms else self.planned.training
         views = [self._camera(candidates, view, "train") for view in pick(candidates, count)]
         return [replace(levelled(view, self.up), name=f"{PREFIX}{number:03d}") for number, view in enumerate(views)]
 

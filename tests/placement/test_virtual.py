@@ -119,7 +119,7 @@ def test_a_plan_says_beforehand_what_is_placed(around_ball):
     planned = plan(len(BALL), 128, slow=True)
     assert (planned.training, planned.test) == (len(train_views(around_ball)), len(test_views(around_ball)))
     assert {planned.size} == {c.width for c in around_ball}
-    assert plan(len(BALL), slow=True).sharper(1.1) == Plan(136, 25, 528), "as many pixels along all sides together"
+    assert plan(len(BALL), slow=True).sharper(1.1) == Plan(136, 182, 25, 528), "as many pixels along all sides together"
     assert plan(len(BALL), slow=True).sharper(3.0).size == plan(len(BALL)).size
     assert plan(len(BALL)).sharper(3.0) == plan(len(BALL))
 
@@ -132,7 +132,7 @@ def test_large_scenes_get_more_views_and_cpus_fewer_and_smaller_ones():
     assert counts[0] == counts[1] < counts[2] < counts[3] <= counts[4] == MOST
     for splats in (1, 1_000_000):
         slow, fast = plan(splats, slow=True), plan(splats)
-        assert slow.training < fast.training
+        assert slow.training < slow.in_rooms < fast.training == fast.in_rooms
         assert slow.size < fast.size
 
 
@@ -239,10 +239,15 @@ def test_pictures_are_larger_where_splats_are_small_from_where_photographs_were_
     assert usual.size < size <= plan(len(fine)).size
     assert len(train_views(views)) == round(usual.training * usual.size / size)
     assert len(test_views(views)) == usual.test
-    # Who asks for a number of views, or for a size, gets it; and who has no colours that tell gets the usual ones.
-    assert {camera.width for camera in place_cameras(from_inside, 20)} == {usual.size}
-    assert {camera.width for camera in place_cameras(fine, size=100)} == {100}
-    assert len(train_views(place_cameras(fine))) == usual.training
+    # Who asks for a number of views gets it, and is judged from the same places; so does who asks for a size.
+    few = place_cameras(from_inside, 20)
+    assert len(train_views(few)) == 20
+    assert np.array_equal(camera_centres(test_views(few)), camera_centres(test_views(views))[: len(test_views(few))])
+    assert {camera.width for camera in place_cameras(from_inside, size=100)} == {100}
+    # Where colours tell nothing, pictures are the usual ones; where there are walls that hide, more of them.
+    for scene, count in ((fine, usual.training), (ROOM, usual.in_rooms)):
+        cameras = train_views(place_cameras(scene))
+        assert (len(cameras), cameras[0].width) == (count, usual.size)
 
 
 def scaled(scene: Scene, factor: float) -> Scene:
