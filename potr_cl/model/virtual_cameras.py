@@ -22,7 +22,7 @@ F64 = NDArray[np.float64]
 #: each room wants views of its own.
 _VIEWS, _VIEWS_ON_CPU, _IN_ROOMS_ON_CPU, MOST = 240, 150, 200, 1600
 _SIZE, _SIZE_ON_CPU, _SPLATS = 600, 480, 300_000
-#: A sixth as many judge, but no more than so many.
+#: An eighth as many judge as would in rooms, but no more than so many.
 _MOST_TESTS = 32
 #: Degrees from side to side, as photographs have.
 FIELD = 50.0
@@ -39,11 +39,11 @@ _AROUND = 0.35
 
 @dataclass(frozen=True)
 class Plan:
-    """What :func:`potr_cl.placement.virtual.place_cameras` places.
+    """What :func:`potr_cl.placement.virtual.place_cameras` sets out from.
 
     Attributes:
         training: views that an encoder looks at.
-        in_rooms: the same where a scene has rooms.
+        in_rooms: the same where a good part of the places to stand is enclosed.
         test: views besides that only judge.
         size: width and height of each, in pixels.
     """
@@ -71,8 +71,9 @@ def plan(splats: int, count: int | None = None, size: int | None = None, slow: b
     Raises:
         UsageError: ``count`` or ``size`` below 1, or above what can be placed and rendered.
     """
-    in_rooms = count
-    if count is None or in_rooms is None:
+    if count is not None:
+        in_rooms = count
+    else:
         more = math.sqrt(max(splats / _SPLATS, 1.0))
         usual = (_VIEWS_ON_CPU, _IN_ROOMS_ON_CPU) if slow else (_VIEWS, _VIEWS)
         count, in_rooms = (min(round(each * more), MOST) for each in usual)
@@ -83,7 +84,7 @@ def plan(splats: int, count: int | None = None, size: int | None = None, slow: b
             f"{count} virtual views of {size} x {size} pixels: both must be at least 1, the views at most "
             f"{MOST_ASKED}, a side at most {WIDEST_ASKED}"
         )
-    return Plan(count, in_rooms, min(count // 6, _MOST_TESTS), size)
+    return Plan(count, in_rooms, min(in_rooms // 8, _MOST_TESTS), size)
 
 
 def is_virtual(cameras: Sequence[Camera]) -> bool:

@@ -108,7 +108,7 @@ _COARSEST, _FINEST = 2.0, 4.5
 #: The most that small pictures are asked for, as a part of the focal length: with more, each would show too little.
 _OF_PICTURE = 0.0076
 #: The distances that are tried, in those at which splats are resolved; rays for each; how well, as a part of the best,
-#: the farthest is remembered at which photographs were taken; and how far the median of these is, in that.
+#: the farthest is remembered at which photographs were taken; and their median distance as a part of that.
 _DISTANCES, _TRIED, _AS_WELL, _MEDIAN = tuple(2.0 ** (step / 4) for step in range(-4, 9)), 600, 0.95, 0.85
 #: The part of the targets that is spread over area.
 _OVER_AREA = 0.25
@@ -318,7 +318,7 @@ class Resolution:
 
     Attributes:
         pixels: that the larger standard deviation of a splat of median size should have.
-        limited: whether colours tell that photographs were not taken from any farther.
+        limited: whether photographs were not taken from as far as was tried, as colours or walls tell.
         memory: what colours remember; None: nothing.
     """
 
