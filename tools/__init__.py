@@ -22,6 +22,7 @@ What a choice costs or brings, against the alternatives (``study``):
 =========================  =============================================================================================
 study.rate_distortion      size against quality, of any options: presets, what the re-fit brings, what pruning may skip
 study.time_error           what does each knob that trades run time for error cost and bring?
+study.placed_views         what do placed views cost by how many they are, how large, and how much colours are held?
 study.ablation             what does each part of the codec contribute?
 study.formats              how small are encodes to the formats that viewers open, and what do others make of scenes?
 =========================  =============================================================================================

@@ -64,6 +64,11 @@ class EvaluatedScene(Owner):
             figures[ssim] = mean[pair].ssim
         return figures
 
+    def mean_and_worst(self, candidate: Scene) -> tuple[float, float]:
+        """PSNR against the uncompressed scene's renders, the mean over the test views and that of the worst, dB."""
+        found = [view.figures["b_against_a"].psnr for view in self._judging.figures(candidate)]
+        return math.fsum(found) / len(found), min(found)
+
     def facts(self) -> dict[str, Any]:
         """The uncompressed scene, for JSON."""
         return {
