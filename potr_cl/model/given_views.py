@@ -79,8 +79,9 @@ class GivenViews:
         little of each house. With weights w of V views, the part is (Σ w)² / (V Σ w²), 1 if all show the splat alike
         and 1 / V if one alone does (Kish 1965, effective sample size).
         """
-        distances = np.linalg.norm(self._matter.targets - self._places[:, None], axis=2)
-        sizes = self._shown / (self._fields[:, None] * np.maximum(distances, 1e-6) ** 2)
+        ways = self._matter.targets - self._places[:, None]
+        squares = np.maximum(np.einsum("pka,pka->pk", ways, ways), 1e-12)
+        sizes = self._shown / (self._fields[:, None] * squares)
         sizes = sizes[:, self._shown.any(axis=0)]
         if not sizes.size:
             return None

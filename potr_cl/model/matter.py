@@ -212,6 +212,7 @@ def _cells_of(rays: F32) -> NDArray[np.int64]:
 
 
 def _weighted_quantile(values: F64, weights: F64, part: float) -> float:
-    order = np.argsort(values, kind="stable")
+    # Where values are equal, their order is of no account.
+    order = np.argsort(values)
     sums = np.cumsum(weights[order])
     return float(values[order[min(int(np.searchsorted(sums, part * sums[-1])), len(order) - 1)]])

@@ -49,6 +49,8 @@ Values = Sequence[NDArray[np.integer]]
 
 #: Of fewer splats, models may weigh more than they save.
 _FEW = 1 << 15
+#: Threads that make models.
+_MODEL_THREADS = 4
 
 
 def encode(
@@ -232,9 +234,15 @@ def encode_natively(
     ]
     encoder.take_numbers([some.tolist() for some in numbers])
     deque(run(encoder.count, range(bundles.number)), 0)
-    alphabets = tokens_of(encoder.largest().astype(np.int64)).astype(int) + 1
-    # Each takes so little that threads would wait for each other.
-    found = [_fitted_model(encoder, *job) for job in enumerate(alphabets.tolist())]
+    alphabets = (tokens_of(encoder.largest().astype(np.int64)).astype(int) + 1).tolist()
+    found = [_NOTHING] * len(streams)
+
+    def model(first: int) -> None:
+        for number in range(first, len(streams), _MODEL_THREADS):
+            found[number] = encoder.model(number, alphabets[number], log_table()) or _NOTHING
+
+    # Each takes so little that more threads would wait for each other.
+    deque(run(model, range(_MODEL_THREADS)), 0)
     models = [model if own is None else own.model for model, own in zip(found, without, strict=True)]
     encoder.take_models(models)
     coded = list(run(encoder.code, range(bundles.number)))
@@ -265,8 +273,8 @@ def narrow(values: Mapping[Property, Sequence[NDArray[np.integer]]], run: Run = 
     """The integers as the native path takes them; None if one is too large for it."""
 
     def narrowed(stream: NDArray[np.integer]) -> I32 | None:
-        # Mapped to unsigned an integer has another bit.
-        if not fits(2 * max(int(stream.max()), -int(stream.min())) + 1):
+        # Mapped to unsigned an integer has another bit. Those of two bytes all fit.
+        if stream.dtype.itemsize > 2 and not fits(2 * max(int(stream.max()), -int(stream.min())) + 1):
             return None
         return np.ascontiguousarray(stream, np.int32)
 
@@ -282,8 +290,3 @@ def _solved(stream: Stream, gram: I64) -> I64:
         return np.zeros(stream.weights, np.int64)
     used = range(stream.weights + 1)
     return solve(gram[np.ix_(used, used)])
-
-
-def _fitted_model(encoder: BundleEncoder, number: int, alphabet: int) -> Model:
-    counts = encoder.counts(number, alphabet)
-    return encoder.contexts(counts, alphabet, log_table()) if counts.any() else _NOTHING

@@ -115,8 +115,7 @@ class BundleEncoder:
         self._work = Spare(lambda: np.zeros(c["potr_bundles_encoding"](), np.uint8))
         self._sums = Spare(lambda: (np.zeros((STREAMS, COLUMNS, COLUMNS), np.int64), np.zeros(STREAMS, np.uint32)))
         self._counts = Spare(lambda: np.zeros((STREAMS, _TOKENS, _TOKENS), np.uint32))
-        self._total = np.empty((_TOKENS, _TOKENS), np.uint32)
-        self._grouping = np.empty(c["potr_bundles_grouping"](), np.uint8)
+        self._grouping = Spare(lambda: np.empty(c["potr_bundles_grouping"](), np.uint8))
         self._words = Spare(lambda: np.empty(_WORDS * _BUNDLE + 2, np.uint16))
         for place, stream in zip(self._streams, streams, strict=True):
             number, some = len(stream.terms), stream.coefficients
@@ -178,36 +177,31 @@ class BundleEncoder:
                 address(counts, np.uint32, counts.size, True),
             )
 
-    def counts(self, stream: int, alphabet: int) -> U32:
-        """(256, 256) how often each expected size of a stream has each token, which are fewer than ``alphabet``.
-
-        Valid until the next call.
-        """
-        first, *others = self._counts.all()
-        np.copyto(self._total, first[stream])
-        for counts in others:
-            self._total[:, :alphabet] += counts[stream, :, :alphabet]
-        return self._total
-
-    def contexts(self, counts: U32, alphabet: int, logs: I64) -> Model:
-        """Contexts of a stream and their frequencies, for one thread at a time.
+    def model(self, stream: int, alphabet: int, logs: I64) -> Model | None:
+        """Contexts of a stream that was counted, and their frequencies; None: it has nothing.
 
         Args:
-            counts: (256, 256), at least one.
-            alphabet: more than the largest token.
+            stream: its number.
+            alphabet: more than its largest token.
             logs: (4096,) log₂ of each number, in units of 2^-16.
         """
-        if not 0 < alphabet <= _MOST_ALPHABET or not counts.any():
+        if not 0 < alphabet <= _MOST_ALPHABET:
             raise TypeError("the native path was given no tokens, or too many")
+        total = np.zeros((_TOKENS, _TOKENS), np.uint32)
+        for counts in self._counts.all():
+            total[:, :alphabet] += counts[stream, :, :alphabet]
+        if not total.any():
+            return None
         classes, frequencies = np.empty(_TOKENS, np.uint8), np.empty(_GROUPS * alphabet, np.uint16)
-        number = self._c["potr_bundles_contexts"](
-            address(counts, np.uint32, _TOKENS * _TOKENS),
-            alphabet,
-            address(logs, np.int64, _LOGS),
-            self._grouping.ctypes.data,
-            address(classes, np.uint8, _TOKENS, True),
-            address(frequencies, np.uint16, len(frequencies), True),
-        )
+        with self._grouping.taken() as grouping:
+            number = self._c["potr_bundles_contexts"](
+                address(total, np.uint32, _TOKENS * _TOKENS),
+                alphabet,
+                address(logs, np.int64, _LOGS),
+                grouping.ctypes.data,
+                address(classes, np.uint8, _TOKENS, True),
+                address(frequencies, np.uint16, len(frequencies), True),
+            )
         return Model(classes, frequencies[: number * alphabet].reshape(number, alphabet).astype(np.int64))
 
     def take_models(self, models: Sequence[Model]) -> None:
