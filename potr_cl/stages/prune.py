@@ -294,7 +294,7 @@ def _in_passing(state: State, bench: Workbench, hidden: NDArray[np.bool_] | None
     """Takes the pictures of the source that later stages will ask for; None: nobody does, or it does not pay.
 
     Args:
-        hidden: (N,) splats that are not there while views are prepared; None: all are.
+        hidden: (N,) splats that are not there while views are looked at; None: all are.
     """
     if not bench.shown_again or bench.memory is not None or state.scene is not state.source:
         return None

@@ -6,7 +6,7 @@ Whoever gives them is a :class:`Targets`, asked for some views at a time:
 - :class:`PhotographTargets`: in files, read whenever somebody asks.
 - :class:`HostTargets`: on the host, asked for once, so that what made them can go.
 - :class:`PicturesAhead`: on devices, rendered in the background before anybody asks, and given away once.
-- :class:`PicturesInPassing`: on a CPU, rendered while views are prepared for something else, and given away once.
+- :class:`PicturesInPassing`: on a CPU, drawn in passing by what looks at the views anyway, and given away once.
 
 :class:`TargetPictures` keeps as many of them on a device as a budget allows, and asks for the others again.
 """
@@ -284,7 +284,7 @@ class _Rendered(Owner):
 
 
 class PicturesInPassing(Owner):
-    """A scene's pictures on a CPU, rendered while its views are prepared for something else; each is given once.
+    """A scene's pictures on a CPU, drawn by whoever looks at its views for something else; each is given once.
 
     They lie there until then: to make a view ready takes longer than to render it.
 
@@ -295,7 +295,7 @@ class PicturesInPassing(Owner):
     def __init__(self, device: Device, cameras: Sequence[Camera]) -> None:
         self._device, self._memory = device, Memory(device)
         self._wanted = {id(camera): camera for camera in cameras}
-        self._of: dict[int, cl.Buffer] = {}
+        self._rooms, self._of = dict[int, cl.Buffer](), dict[int, cl.Buffer]()
 
     @staticmethod
     def wanted(device: Device, cameras: Sequence[Camera]) -> PicturesInPassing | None:
@@ -312,15 +312,22 @@ class PicturesInPassing(Owner):
                     if views.views[0].intersection_count:
                         del self._wanted[id(camera)]
 
-    def take(self, rasterizer: Rasterizer, views: ViewSet) -> None:
-        """Render the picture of a prepared view, if it is wanted."""
+    def room_for(self, views: ViewSet) -> cl.Buffer | None:
+        """Room for the picture of a prepared view, (H, W, 3) float32; None: nobody wants it, or there is none.
+
+        Whoever asks draws it, and says so (:meth:`are_drawn`).
+        """
         (view,) = views.views
-        if id(view.camera) not in self._wanted:
-            return
-        with suppress(DeviceMemoryError):
-            buffer = self._memory.allocate(12 * views.pixels, _WHAT)
-            rasterizer.pictures_into(views, buffer)
-            self._of[id(view.camera)] = buffer
+        if id(view.camera) in self._wanted and id(view.camera) not in self._rooms:
+            with suppress(DeviceMemoryError):
+                self._rooms[id(view.camera)] = self._memory.allocate(12 * views.pixels, _WHAT)
+        return self._rooms.get(id(view.camera))
+
+    def are_drawn(self, cameras: Iterable[Camera]) -> None:
+        """From now on the pictures of these views are there, of those that have room; no others will be."""
+        self._of = {id(camera): self._rooms.pop(id(camera)) for camera in cameras if id(camera) in self._rooms}
+        self._memory.free(*self._rooms.values())
+        self._rooms, self._wanted = {}, {}
 
     def before(self, targets: Targets, cameras: Sequence[Camera]) -> Targets:
         """The pictures that ``targets`` gives of these cameras: it is asked for those that are not here."""
@@ -336,7 +343,7 @@ class PicturesInPassing(Owner):
         return True
 
     def close(self) -> None:
-        self._of = {}
+        self._rooms, self._of = {}, {}
         self._memory.close()
 
 

@@ -1,4 +1,4 @@
-"""Pictures that a CPU renders while pruning prepares its views: the same bits as later, each of them once."""
+"""Pictures that a CPU draws as pruning first looks at its views: the same bits as later, each of them once."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from potr_cl.pipeline.encode import encode
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages import prune, refit
 from potr_cl.stages.pruning.removal import RemovalSweep
+from potr_cl.stages.pruning.sweep import SweepOptions
 from potr_cl.views import targets
 from potr_cl.views.targets import PicturesInPassing, RenderedTargets, target_bytes
 from tests.devices import shared_device
@@ -54,6 +55,7 @@ def test_they_are_given_once(cpu, rendered):
         PicturesInPassing.wanted(cpu, views[:2]) as pictures,
         RemovalSweep(rasterizer, CAMERAS, pictures=pictures) as removal,
     ):
+        removal.measure_on_device()
         given = pictures.before(RenderedTargets(rasterizer, views), views)
         buffer = memory.allocate(3 * size, "pictures")
         wanted = np.stack([rasterizer.render(view)[0] for view in views])
@@ -61,7 +63,45 @@ def test_they_are_given_once(cpu, rendered):
             given.into([0, 1, 2], buffer)
             assert np.array_equal(cpu.download(buffer, wanted.shape, np.float32), wanted)
             assert rendered == told
+
+
+@pytest.mark.parametrize(("splats", "logit"), [(3000, 2.0), (9000, -3.0)])
+def test_they_are_the_rasterizers_where_lists_are_long(cpu, splats, logit):
+    """Their pixels end before those of pruning: early, or segments later in a tile's list."""
+    scene = visible_scene(splats)
+    scene = dataclasses.replace(scene, opacity_logits=scene.opacity_logits + np.float32(logit))
+    with (
+        Rasterizer(cpu, scene, background=BACKGROUND) as rasterizer,
+        Memory(cpu) as memory,
+        PicturesInPassing.wanted(cpu, CAMERAS) as pictures,
+        RemovalSweep(rasterizer, CAMERAS, pictures=pictures) as removal,
+    ):
         removal.measure_on_device()
+        buffer = memory.allocate(target_bytes(CAMERAS[0]), "a picture")
+        for view in CAMERAS:
+            wanted, _ = rasterizer.render(view)
+            assert pictures.give(view, buffer, 0)
+            assert np.array_equal(cpu.download(buffer, wanted.shape, np.float32), wanted)
+
+
+def test_views_that_do_not_stay_have_none(cpu):
+    """There is room for the pictures of all before it is known which views stay."""
+    scene = visible_scene(3000)
+    with Rasterizer(cpu, scene) as rasterizer:
+        with rasterizer.prepare_set(CAMERAS[:1]) as views:
+            room = int(2.5 * views.nbytes)
+        with (
+            PicturesInPassing.wanted(cpu, CAMERAS) as pictures,
+            RemovalSweep(rasterizer, CAMERAS, SweepOptions(memory=room), pictures=pictures) as removal,
+            Memory(cpu) as memory,
+        ):
+            assert 0 < removal.ready_views < len(CAMERAS)
+            removal.measure_on_device()
+            buffer = memory.allocate(target_bytes(CAMERAS[0]), "a picture")
+            given = [view for view in CAMERAS if pictures.give(view, buffer, 0)]
+            assert len(given) == removal.ready_views
+            wanted, _ = rasterizer.render(given[-1])
+            assert np.array_equal(cpu.download(buffer, wanted.shape, np.float32), wanted)
 
 
 def test_a_gpu_and_a_cpu_with_little_memory_take_none(cpu, monkeypatch):
@@ -85,7 +125,7 @@ def test_an_encode_takes_them_and_the_bytes_stay(cpu, monkeypatch, rendered, plu
     assert len(rendered) - fewer == len(train_views(small_views)) + made.between.added
     monkeypatch.setattr(targets, "AHEAD", 1.0)
     taken = []
-    monkeypatch.setattr(PicturesInPassing, "take", lambda self, *args: taken.append(args))
+    monkeypatch.setattr(PicturesInPassing, "room_for", lambda self, *args: taken.append(args))
     encode(scene, small_views, options.changed(memory=1 << 26), device=cpu)
     encode(scene, small_views, options.changed(refit=False, fit=False), device=cpu)
     assert not taken
@@ -119,6 +159,7 @@ def test_none_is_taken_of_views_that_show_what_pruning_has_not_got(cpu):
         pictures.leave_out(away)
         for view in views:
             with rasterizer.prepare_set([view]) as prepared:
-                pictures.take(rasterizer, prepared)
+                assert (pictures.room_for(prepared) is None) == (view is there)
+        pictures.are_drawn(views)
         buffer = memory.allocate(target_bytes(there), "a picture")
         assert [pictures.give(view, buffer, 0) for view in views] == [True] * 3 + [False]

@@ -17,9 +17,13 @@
    On the way a list loses, in place, the intersections of removed splats. A tile's list begins at offsets[tile] and has
    lengths[tile] intersections.
 
+   The first sweep can leave the picture that composite_cpu.cl would, bit for bit, whose pixels end earlier.
+
    Macros:
        LANES                               8 or 16, see lanes.clh;
        ALPHA_CAP, TRANSMITTANCE_THRESHOLD  see subtile_vectors.clh;
+       PICTURES                            1: leave pictures; 0, the default: it would take time in each sweep;
+       PICTURE_THRESHOLD                   with those, where their pixels end, at least TRANSMITTANCE_THRESHOLD;
        INT64_ATOMICS                       see totals.clh. */
 
 #include "include/lanes.clh"
@@ -32,9 +36,12 @@
 /* At how many places of a list the transmittances are kept at most. If there are more segments, those between the last
    such place and the segment in question are walked again. */
 #define CHECKPOINTS 16
-
+#ifndef PICTURES
+#define PICTURES 0
+#endif
 /* A sub-tile's walk forward. Its transmittances and colours move on; memory[2 j] and memory[2 j + 1] become the alphas
-   and weights of the j-th splat. Returns the number of splats before the last pixel's end. */
+   and weights of the j-th splat. `drawn`: transmittances and colours where the picture's pixels end, which move on with
+   PICTURES. Returns the number of splats before the last pixel's end. */
 inline uint walk(
     const Splat *splats,
     const ushort *list,
@@ -42,6 +49,7 @@ inline uint walk(
     float2 first,
     vfloat t[1],
     vfloat rgb[3],
+    vfloat drawn[4],
     float *memory)
 {
     vfloat through = t[0], r = rgb[0], g = rgb[1], b = rgb[2];
@@ -57,6 +65,13 @@ inline uint walk(
             b = MAD(weight, (vfloat)(splat->blue), b);
             VSTORE(goes_on ? alpha : (vfloat)(0.0f), 2 * j, memory);
             VSTORE(weight, 2 * j + 1, memory);
+#if PICTURES
+            const vint shown = after >= PICTURE_THRESHOLD;
+            drawn[0] = shown ? after : drawn[0];
+            drawn[1] = shown ? r : drawn[1];
+            drawn[2] = shown ? g : drawn[2];
+            drawn[3] = shown ? b : drawn[3];
+#endif
         }
     }
     t[0] = through;
@@ -132,6 +147,7 @@ kernel void removal(
     float scale,
     float bound,
     global float *target,
+    global float *picture,
     global float2 *sums,
     global float *counts,
     volatile global uint *totals)
@@ -163,10 +179,11 @@ kernel void removal(
     float memory[2 * (SEGMENT + LANES) * LANES];
     float2 fresh[SEGMENT];
     vfloat t[SUBTILES], rgb[SUBTILES][3], twice[SUBTILES][3], behind[SUBTILES][3];
-    vfloat checkpoints[CHECKPOINTS][SUBTILES];
+    vfloat checkpoints[CHECKPOINTS][SUBTILES], drawn[SUBTILES][4];
     for (int i = 0; i < SUBTILES; ++i) {
-        t[i] = subtile_transmittance(i, origin, view.width, view.height);
+        t[i] = drawn[i][0] = subtile_transmittance(i, origin, view.width, view.height);
         rgb[i][0] = rgb[i][1] = rgb[i][2] = (vfloat)(0.0f);
+        drawn[i][1] = drawn[i][2] = drawn[i][3] = (vfloat)(0.0f);
         behind[i][0] = (vfloat)(red);
         behind[i][1] = (vfloat)(green);
         behind[i][2] = (vfloat)(blue);
@@ -181,7 +198,7 @@ kernel void removal(
                 checkpoints[last / apart][i] = t[i];
         gather_splats(shapes, colours, intersections, subtiles, begin + last * SEGMENT, kept, splats, lists, listed);
         for (int i = 0; i < SUBTILES; ++i)
-            walk(splats, lists[i], listed[i], subtile_centre(origin, i), &t[i], rgb[i], memory);
+            walk(splats, lists[i], listed[i], subtile_centre(origin, i), &t[i], rgb[i], drawn[i], memory);
     }
 
     float importance = 0.0f;
@@ -195,7 +212,7 @@ kernel void removal(
                 gather_splats(
                     shapes, colours, intersections, subtiles, begin + before * SEGMENT, kept, splats, lists, listed);
                 for (int i = 0; i < SUBTILES; ++i)
-                    walk(splats, lists[i], listed[i], subtile_centre(origin, i), &t[i], rgb[i], memory);
+                    walk(splats, lists[i], listed[i], subtile_centre(origin, i), &t[i], rgb[i], drawn[i], memory);
             }
         }
         const uint count = gather_splats(shapes, colours, intersections, subtiles, from, kept, splats, lists, listed);
@@ -203,13 +220,19 @@ kernel void removal(
             fresh[k] = (float2)(0.0f, 0.0f);
         for (int i = 0; i < SUBTILES; ++i) {
             const uint walked =
-                walk(splats, lists[i], listed[i], subtile_centre(origin, i), &t[i], rgb[i], memory);
+                walk(splats, lists[i], listed[i], subtile_centre(origin, i), &t[i], rgb[i], drawn[i], memory);
             if (segment == last) {
                 const vfloat through = fabs(t[i]);
                 float differences[3][LANES];
                 VSTORE(MAD(through, (vfloat)(red), rgb[i][0]), 0, differences[0]);
                 VSTORE(MAD(through, (vfloat)(green), rgb[i][1]), 0, differences[1]);
                 VSTORE(MAD(through, (vfloat)(blue), rgb[i][2]), 0, differences[2]);
+#if PICTURES
+                float shown[3][LANES];
+                VSTORE(MAD(drawn[i][0], (vfloat)(red), drawn[i][1]), 0, shown[0]);
+                VSTORE(MAD(drawn[i][0], (vfloat)(green), drawn[i][2]), 0, shown[1]);
+                VSTORE(MAD(drawn[i][0], (vfloat)(blue), drawn[i][3]), 0, shown[2]);
+#endif
                 for (int lane = 0; lane < LANES; ++lane) {
                     const int column = origin.x + SUBTILE_COLUMN(i) + lane % SUBTILE_WIDTH;
                     const int row = origin.y + SUBTILE_ROW(i) + lane / SUBTILE_WIDTH;
@@ -219,6 +242,9 @@ kernel void removal(
                     for (int channel = 0; channel < 3; ++channel) {
                         if (first_time)
                             target[place + channel] = differences[channel][lane];
+#if PICTURES
+                        picture[place + channel] = shown[channel][lane];
+#endif
                         differences[channel][lane] = 2.0f * (differences[channel][lane] - target[place + channel]);
                     }
                 }

@@ -112,6 +112,8 @@ class PreparedSet(Owner):
         memory: to take the rest from, which is closed with this object; None: memory of its own.
         target: the pictures before any removal, which stay the caller's; None: memory for them.
         pending: as of :meth:`potr_cl.opencl.device.Device.upload`.
+        picture: as the rasterizer draws it, (pixels, 3) float32, which the first sweep leaves there on CPUs; it stays
+            the caller's.
 
     Attributes:
         lengths: (tiles,) uint32, intersections that a tile has left.
@@ -128,7 +130,9 @@ class PreparedSet(Owner):
         memory: Memory | None = None,
         target: cl.Buffer | None = None,
         pending: list[cl.Event] | None = None,
+        picture: cl.Buffer | None = None,
     ) -> None:
+        self.picture = picture
         self._device = device = rasterizer.device
         self._memory = memory or Memory(device)
         self.views = views

@@ -63,7 +63,7 @@ class RemovalSweep(Owner):
         progress: called with the views prepared and their number.
         numbers: of the views that are measured here, ascending, where others are measured elsewhere; None: all.
         plan: of these views; None: all of them with all splats.
-        pictures: take those of views as they are prepared for the first time.
+        pictures: have room for those of resident views, which the first measurement leaves there.
         helpers: measure the other views. All totals are integers in units that follow from all views, so it makes no
             difference to any bit who measures which.
 
@@ -134,10 +134,11 @@ class RemovalSweep(Owner):
     def _attach(
         self, numbers: Sequence[int], subset: Subset, views: ViewSet, memory: Memory | None, target: cl.Buffer | None
     ) -> PreparedSet:
-        if self._pictures is not None and memory is None:
-            self._pictures.take(subset.rasterizer, views)
+        if memory is not None:
+            return PreparedSet(subset.rasterizer, views, memory, target)
+        picture = None if self._pictures is None else self._pictures.room_for(views)
         # The device sorts the lists while the next view is made ready.
-        return PreparedSet(subset.rasterizer, views, memory, target, None if memory else self._pending)
+        return PreparedSet(subset.rasterizer, views, None, target, self._pending, picture)
 
     @property
     def sweeps(self) -> float:
@@ -175,6 +176,8 @@ class RemovalSweep(Owner):
         if self._engine.plan.groups:
             resident.list_stale()
             resident.sweep()
+            if self._pictures is not None and not self._measured:
+                self._pictures.are_drawn(view.camera for ready in self._engine.resident for view in ready.views.views)
             if resident.gather():
                 self._streamed_added = False
             if self._engine.streamed and again:

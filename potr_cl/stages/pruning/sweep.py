@@ -169,7 +169,7 @@ class SetKernels:
     Args:
         lists: of its tiles, perhaps among those of other sets.
         options: where pixels end. fixed_point: the totals' units.
-        first_time: whether a sweep stores the target instead of comparing with it.
+        first_time: whether a sweep stores the target, and the picture if that is wanted, instead of comparing with it.
         place: of the set's counter in ``lists.listed``.
     """
 
@@ -207,6 +207,7 @@ class SetKernels:
                 "view": camera_struct(view.camera),
                 "scale": fixed_point.scale * weight,
                 "bound": fixed_point.bound / weight,
+                "picture": prepared.picture or prepared.target,  # which is not looked at
             }
             both["counts"] = prepared.counts
         else:
@@ -231,21 +232,25 @@ class SetKernels:
                 "listed": lists.listed,
             }
         source = f"prune/removal_{device.family}.cl"
-        self._removal = device.kernel(source, "removal", **macros).bind(
-            start=0,
-            tiles=lists.tiles,
-            shapes=shapes,
-            colours=colours,
-            subtiles=views.subtiles,
-            red=red,
-            green=green,
-            blue=blue,
-            first_time=int(first_time),
-            target=prepared.target,
-            totals=ledger.totals,
-            **both,
-            **swept,
-        )
+        swept |= {
+            "start": 0,
+            "tiles": lists.tiles,
+            "shapes": shapes,
+            "colours": colours,
+            "subtiles": views.subtiles,
+            "red": red,
+            "green": green,
+            "blue": blue,
+            "first_time": int(first_time),
+            "target": prepared.target,
+            "totals": ledger.totals,
+        }
+        self._removal = device.kernel(source, "removal", **macros).bind(**both, **swept)
+        self._later: Kernel | None = None
+        if first_time and prepared.picture is not None:
+            drawing = {"PICTURES": 1, "PICTURE_THRESHOLD": rasterizer.rules.transmittance_threshold}
+            self._later = self._removal
+            self._removal = device.kernel(source, "removal", **macros, **drawing).bind(**both, **swept)
         self._staleness = device.kernel(source, "staleness", **macros).bind(
             alive=ledger.marks, first=prepared.first_tile, stale=lists.stale, **both, **noted
         )
@@ -270,7 +275,9 @@ class SetKernels:
 
     def target_is_known(self) -> None:
         """From now on, sweeps compare with the target picture instead of storing it."""
-        self._removal.set(first_time=0)
+        if self._later is not None:
+            self._removal, self._later = self._later, None
+        self._removal.set(first_time=0, start=self._start)
 
     def note_removal(self, queue: cl.CommandQueue | None = None, list_above: float = math.inf) -> None:
         """Enqueue what follows a removal: each tile's staleness grows by what it lost.
