@@ -132,7 +132,8 @@ kernel void gather(
     uint view_count,
     global const float *scales,
     uint first_scale,
-    global const float4 *free,
+    global const uchar *free,
+    ulong first_free,
     global long *result,
     ulong first_block,
     ulong block_stride,
@@ -188,7 +189,7 @@ kernel void gather(
 #endif
         VREAL basis[SH_COUNT];
         basis_towards(means, stride, splat, &views[number].view, basis);
-        const vint kept = free_channels(free, place);
+        const vint kept = CONVERT_VINT(VLOAD(place, free + first_free));
         const vfloat r = (kept & 1) != 0 ? sums[0] : (vfloat)(0.0f);
         const vfloat g = (kept & 2) != 0 ? sums[1] : (vfloat)(0.0f);
         const vfloat b = (kept & 4) != 0 ? sums[2] : (vfloat)(0.0f);

@@ -45,23 +45,33 @@ inline void change_in_view(
 }
 #endif
 
-inline void store_colour(
-    vfloat red, vfloat green, vfloat blue, vfloat channels, size_t place, global float4 *colours)
+inline void store_colour(vfloat red, vfloat green, vfloat blue, size_t place, global float4 *colours)
 {
 #if LANES == 1
-    colours[place] = (float4)(red, green, blue, channels);
+    colours[place] = (float4)(red, green, blue, 0.0f);
 #else
     vfloat four[4];
-    interleave(red, green, blue, channels, four);
+    interleave(red, green, blue, (vfloat)(0.0f), four);
     for (int k = 0; k < 4; ++k)
         VSTORE(four[k], 4 * place + k, (global float *)colours);
 #endif
 }
 
-/* The splats' colours in each view of a set: of the coefficients themselves (direction == 0), cut at 0, w telling which
-   channels are free (1, 2, 4: above 0); or their change along a direction, 0 where `free` says that the channel is cut,
-   and the same w. Views that have some splats have `free` in a byte each, `free_picks`, which colours leave there.
-   What views have lies `apart`. Work-item i of the second dimension does views i, i + get_global_size(1), … */
+/* A change of colours, times a unit, where the channels are free. */
+inline void store_change(
+    vfloat red, vfloat green, vfloat blue, float unit, global const uchar *free, size_t place, global float4 *colours)
+{
+    const vint kept = CONVERT_VINT(VLOAD(place, free));
+    red = (kept & 1) != 0 ? red * unit : (vfloat)(0.0f);
+    green = (kept & 2) != 0 ? green * unit : (vfloat)(0.0f);
+    blue = (kept & 4) != 0 ? blue * unit : (vfloat)(0.0f);
+    store_colour(red, green, blue, place, colours);
+}
+
+/* The splats' colours in each view of a set: of the coefficients themselves (direction == 0), cut at 0, which leave in
+   `free` which channels are free: above 0; or their change along a direction, 0 where `free` says that the channel is
+   cut. What views have lies `apart`; in `free` that of the first is at `first_free`. Work-item i of the second dimension
+   does views i, i + get_global_size(1), … */
 kernel void view_colours(
     global const float *coefficients,
     global const float *means,
@@ -72,10 +82,11 @@ kernel void view_colours(
     uint view_count,
     int direction,
     float unit,
-    global const float4 *free,
-    global uchar *free_picks,
+    global uchar *free,
+    ulong first_free,
     global float4 *colours)
 {
+    free += first_free;
     const size_t index = get_global_id(0);
     vfloat values[3 * SH_COUNT];
 #if !PICKED
@@ -102,49 +113,26 @@ kernel void view_colours(
         basis_towards(means, stride, splat, &views[number].view, basis);
         vfloat red, green, blue;
         in_view(values, basis, &red, &green, &blue);
-        vfloat channels = (vfloat)(0.0f);
         const size_t place = number * apart / LANES + index;
         if (direction) {
-#if PICKED && LANES > 1
-            int flags[LANES];
-            for (int lane = 0; lane < LANES; ++lane)
-                flags[lane] = free_picks[LANES * place + lane];
-            const vint kept = VLOAD(0, flags);
-#elif PICKED
-            const vint kept = free_picks[place];
-#else
-            const vint kept = free_channels(free, place);
-#endif
-            red = (kept & 1) != 0 ? red * unit : (vfloat)(0.0f);
-            green = (kept & 2) != 0 ? green * unit : (vfloat)(0.0f);
-            blue = (kept & 4) != 0 ? blue * unit : (vfloat)(0.0f);
-            channels = CONVERT_VFLOAT(kept);
-        } else {
-            red = fmin(red + 0.5f, (vfloat)(1e30f));
-            green = fmin(green + 0.5f, (vfloat)(1e30f));
-            blue = fmin(blue + 0.5f, (vfloat)(1e30f));
-            channels = (red > 0.0f ? (vfloat)(1.0f) : (vfloat)(0.0f)) +
-                (green > 0.0f ? (vfloat)(2.0f) : (vfloat)(0.0f)) +
-                (blue > 0.0f ? (vfloat)(4.0f) : (vfloat)(0.0f));
-#if PICKED && LANES > 1
-            float flags[LANES];
-            VSTORE(channels, 0, flags);
-            for (int lane = 0; lane < LANES; ++lane)
-                free_picks[LANES * place + lane] = (uchar)flags[lane];
-#elif PICKED
-            free_picks[place] = (uchar)channels;
-#endif
-            red = fmax(red, (vfloat)(0.0f));
-            green = fmax(green, (vfloat)(0.0f));
-            blue = fmax(blue, (vfloat)(0.0f));
+            store_change(red, green, blue, unit, free, place, colours);
+            continue;
         }
-        store_colour(red, green, blue, channels, place, colours);
+        red = fmin(red + 0.5f, (vfloat)(1e30f));
+        green = fmin(green + 0.5f, (vfloat)(1e30f));
+        blue = fmin(blue + 0.5f, (vfloat)(1e30f));
+        const vfloat channels = (red > 0.0f ? (vfloat)(1.0f) : (vfloat)(0.0f)) +
+            (green > 0.0f ? (vfloat)(2.0f) : (vfloat)(0.0f)) +
+            (blue > 0.0f ? (vfloat)(4.0f) : (vfloat)(0.0f));
+        VSTORE(CONVERT_VUCHAR(channels), place, free);
+        store_colour(
+            fmax(red, (vfloat)(0.0f)), fmax(green, (vfloat)(0.0f)), fmax(blue, (vfloat)(0.0f)), place, colours);
     }
 }
 
 #if LANES > 1 && !PICKED
-/* What a direction adds to the splats' colours in up to eight views on a CPU, whose colours are buffers of their own:
-   `free_…`, of which there may be more than views. */
+/* What a direction adds to the splats' colours in some views on a CPU, as view_colours has it: its coefficients go
+   through the memory once for all of them, and those that none of LANES splats may change are not looked at. */
 kernel void colour_changes(
     global const float *coefficients,
     global const float *means,
@@ -154,17 +142,10 @@ kernel void colour_changes(
     global const SetView *views,
     uint view_count,
     float unit,
-    global const float4 *free_0,
-    global const float4 *free_1,
-    global const float4 *free_2,
-    global const float4 *free_3,
-    global const float4 *free_4,
-    global const float4 *free_5,
-    global const float4 *free_6,
-    global const float4 *free_7,
+    global const uchar *free,
+    ulong first_free,
     global float4 *colours)
 {
-    global const float4 *const free[] = {free_0, free_1, free_2, free_3, free_4, free_5, free_6, free_7};
     const size_t splat = get_global_id(0);
     Changing changing;
     changing_coefficients(active, stride, splat, &changing);
@@ -177,11 +158,7 @@ kernel void colour_changes(
         basis_towards(means, stride, splat, &views[number].view, basis);
         vfloat red, green, blue;
         change_in_view(values, &changing, basis, &red, &green, &blue);
-        const vint kept = free_channels(free[number], splat);
-        red = (kept & 1) != 0 ? red * unit : (vfloat)(0.0f);
-        green = (kept & 2) != 0 ? green * unit : (vfloat)(0.0f);
-        blue = (kept & 4) != 0 ? blue * unit : (vfloat)(0.0f);
-        store_colour(red, green, blue, CONVERT_VFLOAT(kept), number * apart / LANES + splat, colours);
+        store_change(red, green, blue, unit, free + first_free, number * apart / LANES + splat, colours);
     }
 }
 #endif

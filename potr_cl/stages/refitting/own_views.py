@@ -22,10 +22,10 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.view_set import TABLE_ENTRY, ViewSet
 from potr_cl.stages.compaction.view_weights import pixel_weight
 from potr_cl.stages.refitting.coefficients import Coefficients, Vector
-from potr_cl.stages.refitting.view_kernels import Picks, RefitSweep, SweptSums, ViewKernels, gathered_scale
+from potr_cl.stages.refitting.view_kernels import Free, RefitSweep, SweptSums, ViewKernels, gathered_scale
 from potr_cl.views import plan as plans
 from potr_cl.views.budget import ViewCache, free_memory, target_bytes, tiles_of
-from potr_cl.views.engine import Launch, Ready, ViewEngine
+from potr_cl.views.engine import Launch, ViewEngine
 from potr_cl.views.reached import Reach
 from potr_cl.views.subsets import ListedSplats, Subset, WholeScene
 from potr_cl.views.targets import TargetPictures, Targets
@@ -170,16 +170,22 @@ class OwnViews(Owner):
             launches = list(self._engine.walk())
             ends = [0, *itertools.accumulate(len(each.numbers) for each in launches)]
             self._launches = [
-                _Own(each, range(*views), None if reach is None else self._memory.allocate(each.size, "what is cut"))
-                for each, views in zip(launches, itertools.pairwise(ends), strict=True)
+                _Own(each, range(*views)) for each, views in zip(launches, itertools.pairwise(ends), strict=True)
             ]
             most = max((len(each.numbers) for each in launches), default=0)
             largest, together = max((each.size for each in launches), default=0), 1
             if most == 1 and reach is None:
                 fitting = int(_AT_ONCE * room / ((_CHANGE + _TOTALS) * largest))
                 together = max(min(sweep.gathered, len(launches), fitting), 1)
-            self._gathered = [self._launches[n : n + together] for n in range(0, len(self._launches), together)]
-            at_once = together * largest
+            at_once, known = together * largest, 0
+            self._gathered = list[_Gathered]()
+            for first in range(0, len(self._launches), together):
+                own = self._launches[first : first + together]
+                stays = reach is not None or all(each.launch.resident is not None for each in own)
+                self._gathered.append(_Gathered(own, known if stays else None))
+                known += sum(each.launch.size for each in own) * stays
+            passing = any(each.free is None for each in self._gathered)
+            self._passing, self._free = known, self._memory.allocate(known + passing * at_once, "what is cut")
             self._change = self._memory.allocate(_CHANGE * at_once, "the colours' change")
             self._totals = self._memory.allocate(_TOTALS * at_once, "the re-fit's sums")
             self._slots = [
@@ -215,22 +221,22 @@ class OwnViews(Owner):
         if look.x is None:
             self._coefficients.zero(self._change)  # black, and no channel is free
         for gathered in self._gathered:
-            every = range(gathered[0].views.start, gathered[-1].views.stop)
-            changed = self._change_together(gathered, look)
-            for slot, own in zip(self._slots, gathered, strict=False):
+            every, free = gathered.views, Free(self._free, self._passing if gathered.free is None else gathered.free)
+            changed, of_next = self._change_together(gathered, free, look), free
+            for slot, own in zip(self._slots, gathered.launches, strict=False):
+                of_own, of_next = of_next, Free(self._free, of_next.first + own.launch.size)
                 with self._engine.ready(own.launch) as ready:
-                    views, picks, (shapes, colours) = ready.views, own.picks(ready), ready.geometry
+                    views, picks, (shapes, colours) = ready.views, ready.subset.numbers, ready.geometry
                     swept, target = slot.change, None
                     if targets is not None:
-                        kernels.colour(views, picks, look.x, colours, colours)
+                        kernels.colour(views, picks, look.x, colours, of_own)
                         swept, target = colours, self._targets.of(own.launch.numbers, targets)
                     elif look.x is not None and not changed:
                         assert look.at is not None
-                        anew = ready.shares or own.launch.resident is None
-                        if anew and picks is None:  # which colours are cut is not known any more
+                        if gathered.free is None:  # which colours are cut is not known any more
                             at = self._coefficients.on_device(look.at, 1)
-                            kernels.colour(views, picks, at, colours, colours)
-                        kernels.colour(views, picks, look.x, slot.change, colours, look.unit, look.constant)
+                            kernels.colour(views, picks, at, colours, of_own)
+                        kernels.colour(views, picks, look.x, slot.change, of_own, look.unit, look.constant)
                     scale, errors = self._fixed_points[ready.numbers[0]], self._errors.latest
                     weights = look.blocks is not None
                     sampled = (self._numbers, own.views.start, look.every, look.back)
@@ -250,29 +256,26 @@ class OwnViews(Owner):
                     if targets is not None:
                         if look.drawn is not None:
                             kernels.mark_drawn(views, look.drawn)
-                        if look.back:  # which of them are cut, the gathering asks
-                            self._device.copy(slot.change, colours, _CHANGE * views.stride * len(own.views))
                         self._errors.keep(own.views)
                     place = TABLE_ENTRY * (own.views.start - every.start)
                     self._device.copy(self._tables, views.table, TABLE_ENTRY * len(own.views), place)
             if not look.back:
                 continue
-            found = SweptSums(
-                self._totals, self._change, ready.views.stride, ready.subset.numbers, self._tables, every
-            )  # fmt: skip
+            found = SweptSums(self._totals, free, ready.views.stride, ready.subset.numbers, self._tables, every)
             kernels.gather(found, self.sums, look.constant, look.blocks, look.first_block)
 
-    def _change_together(self, gathered: Sequence[_Own], look: Look) -> bool:
+    def _change_together(self, gathered: _Gathered, free: Free, look: Look) -> bool:
         """Enqueue what a direction adds to the colours of some launches' views, if all are there with all splats."""
-        there = [own.launch.resident for own in gathered]
-        views = [each.views for each in there if each is not None and not each.shares and each.subset.numbers is None]
-        if look.x is None or look.targets is not None or not 1 < len(views) == len(gathered):
+        there = [own.launch.resident for own in gathered.launches]
+        views = [each.views for each in there if each is not None and each.subset.numbers is None]
+        if look.x is None or look.targets is not None or not 1 < len(views) == len(there):
             return False
         for place, each in enumerate(views):
             self._device.copy(self._tables, each.table, TABLE_ENTRY, TABLE_ENTRY * place)
         assert look.unit is not None
-        free = [each.colours for each in views]
-        self._kernels.changes(self._tables, views[0].stride, look.x, self._change, free, look.unit, look.constant)
+        self._kernels.changes(
+            self._tables, len(views), views[0].stride, look.x, self._change, free, look.unit, look.constant
+        )
         return True
 
     def found_errors(self) -> dict[int, float]:
@@ -285,10 +288,10 @@ class OwnViews(Owner):
 
 
 class _Attached(Owner):
-    """Views, with nothing of a re-fit's own but the numbers of their splats."""
+    """Views, with nothing of a re-fit's own but the numbers of their splats; and a byte of what is cut for each."""
 
     def __init__(self, numbers: Sequence[int], subset: Subset, views: ViewSet, *_: object) -> None:
-        self.nbytes = 0 if subset.numbers is None else subset.numbers.size
+        self.nbytes = len(numbers) * views.stride + (0 if subset.numbers is None else subset.numbers.size)
         self._views = views
 
     def close(self) -> None:
@@ -302,16 +305,28 @@ class _Own:
     Attributes:
         launch: the engine's.
         views: their places among all of the views that are done here.
-        free: which channels of views' own splats are free: a byte a splat and view, which stays as the views may not.
     """
 
     launch: Launch[_Attached]
     views: range
-    free: cl.Buffer | None
 
-    def picks(self, ready: Ready[_Attached]) -> Picks | None:
-        """The views' own splats; None: they have all."""
-        return None if ready.subset.numbers is None else Picks(ready.subset.numbers, self.free)
+
+@dataclass(frozen=True)
+class _Gathered:
+    """Launches whose sums are gathered together.
+
+    Attributes:
+        launches: they, whose views follow each other.
+        free: where it stays which of the views' colours are cut; None: as views come and go, it is found anew.
+    """
+
+    launches: Sequence[_Own]
+    free: int | None
+
+    @property
+    def views(self) -> range:
+        """The places of all."""
+        return range(self.launches[0].views.start, self.launches[-1].views.stop)
 
 
 @dataclass(frozen=True)

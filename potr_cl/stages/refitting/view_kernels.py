@@ -142,16 +142,16 @@ _TOGETHER = 8
 
 
 @dataclass(frozen=True)
-class Picks:
-    """Views' own splats.
+class Free:
+    """Which channels were not cut at 0 when views' colours were made.
 
     Attributes:
-        numbers: (views, stride) uint32, their numbers.
-        free: (views, stride) uint8, which channels were not cut when the views' colours were made.
+        buffer: (…) uint8.
+        first: where the (views, stride) of some views begin.
     """
 
-    numbers: cl.Buffer
-    free: cl.Buffer
+    buffer: cl.Buffer
+    first: int
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,7 @@ class SweptSums:
 
     Attributes:
         totals: (views, stride, 4) int64; 0 once they are gathered.
-        free: (views, stride, 4) float32, whose last element tells which channels are not cut.
+        free: of the views.
         stride: room for the splats of each view.
         picks: (views, stride) uint32, the splats' numbers; None: all views have all, in their order.
         tables: of the views, ``SetView`` in cl/include/view_set.clh.
@@ -168,7 +168,7 @@ class SweptSums:
     """
 
     totals: cl.Buffer
-    free: cl.Buffer
+    free: Free
     stride: int
     picks: cl.Buffer | None
     tables: cl.Buffer
@@ -193,10 +193,10 @@ class ViewKernels:
     def colour(
         self,
         views: ViewSet,
-        picks: Picks | None,
+        picks: cl.Buffer | None,
         x: cl.Buffer,
         result: cl.Buffer,
-        free: cl.Buffer,
+        free: Free,
         unit: float | None = None,
         constant: bool = False,
     ) -> None:
@@ -204,10 +204,10 @@ class ViewKernels:
 
         Args:
             views: prepared.
-            picks: the views' own splats; None: they have all.
+            picks: (views, stride) uint32, numbers of the views' own splats; None: they have all.
             x: (3 M, stride of the layout) float32, the coefficients or the direction.
             result: (views, stride, 4) float32.
-            free: the same at the coefficients, if a direction is looked along and views have all splats.
+            free: is told by coefficients, and asked for a direction.
             unit: of the direction; None: x are coefficients.
             constant: the direction's other coefficients are 0.
         """
@@ -219,31 +219,30 @@ class ViewKernels:
             means=self._means,
             stride=self._layout.stride,
             apart=views.stride,
-            numbers=views.table if picks is None else picks.numbers,
+            numbers=views.table if picks is None else picks,
             views=views.table,
             view_count=len(views.views),
             direction=unit is not None,
             unit=np.float32(1.0 if unit is None else unit),
-            free=free,
-            free_picks=views.table if picks is None else picks.free,
+            free=free.buffer,
+            first_free=free.first,
             colours=result,
         )
         together = _TOGETHER if picks is None else 1
         kernel.launch(*self._layout.items(views.stride, -(-len(views.views) // together)))
 
     def changes(
-        self, tables: cl.Buffer, stride: int, x: cl.Buffer, result: cl.Buffer, free: Sequence[cl.Buffer], unit: float,
+        self, tables: cl.Buffer, count: int, stride: int, x: cl.Buffer, result: cl.Buffer, free: Free, unit: float,
         constant: bool,
     ) -> None:  # fmt: skip
-        """Enqueue what a direction adds to the colours of up to :data:`TOGETHER` views, each prepared for itself.
+        """Enqueue what a direction adds to the colours of some views on a CPU, each prepared for itself.
 
         To bring the direction from memory takes most of the time, and they have it once.
 
         Args:
-            tables: of the views. stride: of their splats, which are all.
-            x, unit, constant: as of :meth:`colour`.
+            tables: of the views. count: of them. stride: of their splats, which are all.
+            x, unit, constant, free: as of :meth:`colour`.
             result: (views, stride, 4) float32.
-            free: the colours of each.
         """
         kernel = self._device.shared_kernel(
             "refit/view_colours.cl", "colour_changes", PICKED=0, **self._layout.some(constant)
@@ -255,9 +254,10 @@ class ViewKernels:
             stride=self._layout.stride,
             apart=stride,
             views=tables,
-            view_count=len(free),
+            view_count=count,
             unit=np.float32(unit),
-            **{f"free_{number}": free[min(number, len(free) - 1)] for number in range(TOGETHER)},
+            free=free.buffer,
+            first_free=free.first,
             colours=result,
         )
         kernel.launch(*self._layout.items(stride, 1))
@@ -302,8 +302,9 @@ class ViewKernels:
                 self._gather_blocks(found, of_blocks)
         kernel = self._kernel("gather", found, WEIGHTS=weights, SOME_BLOCKS=some, **layout.some(constant))
         items = layout.items(found.stride)
+        free = {"free": found.free.buffer, "first_free": found.free.first}
         for arguments in self._arguments(found):
-            kernel.bind(**arguments, **own, active=self._active, free=found.free, result=sums).launch(*items)
+            kernel.bind(**arguments, **own, **free, active=self._active, result=sums).launch(*items)
 
     def _gather_blocks(self, found: SweptSums, blocks: dict[str, Any]) -> None:
         kernel = self._kernel("gather_blocks", found, WEIGHTS=0, SOME_BLOCKS=0, **self._layout.macros)
