@@ -8,13 +8,14 @@ from typing import Any
 
 from potr_cl.errors import DataError
 from potr_cl.formats import load_cameras, load_scene
-from potr_cl.model.camera import Camera, test_views
+from potr_cl.model.camera import test_views, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
 from potr_cl.quality.compare import mean_view
 from potr_cl.quality.judging import Judging, Looks
 from potr_cl.quality.photographs import find_ground_truth
+from tools.workloads import scaled
 
 
 class EvaluatedScene(Owner):
@@ -24,25 +25,31 @@ class EvaluatedScene(Owner):
         folder: holds point_cloud.ply, cameras.json with test views, and photographs in ``images`` if there are any.
         device: to render on.
         every: judge by each so many-th test view only.
+        few: do without all views but each so many-th, of either kind.
+        scale: of the pictures' width and height; photographs do not fit others than 1.
 
     Attributes:
         source: the uncompressed scene.
-        cameras: all of them.
+        cameras: all of them that are left.
         views: the test views among them; every comparison is over these.
         source_bytes: of the PLY file.
     """
 
-    def __init__(self, folder: Path, device: Device, every: int = 1) -> None:
+    def __init__(self, folder: Path, device: Device, every: int = 1, few: int = 1, scale: float = 1.0) -> None:
         path = folder / "point_cloud.ply"
         self.name = folder.resolve().name
         self.source: Scene = load_scene(path)
         self.source_bytes = path.stat().st_size
-        self.cameras: list[Camera] = load_cameras(folder / "cameras.json")
+        cameras = load_cameras(folder / "cameras.json")
+        if few > 1:
+            cameras = [*train_views(cameras)[::few], *test_views(cameras)[::few]]
+        self.cameras = cameras if scale == 1 else [scaled(camera, scale) for camera in cameras]
         self.views = test_views(self.cameras)[::every]
         if not self.views:
             raise DataError(f"'{folder / 'cameras.json'}' has no test views")
         images = folder / "images"
-        self._ground_truth = find_ground_truth(images, self.views) if images.is_dir() else None
+        photographed = images.is_dir() and scale == 1
+        self._ground_truth = find_ground_truth(images, self.views) if photographed else None
         self._judging = Judging(device, self.source, self.views, Looks(ground_truth=self._ground_truth))
 
     def __call__(self, candidate: Scene) -> dict[str, float | None]:

@@ -1,6 +1,6 @@
 """Run time against error: each knob that trades one for the other, turned alone, in whole encodes.
 
-    python -m tools.study.time_error SCENE … [--device NAME] [--knobs NAME …] [--json FILE]
+    python -m tools.study.time_error SCENE … [--device NAME] [--knobs NAME …] [--few N --scale X] [--json FILE]
 
 Error is the bytes that a file takes more or fewer than one of its preset's defaults with the same PSNR on the test
 views, in percent, the mean of two qualities; what the defaults take there is read off their own curve. Time is that of
@@ -14,7 +14,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -77,9 +76,11 @@ def gap(curve: list[Point], point: Point) -> float:
     return 100 * (point["bytes"] / (size_at(curve, "psnr", point["psnr"], beyond=True) or np.nan) - 1)
 
 
-def study(results: Results, folder: Path, device: Device, knobs: Sequence[str], qualities: Sequence[float]) -> None:
+def study(
+    results: Results, evaluated: EvaluatedScene, device: Device, knobs: Sequence[str], qualities: Sequence[float]
+) -> None:
     """The table of a scene."""
-    with EvaluatedScene(folder, device) as evaluator:
+    with evaluated as evaluator:
         table = results.table(
             evaluator.name, f"Run time against error, {evaluator.name}",
             "knob; value; time, in that of the default||.2f; bytes at equal PSNR|%|+.2f; an encode|s|.2f",
@@ -113,11 +114,14 @@ def main() -> None:
     parser = scene_parser(__doc__)
     parser.add_argument("--knobs", nargs="+", choices=KNOBS, default=list(KNOBS))
     parser.add_argument("--qualities", nargs="+", type=float, default=list(QUALITIES), metavar="Q")
+    parser.add_argument("--few", type=int, default=1, metavar="N", help="take each N-th view only, for slow devices")
+    parser.add_argument("--scale", type=float, default=1.0, metavar="X", help="of the pictures' width and height")
     args = parser.parse_args()
     device = Device(choose_device(args.device))
     results = Results(device.info, args.json)
     for folder in args.scenes:
-        study(results, folder, device, args.knobs, args.qualities)
+        evaluated = EvaluatedScene(folder, device, few=args.few, scale=args.scale)
+        study(results, evaluated, device, args.knobs, args.qualities)
 
 
 if __name__ == "__main__":
