@@ -26,7 +26,7 @@ _UPLOADED = 1 << 18
 #: Splats that are copied out of a scene at a time: so few that no array of theirs is ever mapped to a file.
 _TAKEN = 1 << 16
 #: Splats whose parameters are activated at a time.
-_ACTIVATED = 1 << 15
+_ACTIVATED = 1 << 17
 
 
 class SceneBuffers(Owner):

@@ -49,8 +49,6 @@ Values = Sequence[NDArray[np.integer]]
 
 #: Of fewer splats, models may weigh more than they save.
 _FEW = 1 << 15
-#: Threads that make models.
-_MODEL_THREADS = 4
 
 
 def encode(
@@ -235,14 +233,8 @@ def encode_natively(
     encoder.take_numbers([some.tolist() for some in numbers])
     deque(run(encoder.count, range(bundles.number)), 0)
     alphabets = (tokens_of(encoder.largest().astype(np.int64)).astype(int) + 1).tolist()
-    found = [_NOTHING] * len(streams)
-
-    def model(first: int) -> None:
-        for number in range(first, len(streams), _MODEL_THREADS):
-            found[number] = encoder.model(number, alphabets[number], log_table()) or _NOTHING
-
-    # Each takes so little that more threads would wait for each other.
-    deque(run(model, range(_MODEL_THREADS)), 0)
+    # Each takes so little that threads would wait for each other.
+    found = [encoder.model(*job, log_table()) or _NOTHING for job in enumerate(alphabets)]
     models = [model if own is None else own.model for model, own in zip(found, without, strict=True)]
     encoder.take_models(models)
     coded = list(run(encoder.code, range(bundles.number)))

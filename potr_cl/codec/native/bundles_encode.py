@@ -115,7 +115,7 @@ class BundleEncoder:
         self._work = Spare(lambda: np.zeros(c["potr_bundles_encoding"](), np.uint8))
         self._sums = Spare(lambda: (np.zeros((STREAMS, COLUMNS, COLUMNS), np.int64), np.zeros(STREAMS, np.uint32)))
         self._counts = Spare(lambda: np.zeros((STREAMS, _TOKENS, _TOKENS), np.uint32))
-        self._grouping = Spare(lambda: np.empty(c["potr_bundles_grouping"](), np.uint8))
+        self._grouping = np.empty(c["potr_bundles_grouping"](), np.uint8)
         self._words = Spare(lambda: np.empty(_WORDS * _BUNDLE + 2, np.uint16))
         for place, stream in zip(self._streams, streams, strict=True):
             number, some = len(stream.terms), stream.coefficients
@@ -178,7 +178,7 @@ class BundleEncoder:
             )
 
     def model(self, stream: int, alphabet: int, logs: I64) -> Model | None:
-        """Contexts of a stream that was counted, and their frequencies; None: it has nothing.
+        """Contexts of a stream that was counted, and their frequencies, for one thread at a time; None: it has nothing.
 
         Args:
             stream: its number.
@@ -193,15 +193,14 @@ class BundleEncoder:
         if not total.any():
             return None
         classes, frequencies = np.empty(_TOKENS, np.uint8), np.empty(_GROUPS * alphabet, np.uint16)
-        with self._grouping.taken() as grouping:
-            number = self._c["potr_bundles_contexts"](
-                address(total, np.uint32, _TOKENS * _TOKENS),
-                alphabet,
-                address(logs, np.int64, _LOGS),
-                grouping.ctypes.data,
-                address(classes, np.uint8, _TOKENS, True),
-                address(frequencies, np.uint16, len(frequencies), True),
-            )
+        number = self._c["potr_bundles_contexts"](
+            address(total, np.uint32, _TOKENS * _TOKENS),
+            alphabet,
+            address(logs, np.int64, _LOGS),
+            self._grouping.ctypes.data,
+            address(classes, np.uint8, _TOKENS, True),
+            address(frequencies, np.uint16, len(frequencies), True),
+        )
         return Model(classes, frequencies[: number * alphabet].reshape(number, alphabet).astype(np.int64))
 
     def take_models(self, models: Sequence[Model]) -> None:
