@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -156,11 +156,6 @@ class Geometry:
 
     def colour_classes(self) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
         """(N,) classes of the steps of DC and of AC, in the order of the file: :class:`ColourSteps`; 0 without any."""
-        return self._classes
-
-    @cached_property
-    def _classes(self) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
-        """Found once: a re-fit asks for them while a GPU has the host wait, and the encoder again."""
         if self.steps is None:
             none = np.zeros(len(self.order), np.int8)
             return none, none

@@ -66,7 +66,7 @@ class Results:
         unseen: splats that no view sees, or that stay though none resolves them.
         price: ΔMSE below which a splat has gone.
         shares: who of the workers elsewhere does which views, with what these see.
-        pictures: of the source in the state's views, rendered in passing.
+        pictures: of the source in the state's views, drawn in passing.
         pruned: the order in which splats went.
         importance: (N,) float32, I_k of each splat of the source before any went, in the finest level's views.
         fitted: the fit, or why there is none.
@@ -235,7 +235,7 @@ class Workbench:
             yield whole if numbers is None else Shared(whole.handle, numbers.astype(np.uint32))
 
     def rendered_before(self, state: State, targets: Targets, views: Sequence[Camera]) -> Targets:
-        """Pictures of the source in some views: what was rendered in passing first, the others by ``targets``."""
+        """Pictures of the source in some views: what was drawn in passing first, the others by ``targets``."""
         pictures = state.results.pictures
         if pictures is None:
             return targets

@@ -295,7 +295,7 @@ class PicturesInPassing(Owner):
     def __init__(self, device: Device, cameras: Sequence[Camera]) -> None:
         self._device, self._memory = device, Memory(device)
         self._wanted = {id(camera): camera for camera in cameras}
-        self._rooms, self._of = dict[int, cl.Buffer](), dict[int, cl.Buffer]()
+        self._rooms, self._of = dict[int, cl.Buffer](), dict[int, tuple[Camera, cl.Buffer]]()
 
     @staticmethod
     def wanted(device: Device, cameras: Sequence[Camera]) -> PicturesInPassing | None:
@@ -325,7 +325,8 @@ class PicturesInPassing(Owner):
 
     def are_drawn(self, cameras: Iterable[Camera]) -> None:
         """From now on the pictures of these views are there, of those that have room; no others will be."""
-        self._of = {id(camera): self._rooms.pop(id(camera)) for camera in cameras if id(camera) in self._rooms}
+        there = [camera for camera in cameras if id(camera) in self._rooms]
+        self._of = {id(camera): (camera, self._rooms.pop(id(camera))) for camera in there}
         self._memory.free(*self._rooms.values())
         self._rooms, self._wanted = {}, {}
 
@@ -335,9 +336,9 @@ class PicturesInPassing(Owner):
 
     def give(self, camera: Camera, buffer: cl.Buffer, start: int) -> bool:
         """Enqueue a copy to another buffer; whether the picture is there."""
-        picture = self._of.pop(id(camera), None)
-        if picture is None:
+        if id(camera) not in self._of:
             return False
+        _, picture = self._of.pop(id(camera))
         self._device.copy(buffer, picture, target_bytes(camera), to=start)
         self._memory.free(picture)
         return True

@@ -84,6 +84,34 @@ def test_they_are_the_rasterizers_where_lists_are_long(cpu, splats, logit):
             assert np.array_equal(cpu.download(buffer, wanted.shape, np.float32), wanted)
 
 
+def test_they_are_not_drawn_where_pruning_ends_pixels_earlier(cpu):
+    with (
+        Rasterizer(cpu, SCENE) as rasterizer,
+        PicturesInPassing.wanted(cpu, CAMERAS) as pictures,
+        RemovalSweep(rasterizer, CAMERAS, SweepOptions(transmittance_threshold=1e-3), pictures=pictures) as removal,
+        Memory(cpu) as memory,
+    ):
+        removal.measure_on_device()
+        assert not pictures.give(CAMERAS[0], memory.allocate(target_bytes(CAMERAS[0]), "a picture"), 0)
+
+
+def test_pruning_goes_on_once_they_are_given(cpu):
+    totals = []
+    for drawn in (True, False):
+        with (
+            Rasterizer(cpu, SCENE) as rasterizer,
+            PicturesInPassing.wanted(cpu, CAMERAS) as pictures,
+            RemovalSweep(rasterizer, CAMERAS, pictures=pictures if drawn else None) as removal,
+            Memory(cpu) as memory,
+        ):
+            removal.measure_on_device()
+            buffer = memory.allocate(target_bytes(CAMERAS[0]), "a picture")
+            assert all(pictures.give(view, buffer, 0) == drawn for view in CAMERAS)
+            removal.remove(np.arange(10))
+            totals.append(removal.measure_totals())
+    assert np.array_equal(*totals)
+
+
 def test_views_that_do_not_stay_have_none(cpu):
     """There is room for the pictures of all before it is known which views stay."""
     scene = visible_scene(3000)

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from potr_cl.model.camera import resized
+from potr_cl.stages.refitting import own_views
 from potr_cl.stages.refitting.refit_options import RefitOptions
+from tests.devices import shared_device
 from tests.reference.refit import to_ycocg
 from tests.reference.refit_cases import Case, Linearised
 from tests.reference.scenes import plain_splats, ring_of_cameras, straight_camera, visible_scene
@@ -35,6 +37,26 @@ def test_more_views_than_are_swept_at_a_time(device):
     with Case(device, visible_scene(30, 1), visible_scene(50, 1, 5), ring_of_cameras(37, size=20)) as case:
         one, other = (case.solve(RefitOptions(steps=3, gain=0, memory=memory)) for memory in (None, 250_000))
     assert np.array_equal(one.sh, other.sh)
+
+
+def test_views_that_are_gathered_together_though_some_of_them_come_and_go(monkeypatch):
+    """What is cut stays known of some groups, and is found anew of others."""
+    device, groups, real = shared_device("cpu"), [], own_views._Gathered
+
+    def noted(own, free):
+        groups.append((len(own), sum(each.launch.resident is not None for each in own), free is not None))
+        return real(own, free)
+
+    monkeypatch.setattr(own_views, "_AT_ONCE", 1.0)
+    monkeypatch.setattr(own_views, "_Gathered", noted)
+    with Case(device, visible_scene(300, 1), visible_scene(50, 1, 5), ring_of_cameras(37, size=20)) as case:
+        wanted, *found = (
+            case.solve(RefitOptions(steps=3, gain=0, memory=memory)).sh
+            for memory in (None, 60_000, 100_000, 200_000, 400_000)
+        )
+    assert all(np.array_equal(sh, wanted) for sh in found)
+    assert any(1 < number == there and stays for number, there, stays in groups)
+    assert any(0 < there < number and not stays for number, there, stays in groups)
 
 
 def solve_and_check(case: Case, options: RefitOptions, active=None) -> np.ndarray:

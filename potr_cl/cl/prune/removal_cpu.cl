@@ -39,6 +39,7 @@
 #ifndef PICTURES
 #define PICTURES 0
 #endif
+
 /* A sub-tile's walk forward. Its transmittances and colours move on; memory[2 j] and memory[2 j + 1] become the alphas
    and weights of the j-th splat. `drawn`: transmittances and colours where the picture's pixels end, which move on with
    PICTURES. Returns the number of splats before the last pixel's end. */

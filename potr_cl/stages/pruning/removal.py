@@ -102,7 +102,7 @@ class RemovalSweep(Owner):
             room = default_memory(self.device) if options.memory is None else options.memory
             plan = plans.whole(range(len(cameras)) if numbers is None else numbers, self.splats, room)
         self._cameras, self._pending, self._helpers = cameras, list[cl.Event](), helpers
-        self._pictures = pictures
+        self._pictures, self._threshold = pictures, options.transmittance_threshold
         with ExitStack() as owned:
             owned.callback(source.close)
             self._memory = owned.enter_context(Memory(self.device))
@@ -136,7 +136,10 @@ class RemovalSweep(Owner):
     ) -> PreparedSet:
         if memory is not None:
             return PreparedSet(subset.rasterizer, views, memory, target)
-        picture = None if self._pictures is None else self._pictures.room_for(views)
+        picture, rules = None, subset.rasterizer.rules
+        # Pictures whose pixels end later than those of pruning it cannot draw.
+        if self._pictures is not None and (self._threshold or 0.0) <= rules.transmittance_threshold:
+            picture = self._pictures.room_for(views)
         # The device sorts the lists while the next view is made ready.
         return PreparedSet(subset.rasterizer, views, None, target, self._pending, picture)
 

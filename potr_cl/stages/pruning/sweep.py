@@ -207,7 +207,6 @@ class SetKernels:
                 "view": camera_struct(view.camera),
                 "scale": fixed_point.scale * weight,
                 "bound": fixed_point.bound / weight,
-                "picture": prepared.picture or prepared.target,  # which is not looked at
             }
             both["counts"] = prepared.counts
         else:
@@ -245,12 +244,15 @@ class SetKernels:
             "target": prepared.target,
             "totals": ledger.totals,
         }
-        self._removal = device.kernel(source, "removal", **macros).bind(**both, **swept)
+        # Only programs that draw look at the picture.
+        none = {"picture": prepared.target} if device.family == "cpu" else {}
+        self._removal = device.kernel(source, "removal", **macros).bind(**both, **swept, **none)
         self._later: Kernel | None = None
         if first_time and prepared.picture is not None:
             drawing = {"PICTURES": 1, "PICTURE_THRESHOLD": rasterizer.rules.transmittance_threshold}
             self._later = self._removal
-            self._removal = device.kernel(source, "removal", **macros, **drawing).bind(**both, **swept)
+            self._removal = device.kernel(source, "removal", **macros, **drawing)
+            self._removal.bind(**both, **swept, picture=prepared.picture)
         self._staleness = device.kernel(source, "staleness", **macros).bind(
             alive=ledger.marks, first=prepared.first_tile, stale=lists.stale, **both, **noted
         )

@@ -88,7 +88,7 @@ class Look:
     Attributes:
         x: (3 M, stride) float32 on the device, coefficients or a direction; None: black, for blocks alone.
         targets: what pictures of coefficients should show; None: x is a direction.
-        at: the coefficients, where x is a direction. unit: it is multiplied by this.
+        at: the coefficients that were looked at last, where x is a direction. unit: it is multiplied by this.
         constant: only constant coefficients: leave the sums of others alone; a direction's others are all 0.
         every: of so many blocks of pixels one is looked at (:meth:`RefitSweep.run`).
         back: whether sums are wanted, and not only errors.
@@ -219,7 +219,7 @@ class OwnViews(Owner):
         kernels, targets = self._kernels, look.targets
         background = (0.0, 0.0, 0.0) if targets is None else self._background
         if look.x is None:
-            self._coefficients.zero(self._change)  # black, and no channel is free
+            self._coefficients.zero(self._change)  # black: the sums of channels are 0, whichever are free
         for gathered in self._gathered:
             every, free = gathered.views, Free(self._free, self._passing if gathered.free is None else gathered.free)
             changed, of_next = self._change_together(gathered, free, look), free
@@ -334,7 +334,7 @@ class _Slot:
     """Where a launch that is gathered together with others has its own buffers.
 
     Attributes:
-        change: (views, stride, 4) float32, what the launch's views composite, or its w.
+        change: (views, stride, 4) float32, what the launch's views composite.
         totals: (views, stride, 4) int64.
     """
 
