@@ -325,8 +325,8 @@ class PicturesInPassing(Owner):
 
     def are_drawn(self, cameras: Iterable[Camera]) -> None:
         """From now on the pictures of these views are there, of those that have room; no others will be."""
-        there = [camera for camera in cameras if id(camera) in self._rooms]
-        self._of = {id(camera): (camera, self._rooms.pop(id(camera))) for camera in there}
+        there = {id(camera): camera for camera in cameras if id(camera) in self._rooms}
+        self._of = {key: (camera, self._rooms.pop(key)) for key, camera in there.items()}
         self._memory.free(*self._rooms.values())
         self._rooms, self._wanted = {}, {}
 

@@ -95,6 +95,19 @@ def test_they_are_not_drawn_where_pruning_ends_pixels_earlier(cpu):
         assert not pictures.give(CAMERAS[0], memory.allocate(target_bytes(CAMERAS[0]), "a picture"), 0)
 
 
+def test_a_view_that_counts_twice_has_one(cpu):
+    views = [CAMERAS[0], CAMERAS[1], CAMERAS[0]]
+    with (
+        Rasterizer(cpu, SCENE) as rasterizer,
+        PicturesInPassing.wanted(cpu, views) as pictures,
+        RemovalSweep(rasterizer, views, pictures=pictures) as removal,
+        Memory(cpu) as memory,
+    ):
+        removal.measure_on_device()
+        buffer = memory.allocate(target_bytes(CAMERAS[0]), "a picture")
+        assert [pictures.give(view, buffer, 0) for view in views] == [True, True, False]
+
+
 def test_pruning_goes_on_once_they_are_given(cpu):
     totals = []
     for drawn in (True, False):
