@@ -212,7 +212,7 @@ def _cells_of(rays: F32) -> NDArray[np.int64]:
 
 
 def _weighted_quantile(values: F64, weights: F64, part: float) -> float:
-    # Where values are equal, their order is of no account.
+    # In what order equal values come, moves no more than the last digit of a sum.
     order = np.argsort(values)
     sums = np.cumsum(weights[order])
     return float(values[order[min(int(np.searchsorted(sums, part * sums[-1])), len(order) - 1)]])

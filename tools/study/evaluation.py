@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from potr_cl.errors import DataError
+from potr_cl.errors import DataError, UsageError
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model.camera import test_views, train_views
 from potr_cl.model.scene import Scene
@@ -33,9 +33,15 @@ class EvaluatedScene(Owner):
         cameras: all of them that are left.
         views: the test views among them; every comparison is over these.
         source_bytes: of the PLY file.
+
+    Raises:
+        UsageError: ``few`` or ``scale`` leaves nothing to look at.
+        DataError: there are no test views.
     """
 
     def __init__(self, folder: Path, device: Device, every: int = 1, few: int = 1, scale: float = 1.0) -> None:
+        if few < 1 or not 0 < scale <= 1:
+            raise UsageError(f"each {few}-th view at {scale:g} of its size: give at least 1, and more than 0 up to 1")
         path = folder / "point_cloud.ply"
         self.name = folder.resolve().name
         self.source: Scene = load_scene(path)

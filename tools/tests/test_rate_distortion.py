@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 
 from potr_cl.errors import UsageError
+from potr_cl.model.camera import test_views as judging_views
 from potr_cl.pipeline.options import EncodeOptions
+from tests.devices import shared_device
 from tests.reference.scenes import random_scene
-from tools.study import ablation, formats, rate_distortion
+from tools.study import ablation, formats, placed_views, rate_distortion
+from tools.study.evaluation import EvaluatedScene
 from tools.study.rate_distortion import merged
 from tools.workloads import excerpt
 
@@ -190,3 +193,28 @@ def test_ablation(monkeypatch, folder, tmp_path):
     assert ply[:2] == ["as PLY", 12.0]
     for (_, splats, size, *_), (*_, a_splat) in list(zip(steps, parts, strict=True))[1:]:
         assert 0 < 1e6 * size - a_splat * splats < 3000, "more than the header is missing"
+
+
+def test_a_part_of_the_views_in_smaller_pictures(folder):
+    device = shared_device("cpu")
+    with EvaluatedScene(folder, device) as whole, EvaluatedScene(folder, device, few=3, scale=0.5) as part:
+        assert len(part.views) == -(-len(whole.views) // 3)
+        assert judging_views(part.cameras) == part.views
+        assert {camera.width for camera in part.cameras} == {camera.width // 2 for camera in whole.cameras}
+        mean, worst = part.mean_and_worst(random_scene(5))
+        assert worst <= mean < 60
+    for few, scale in ((0, 1.0), (-2, 1.0), (1, 0.0), (1, 2.0), (1, np.nan)):
+        with pytest.raises(UsageError, match="give at least 1"):
+            EvaluatedScene(folder, device, few=few, scale=scale)
+
+
+def test_placed_views_against_true_ones(monkeypatch, folder, tmp_path, capsys):
+    kept = tmp_path / "placed.json"
+    call(monkeypatch, placed_views, folder, "--views", "6x48", "--true", "0.3", "0.5", "--json", kept)
+    (table,) = json.loads(kept.read_text()).values()
+    (row,) = table["rows"]
+    assert row[1] == "6 of 48"
+    assert isinstance(row[-1], float)
+    with pytest.raises(SystemExit):
+        call(monkeypatch, placed_views, folder, "--views", "many")
+    assert "invalid" in capsys.readouterr().err

@@ -222,9 +222,10 @@ class OwnViews(Owner):
             self._coefficients.zero(self._change)  # black: the sums of channels are 0, whichever are free
         for gathered in self._gathered:
             every, free = gathered.views, Free(self._free, self._passing if gathered.free is None else gathered.free)
-            changed, of_next = self._change_together(gathered, free, look), free
+            changed, first = self._change_together(gathered, free, look), free.first
             for slot, own in zip(self._slots, gathered.launches, strict=False):
-                of_own, of_next = of_next, Free(self._free, of_next.first + own.launch.size)
+                of_own = Free(self._free, first)
+                first += own.launch.size
                 with self._engine.ready(own.launch) as ready:
                     views, picks, (shapes, colours) = ready.views, ready.subset.numbers, ready.geometry
                     swept, target = slot.change, None
