@@ -177,9 +177,10 @@ class Prune(Stage):
             return self._pruned(told, bench, visibility, hidden=hidden)
         seen = np.flatnonzero(~hidden)
         if not len(seen):
-            everything = np.arange(splats)
             nothing = np.zeros(splats, np.float32)
-            return _knowing(told, Pruned(splats, np.full(splats, -1, np.int32), 0, nothing, lambda: Course(everything)))
+            return _knowing(
+                told, Pruned(splats, np.full(splats, -1, np.int32), 0, nothing, lambda: Course(np.zeros(splats)))
+            )
         if visibility is not None:
             visibility = visibility_of_large(state.scene.uncoloured().subset(seen), state.views)
         return self._pruned(told, bench, visibility, seen, hidden)

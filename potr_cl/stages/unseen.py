@@ -7,7 +7,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -194,18 +193,16 @@ def as_of_whole(seen: NDArray[np.int64], hidden: NDArray[np.bool_], pruned: Prun
         pruned: what was done to those that are seen.
     """
     unseen = np.flatnonzero(hidden)
-    removed = len(seen) - pruned.kept
     iteration_of = np.full(len(unseen) + len(seen), -1, np.int32)
     iteration_of[seen] = pruned.iteration_of
     importance = np.zeros(len(iteration_of), np.float32)
     importance[seen] = pruned.importance
 
     def course() -> Course:
-        order = seen[pruned.order]
-        return Course(
-            np.concatenate([order[:removed], unseen, order[removed:]]),
-            tuple(dataclasses.replace(each, left=each.left + len(unseen)) for each in pruned.history),
-        )
+        own = pruned.course()
+        # Those that no view sees would go before all that are left.
+        score = np.full(len(iteration_of), -np.inf)
+        score[seen] = own.score
+        return Course(score, tuple(dataclasses.replace(each, left=each.left + len(unseen)) for each in own.history))
 
-    kept = pruned.kept + len(unseen)
-    return Pruned(kept, iteration_of, pruned.iterations, importance, lru_cache(maxsize=1)(course))
+    return Pruned(pruned.kept + len(unseen), iteration_of, pruned.iterations, importance, course)

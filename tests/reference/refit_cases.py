@@ -103,9 +103,9 @@ class Linearised:
         """(N, M, 3) in Y, Co, Cg: the coefficients that may change."""
         self._refit.coefficients.activate(active)
 
-    def error_alone(self, targets: Targets, every: int = 1) -> float:
-        """|pictures - targets|^2 by W, without a gradient, by one of so many blocks of pixels."""
-        return self._refit.colour_map.error(self._at, targets, every)
+    def error_alone(self, targets: Targets) -> float:
+        """|pictures - targets|^2 by W, without a gradient."""
+        return self._refit.colour_map.error(self._at, targets)
 
     def gradient_of_dc(self, targets: Targets, every: int) -> tuple[Array, float]:
         """(N, 3) in Y, Co, Cg, the gradient of the constant coefficients, and the error; by one of so many blocks."""

@@ -196,7 +196,7 @@ def test_a_gradient_by_some_blocks(device, every, monkeypatch):
     scene = visible_scene(60, 1)
     with Case(device, scene, visible_scene(60, 3), cameras) as case, Linearised(case) as linear:
         found, error = linear.gradient_of_dc(case.targets, every)
-        again, alone = linear.gradient_of_dc(case.targets, every), linear.error_alone(case.targets, every)
+        again = linear.gradient_of_dc(case.targets, every)
         whole, all_error = linear.gradient[:, 0], linear.error
         reference = case.reference()
         images = [-residual for residual in reference.residuals()]
@@ -206,7 +206,7 @@ def test_a_gradient_by_some_blocks(device, every, monkeypatch):
         wanted = every * reference.transposed(images)[:, 0]
         squares = [view.weight * (image**2).sum() for view, image in zip(reference.views, images, strict=True)]
     assert np.array_equal(found, again[0])
-    assert error == again[1] == pytest.approx(alone, rel=1e-6)
+    assert error == again[1]
     if device.family == "gpu":
         assert np.array_equal(found, whole)
         assert error == all_error
@@ -240,28 +240,25 @@ def test_steps_by_half_of_the_pixels_are_for_many_of_them_and_rounds_that_follow
 @pytest.mark.one_family
 @pytest.mark.parametrize(("splats", "wanted"), [(40, {1, 2}), (60, {1})])
 def test_the_last_gradient_is_by_half_of_many_pixels(device, splats, wanted, monkeypatch):
-    """3 views of 40 x 40 pixels are 120 for each of 40 splats, and 80 of 60."""
-    asked, ends, gradient, error = list[int](), list[int](), ColourMap.gradient, ColourMap.error
+    """3 views of 40 x 40 pixels are 120 for each of 40 splats, and 80 of 60. Nobody measures what comes of it."""
+    asked, gradient = list[int](), ColourMap.gradient
 
     def noted(self, x, targets, result, blocks=None, constant=False, every=1):
         assert constant or every == 1
         asked.append(every)
         return gradient(self, x, targets, result, blocks, constant, every)
 
-    def measured(self, x, targets, every=1):
-        ends.append(every)
-        return error(self, x, targets, every)
+    def measured(self, x, targets):
+        raise AssertionError
 
     monkeypatch.setattr(ColourMap, "gradient", noted)
     monkeypatch.setattr(ColourMap, "error", measured)
     options, scene = RefitOptions(steps=2, gain=0, drop=1e-9), visible_scene(splats, 1)
-    with Case(device, scene, scene, ring_of_cameras(3, size=40)) as case:
+    with Case(device, scene, visible_scene(splats, 3), ring_of_cameras(3, size=40)) as case:
         refit_colours(
             device, scene, case.cameras, case.targets, options, colour_grid=lambda effects: grid_of(splats)
         )  # fmt: skip
     assert set(asked) == wanted
-    assert max(wanted) in ends
-    assert max(ends) == max(wanted)
 
 
 def test_few_views_are_looked_at_whole(device):

@@ -18,7 +18,7 @@ from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.opencl.structs import bytes_before, struct_dtype
 from potr_cl.raster.sweep import totals_limits
 from potr_cl.stages.pruning.removal import RemovalSweep
-from potr_cl.stages.pruning.schedule import BEYOND, Course, Indices, Iteration, Pruned, PruningOptions, prune
+from potr_cl.stages.pruning.schedule import BEYOND, Course, Iteration, Pruned, PruningOptions, prune
 
 _SOURCE = "prune/choose_gpu.cl"
 #: A score has so many digits, each of so many values; a work-group has a work-item for each value.
@@ -138,33 +138,21 @@ class _Controller(Owner):
             final = np.flatnonzero(iteration == iteration.max())
             last = final[ascending(removed["key"][final])][-1]
             alive[last], iteration[last] = True, -1
-        left = np.flatnonzero(alive)
         # Others go on with what is left meanwhile.
-        course = in_background(self._course, done, iteration, removed, left, smoothed)
-        return Pruned(len(left), iteration, done, importance, course.result)
+        course = in_background(_course, iteration, removed, smoothed)
+        return Pruned(int(np.count_nonzero(alive)), iteration, done, importance, course.result)
 
-    def _course(
-        self, done: int, iteration: NDArray[np.int32], removed: np.ndarray, left: Indices, smoothed: NDArray[np.float32]
-    ) -> Course:
-        """In which order splats went, and those that are left would go; what is known of each iteration.
 
-        In place, one iteration after the other: what all of a large scene's splats need at once is as large as the
-        scene.
-        """
-        # Small integers are put in order by counting; those that are left come last.
-        small = np.uint16 if done < 1 << 16 else np.uint32
-        order = np.argsort(np.where(iteration < 0, done, iteration).astype(small), kind="stable")
-        ends = np.cumsum(np.bincount(iteration[iteration >= 0], minlength=done)[:done])
-        history = []
-        gone = 0
-        for end in ends.tolist():
-            if gone == end:
-                continue
-            own = order[gone:end]
-            own[:] = own[ascending(removed["key"][own])]
-            gone = end
-            importance, effect = (removed[name][own].astype(np.float64) for name in ("importance", "effect"))
-            weight, harm = (float(np.add.reduceat(values, [0])[0]) for values in (importance, effect))
-            history.append(Iteration(self._splats - gone, weight, harm, float(effect.max())))
-        order[gone:] = left[ascending(smoothed[left])]
-        return Course(order, tuple(history))
+def _course(iteration: NDArray[np.int32], removed: np.ndarray, smoothed: NDArray[np.float32]) -> Course:
+    """What the device has told: (N,) in which iteration each splat went, else -1, and what it was worth then."""
+    score = np.where(iteration < 0, smoothed, removed["key"])
+    gone = np.flatnonzero(iteration >= 0)
+    own, effects = iteration[gone], removed["effect"][gone]
+    counts = np.bincount(own)
+    importance, effect = (np.bincount(own, values) for values in (removed["importance"][gone], effects))
+    largest = np.full(len(counts), -np.inf)
+    np.maximum.at(largest, own, effects)
+    some = np.flatnonzero(counts)
+    left = len(iteration) - np.cumsum(counts)
+    columns = (each[some].tolist() for each in (left, importance, effect, largest))
+    return Course(score, tuple(Iteration(*each) for each in zip(*columns, strict=True)))

@@ -89,9 +89,14 @@ class Iteration:
 
 @dataclass(frozen=True)
 class Course:
-    """How a pruning run went; see :class:`Pruned`."""
+    """How a pruning run of N splats went.
 
-    order: Indices
+    Attributes:
+        score: (N,) float64, in which order the splats of an iteration went, and those that are left would.
+        history: what is known of the rounds that removed splats.
+    """
+
+    score: NDArray[np.float64]
     history: tuple[Iteration, ...] = ()
 
 
@@ -104,7 +109,7 @@ class Pruned:
         iteration_of: (N,) int32, the iteration (from 0) in which each splat went; -1 for the kept ones.
         iterations: rounds that were run: fewer than asked for when nothing was left to decide.
         importance: (N,) float32, I_k of each splat before any went.
-        course: gives the course of the run, which takes long to find of millions of splats, and few ask for.
+        course: gives how it went, once that has been found.
     """
 
     kept: int
@@ -116,7 +121,8 @@ class Pruned:
     @property
     def order(self) -> Indices:
         """(N,) all splats: first the removed ones as they went, then the kept ones by ascending (smoothed) ΔMSE."""
-        return self.course().order
+        last = np.where(self.iteration_of < 0, self.iterations, self.iteration_of)
+        return np.lexsort((self.course().score, last))
 
     @property
     def history(self) -> tuple[Iteration, ...]:
@@ -234,7 +240,7 @@ def prune(
     """
     alive = np.arange(splats, dtype=np.int64)
     iteration_of = np.full(splats, -1, np.int32)
-    removed: list[Indices] = []
+    score = np.empty(splats)
     history: list[Iteration] = []
     done = 0
     delta_mse = np.zeros(splats)
@@ -253,7 +259,7 @@ def prune(
         if len(gone) == 0:
             break  # no candidate is left, and measuring again would find the same
         iteration_of[gone] = iteration
-        removed.append(gone)
+        score[gone] = np.arange(len(gone))
         effects.remove(gone)  # first: the device is busy with it during the rest
         alive = alive[iteration_of[alive] < 0]
         effect = newest[gone]
@@ -262,6 +268,6 @@ def prune(
             progress(done, len(alive))
         if after_iteration is not None:
             after_iteration(iteration)
-    kept = alive[ascending(delta_mse[alive])]
-    course = Course(np.concatenate([*removed, kept]), tuple(history))
-    return Pruned(len(kept), iteration_of, done, at_first, lambda: course)
+    score[alive] = delta_mse[alive]
+    course = Course(score, tuple(history))
+    return Pruned(len(alive), iteration_of, done, at_first, lambda: course)

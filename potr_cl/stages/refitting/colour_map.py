@@ -101,22 +101,22 @@ class ColourMap:
         """Of how many blocks of pixels a gradient looks at one: on GPUs the errors of others would count too."""
         return every if self.own.count >= ENOUGH and self._coefficients.device.family == "cpu" else 1
 
-    def error(self, x: Vector, targets: Targets, every: int = 1) -> float:
+    def error(self, x: Vector, targets: Targets) -> float:
         """The squared error by W at x, as :meth:`gradient` returns it, which takes nearly twice as long.
 
         Colours that are cut at 0 at x are settled here too.
 
         Args:
-            x, targets, every: as of :meth:`gradient`.
+            x, targets: as of :meth:`gradient`.
         """
-        own, on_device, every = self.own, self._coefficients.on_device(x), self._sampled(every)
+        own, on_device = self.own, self._coefficients.on_device(x)
         if self._helpers is not None:
             own.prepare(targets)
-            self._helpers.begin_gradient(on_device, None, False, every, back=False)
-        own.add_up(Look(on_device, targets, every=every, back=False))
+            self._helpers.begin_gradient(on_device, None, False, back=False)
+        own.add_up(Look(on_device, targets, back=False))
         errors = {} if self._helpers is None else self._helpers.add(own.sums, None)
         errors |= own.found_errors()
-        return every * math.fsum(errors[number] for number in sorted(errors))
+        return math.fsum(errors[number] for number in sorted(errors))
 
     def normal(
         self,

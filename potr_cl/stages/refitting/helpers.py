@@ -265,7 +265,9 @@ class ColourHelpers(Owner):
         self._ask_drawn = not in_process and len(others) > 1
         self._drawn: DrawnRows | None = None
 
-    def begin_gradient(self, x: cl.Buffer, blocks: range | None, constant: bool, every: int, back: bool = True) -> None:
+    def begin_gradient(
+        self, x: cl.Buffer, blocks: range | None, constant: bool, every: int = 1, back: bool = True
+    ) -> None:
         """Have them begin with a gradient at x and the own blocks of some splats; or only with the error there.
 
         Args:

