@@ -67,7 +67,8 @@ typedef struct {
     const fitted_stream *fitted;
     int64_t *grams;    /* (streams, COLUMNS, COLUMNS) */
     uint32_t *largest; /* (streams) largest integer, mapped to unsigned */
-    uint32_t *counts;  /* (streams, 256, 256) of expected size and token */
+    uint32_t *counts;  /* (streams, 256, alphabet) of expected size and token */
+    size_t alphabet;
     uint64_t at_least; /* samples of a bundle */
     size_t lanes;
 } pass;
@@ -186,11 +187,11 @@ static void visit(const pass *p, size_t s, const int16_t *const *terms, const in
     cut(e->sums, made->expected, rows);
     if (!p->counts)
         return;
-    uint32_t *const counts = p->counts + s * TOKENS * TOKENS;
+    uint32_t *const counts = p->counts + s * TOKENS * p->alphabet;
     for (size_t step = 0; step < steps; step++) {
         const size_t count = (items - step + steps - 1) / steps;
         for (size_t at = step * LANES; at < step * LANES + count; at++)
-            counts[(size_t)made->expected[at] * TOKENS + made->tokens[at]]++;
+            counts[made->expected[at] * p->alphabet + made->tokens[at]]++;
     }
 }
 
@@ -410,15 +411,16 @@ POTR_EXPORT void potr_bundles_survey(
     const file_integers *file, uint64_t bundle, const fitted_stream *streams, encoding *e, uint64_t at_least,
     int64_t *grams, uint32_t *largest)
 {
-    pass p = { e, streams, grams, largest, NULL, at_least, 0 };
+    pass p = { e, streams, grams, largest, NULL, 0, at_least, 0 };
     make_streams(file, bundle, &p);
 }
 
-/* Adds to counts (25, 256, 256) how often each expected size has each token. streams: with their numbers. */
+/* Adds to counts (25, 256, alphabet) how often each expected size has each token. streams: with their numbers. */
 POTR_EXPORT void potr_bundles_count(
-    const file_integers *file, uint64_t bundle, const fitted_stream *streams, encoding *e, uint32_t *counts)
+    const file_integers *file, uint64_t bundle, const fitted_stream *streams, encoding *e, size_t alphabet,
+    uint32_t *counts)
 {
-    pass p = { e, streams, NULL, NULL, counts, 0, 0 };
+    pass p = { e, streams, NULL, NULL, counts, alphabet, 0, 0 };
     make_streams(file, bundle, &p);
 }
 
@@ -481,7 +483,7 @@ POTR_EXPORT size_t potr_bundles_code(
 {
     static const size_t begin[SECTIONS + 1] = { OPACITY_STREAM, SCALE_STREAM, DC_STREAM, BAND_STREAM,
         BAND_STREAM + BAND_STREAMS, BAND_STREAM + 2 * BAND_STREAMS, ROTATION_STREAM, STREAMS };
-    pass p = { e, streams, NULL, NULL, NULL, 0, 0 };
+    pass p = { e, streams, NULL, NULL, NULL, 0, 0, 0 };
     make_streams(file, bundle, &p);
     writer w = { words, room };
     for (size_t l = 0; l < LANES; l++)

@@ -126,20 +126,20 @@ POTR_EXPORT size_t potr_bundles_grouping(void)
 
 /* Contexts by expected size, and the frequencies of each.
  *
- * counts: (256, 256) of expected sizes and tokens, at least one. alphabet: more than the largest token. logs: (4096)
+ * counts: (256, alphabet) of expected sizes and tokens, at least one. alphabet: more than the largest token. logs: (4096)
  * log2 of each number, rounded to units of 2^-16. g: room. classes: (256), filled. frequencies: (64 · alphabet), filled
  * with (contexts, alphabet). Returns the number of contexts. */
 POTR_EXPORT size_t potr_bundles_contexts(
     const uint32_t *counts, size_t alphabet, const int64_t *logs, grouping *g, uint8_t *classes, uint16_t *frequencies)
 {
     uint64_t total = 0, before = 0, last = 0;
-    for (size_t i = 0; i < TOKENS * TOKENS; i++)
+    for (size_t i = 0; i < TOKENS * alphabet; i++)
         total += counts[i];
     g->logs = logs;
     g->alphabet = alphabet;
     g->number = 0;
     for (int size = 0; size < TOKENS; size++) {
-        const uint32_t *const row = counts + (size_t)size * TOKENS;
+        const uint32_t *const row = counts + (size_t)size * alphabet;
         uint64_t of_size = 0;
         for (size_t k = 0; k < alphabet; k++)
             of_size += row[k];

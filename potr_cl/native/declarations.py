@@ -48,7 +48,7 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
     "potr_bundles_wait": (ctypes.c_int32, [_POINTER, _WORD]),
     "potr_bundles_encoding": (_SIZE, []),
     "potr_bundles_survey": (None, [_POINTER, _WORD, _POINTER, _POINTER, _WORD, _POINTER, _POINTER]),
-    "potr_bundles_count": (None, [_POINTER, _WORD, *[_POINTER] * 3]),
+    "potr_bundles_count": (None, [_POINTER, _WORD, _POINTER, _POINTER, _SIZE, _POINTER]),
     "potr_bundles_code": (_SIZE, [_POINTER, _WORD, *[_POINTER] * 3, _SIZE, *[_POINTER] * 3]),
     "potr_bundles_grouping": (_SIZE, []),
     "potr_bundles_contexts": (_SIZE, [_POINTER, _SIZE, *[_POINTER] * 4]),

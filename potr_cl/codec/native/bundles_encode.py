@@ -114,7 +114,8 @@ class BundleEncoder:
         self._streams = (_Stream * STREAMS)()
         self._work = Spare(lambda: np.zeros(c["potr_bundles_encoding"](), np.uint8))
         self._sums = Spare(lambda: (np.zeros((STREAMS, COLUMNS, COLUMNS), np.int64), np.zeros(STREAMS, np.uint32)))
-        self._counts = Spare(lambda: np.zeros((STREAMS, _TOKENS, _TOKENS), np.uint32))
+        self._counts = Spare(lambda: np.zeros((STREAMS, _TOKENS, self._alphabet), np.uint32))
+        self._alphabet = 0
         self._grouping = np.empty(c["potr_bundles_grouping"](), np.uint8)
         self._words = Spare(lambda: np.empty(_WORDS * _BUNDLE + 2, np.uint16))
         for place, stream in zip(self._streams, streams, strict=True):
@@ -159,8 +160,16 @@ class BundleEncoder:
         most: U32 = np.max([largest for _, largest in self._sums.all()], axis=0)
         return most
 
-    def take_numbers(self, numbers: Sequence[Sequence[int]]) -> None:
-        """What tells the contexts of each stream: weights of terms and of recent sizes, constant, biases."""
+    def take_numbers(self, numbers: Sequence[Sequence[int]], alphabet: int) -> None:
+        """What tells the contexts of each stream, once all bundles have been surveyed.
+
+        Args:
+            numbers: weights of terms and of recent sizes, constant, biases.
+            alphabet: more than any stream's largest token.
+        """
+        if not 0 < alphabet <= _MOST_ALPHABET:
+            raise TypeError("the native path was given no tokens, or too many")
+        self._alphabet = alphabet
         for to, some in zip(self._streams, numbers, strict=True):
             if len(some) != to.terms + 2 + to.coefficients:
                 raise TypeError("the native path was given too few numbers")
@@ -174,6 +183,7 @@ class BundleEncoder:
                 self._checked(bundle),
                 self._streams,
                 work.ctypes.data,
+                self._alphabet,
                 address(counts, np.uint32, counts.size, True),
             )
 
@@ -185,16 +195,16 @@ class BundleEncoder:
             alphabet: more than its largest token.
             logs: (4096,) log₂ of each number, in units of 2^-16.
         """
-        if not 0 < alphabet <= _MOST_ALPHABET:
+        if not 0 < alphabet <= self._alphabet:
             raise TypeError("the native path was given no tokens, or too many")
-        total = np.zeros((_TOKENS, _TOKENS), np.uint32)
+        total = np.zeros((_TOKENS, alphabet), np.uint32)
         for counts in self._counts.all():
-            total[:, :alphabet] += counts[stream, :, :alphabet]
+            total += counts[stream, :, :alphabet]
         if not total.any():
             return None
         classes, frequencies = np.empty(_TOKENS, np.uint8), np.empty(_GROUPS * alphabet, np.uint16)
         number = self._c["potr_bundles_contexts"](
-            address(total, np.uint32, _TOKENS * _TOKENS),
+            address(total, np.uint32, _TOKENS * alphabet),
             alphabet,
             address(logs, np.int64, _LOGS),
             self._grouping.ctypes.data,
