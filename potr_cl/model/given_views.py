@@ -46,7 +46,7 @@ class GivenViews:
 
     def __init__(self, scene: Scene, cameras: Sequence[Camera], run: Run = map) -> None:
         every = max(len(scene) // _TAKEN, 1)
-        some = scene.subset(np.arange(0, len(scene), every))
+        some = scene.of_arrays([each[::every] for each in scene.arrays])
         self._frame = frame_of(some, run)
         matter = matter_of(some, self._frame, _TARGETS, _OCCLUDERS)
         # Each point stands for the surface of the splats that were not taken, too.
@@ -79,8 +79,10 @@ class GivenViews:
         little of each house. With weights w of V views, the part is (Σ w)² / (V Σ w²), 1 if all show the splat alike
         and 1 / V if one alone does (Kish 1965, effective sample size).
         """
-        ways = self._matter.targets - self._places[:, None]
-        squares = np.maximum(np.einsum("pka,pka->pk", ways, ways), 1e-12)
+        x, y, z = (
+            (axis - places[:, None]) ** 2 for axis, places in zip(self._matter.targets.T, self._places.T, strict=True)
+        )
+        squares = np.maximum(x + y + z, 1e-12)
         sizes = self._shown / (self._fields[:, None] * squares)
         sizes = sizes[:, self._shown.any(axis=0)]
         if not sizes.size:

@@ -59,7 +59,9 @@ def points_on_splats(means: F64, scales: F64, quaternions: F64, opacities: F64, 
 
 def opacity_weighted(scales: F64, opacities: F64) -> F64:
     """(N,) area of each splat's largest cross-section, its whole bell, times its opacity."""
-    area: F64 = 2 * np.pi * np.sort(scales, axis=1)[:, 1:].prod(axis=1) * opacities
+    a, b, c = scales.T
+    low, high = np.minimum(a, b), np.maximum(a, b)
+    area: F64 = 2 * np.pi * (np.maximum(low, np.minimum(high, c)) * np.maximum(high, c)) * opacities
     return area
 
 

@@ -13,7 +13,11 @@ from potr_cl.raster.view_set import TILE, ViewSet, camera_struct
 
 #: Work-items of a tile's work-group on a GPU, and views of a launch there. A CPU does one view at a time, a work-item a
 #: tile.
-_GROUP, _MOST_VIEWS = 128, 32
+_GROUP = 128
+#: Views that a launch of a GPU does at most. At its end the longest tile list keeps one work-group busy when all others
+#: are done, so one launch is quicker than several. But GPUs that share the host's memory are slow, and drivers end what
+#: takes seconds.
+_MOST_VIEWS, _MOST_VIEWS_OF_SLOW = 128, 32
 
 
 def sweep_limits(device: Device) -> dict[str, int]:
@@ -46,6 +50,13 @@ def fixed_point_scale(width: int, height: int, largest: float) -> float:
     return 2.0 ** math.floor(62 - math.log2(largest * padded_area(width, height)))
 
 
+def most_views(device: Device) -> int:
+    """Views that a launch over tiles does at most."""
+    if device.family == "cpu":
+        return 1
+    return _MOST_VIEWS_OF_SLOW if device.info.shares_host_memory else _MOST_VIEWS
+
+
 class TileSweep:
     """A kernel that goes over the tiles of some views, in a program for each family.
 
@@ -63,7 +74,7 @@ class TileSweep:
 
     def __init__(self, device: Device, rules: RasterRules, source: str, kernel: str, **macros: float) -> None:
         self._gpu = device.family == "gpu"
-        self.lanes, self.most_views = (1, _MOST_VIEWS) if self._gpu else (device.vector_width, 1)
+        self.lanes, self.most_views = 1 if self._gpu else device.vector_width, most_views(device)
         self._kernel = device.shared_kernel(
             f"{source}_{device.family}.cl",
             kernel,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,8 @@ U32 = NDArray[np.uint32]
 COLUMNS, NUMBERS = 22, 21
 _TOKENS = 256
 _LANES, _BUNDLE = 32, 8192
+#: Memory that stays for the bundles of other files, in which some 4 MB of each have been written to.
+_KEPT = 16
 _MOST_ALPHABET, _GROUPS, _LOGS = 252, 64, 4096
 #: Words that a bundle can have at most, for each splat: of 13 streams of splats, and of 15 coefficients' patterns and
 #: values. A token and its bits take four at most.
@@ -74,6 +77,12 @@ class CodedBundle:
     rotation_states: U32
 
 
+@lru_cache(maxsize=1)
+def _memory(nbytes: int) -> Spare[U8]:
+    """What threads encode bundles in, of all files: new memory would take them longer than to survey a bundle."""
+    return Spare(lambda: np.zeros(nbytes, np.uint8), most=_KEPT)
+
+
 class BundleEncoder:
     """A file's integers, whose bundles any thread may go through.
 
@@ -112,7 +121,7 @@ class BundleEncoder:
             for k, integers in enumerate(own, start=first):
                 to[k] = self._keep(integers, np.int32, splats)
         self._streams = (_Stream * STREAMS)()
-        self._work = Spare(lambda: np.zeros(c["potr_bundles_encoding"](), np.uint8))
+        self._work = _memory(c["potr_bundles_encoding"]())
         self._sums = Spare(lambda: (np.zeros((STREAMS, COLUMNS, COLUMNS), np.int64), np.zeros(STREAMS, np.uint32)))
         self._counts = Spare(lambda: np.zeros((STREAMS, _TOKENS, self._alphabet), np.uint32))
         self._alphabet = 0

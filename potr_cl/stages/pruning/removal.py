@@ -31,12 +31,13 @@ from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
+from potr_cl.raster.sweep import most_views
 from potr_cl.raster.view_set import ViewSet
 from potr_cl.stages.pruning.buffers import Bits, PreparedSet, Survivors
 from potr_cl.stages.pruning.exchange import add_totals
 from potr_cl.stages.pruning.resident import ResidentSweep
 from potr_cl.stages.pruning.streamed import StreamedSweep
-from potr_cl.stages.pruning.sweep import FixedPoint, SweepOptions, family_of
+from potr_cl.stages.pruning.sweep import FixedPoint, SweepOptions
 from potr_cl.views import plan as plans
 from potr_cl.views.budget import default_memory, tiles_of
 from potr_cl.views.engine import ViewEngine
@@ -117,7 +118,7 @@ class RemovalSweep(Owner):
                 Survivors(self.device, self.splats, source.stride, lambda: self._resident.queues.wait())
             )
             self.marks: cl.Buffer = self._survivors.buffer
-            self._engine = ViewEngine(source, cameras, plan, self._attach, family_of(self.device).most_views, progress)
+            self._engine = ViewEngine(source, cameras, plan, self._attach, most_views(self.device), progress)
             owned.enter_context(self._engine)
             self._pending.clear()
             self._resident = ResidentSweep(self._engine, self._survivors, self._own, options, self.fixed_point)

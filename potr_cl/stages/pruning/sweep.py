@@ -126,20 +126,18 @@ class Family(NamedTuple):
     """What the kernels of a family can do.
 
     Attributes:
-        most_views: how many views one launch can do.
         most_queues: on how many queues independent launches may run at the same time. A set's longest tile list keeps
             one work-group of a GPU busy when all others are done: other sets fill the gap.
         lists_tiles: whether the device itself can list the tiles that are stale.
         group: work-items of a work-group. PoCL would keep the private memory of more of them on a CPU's stack.
     """
 
-    most_views: int
     most_queues: int
     lists_tiles: bool
     group: int
 
 
-_FAMILIES = {"cpu": Family(1, 1, False, 1), "gpu": Family(32, 4, True, 128)}
+_FAMILIES = {"cpu": Family(1, False, 1), "gpu": Family(4, True, 128)}
 
 
 def family_of(device: Device) -> Family:
