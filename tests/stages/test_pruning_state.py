@@ -108,12 +108,23 @@ def test_what_the_driver_refuses_is_told_in_one_line(survivors, monkeypatch):
 
 
 @pytest.mark.parametrize("refused", ["finish", "flush"])
-def test_so_is_what_queues_refuse(usual_device, refused):
-    queue = SimpleNamespace(finish=lambda: None, flush=lambda: None)
+@pytest.mark.parametrize("most", [1, 2])
+def test_so_is_what_queues_refuse(usual_device, refused, most, monkeypatch):
+    """But one queue is not waited for."""
+    queue = SimpleNamespace(finish=lambda: None, flush=lambda: None, properties=0)
     setattr(queue, refused, refusing)
-    failing = SimpleNamespace(queue=queue, errors=usual_device.errors, finish=lambda: Device.finish(failing))
+    monkeypatch.setattr(cl, "CommandQueue", lambda *_: queue)
+    failing = SimpleNamespace(
+        queue=queue, errors=usual_device.errors, finish=lambda: Device.finish(failing), several_queues=True,
+        context=None, info=SimpleNamespace(handle=None),
+    )  # fmt: skip
+    queues = Queues(failing, most)
+    if (refused, most) == ("finish", 1):
+        assert [piece for piece, _ in queues.dealt([1, 2])] == [1, 2]
+        queues.wait()
+        return
     with pytest.raises(DeviceError, match="INVALID_MEM_OBJECT"):
-        list(Queues(failing, 1).dealt([1, 2]))
+        list(queues.dealt([1, 2]))
 
 
 # -------------------------------------------------------------------------------- tiles that are swept again

@@ -44,7 +44,7 @@ class Survivors(Owner):
     Args:
         splats: N.
         stride: N padded; the buffer holds so many, and all are alive at first.
-        wait: returns once the device has finished what was enqueued.
+        wait: sees to it that what is enqueued from now on comes after all that was.
 
     Attributes:
         buffer: (stride,) uint8 in the device's memory, :class:`SplatState`.

@@ -32,7 +32,7 @@ _SINGLY = 8
 
 
 class Queues:
-    """The device's own queue, or several others.
+    """The device's own queue, which nobody has to wait for as it does one thing after the other; or several others.
 
     Args:
         most: queues to open, where the device takes more than its own.
@@ -40,23 +40,24 @@ class Queues:
 
     def __init__(self, device: Device, most: int) -> None:
         self._device = device
-        self._queues = [device.queue]
+        self._others: list[cl.CommandQueue] = []
         if most > 1 and device.several_queues:
             properties = device.queue.properties
-            self._queues = [cl.CommandQueue(device.context, device.info.handle, properties) for _ in range(most)]
+            self._others = [cl.CommandQueue(device.context, device.info.handle, properties) for _ in range(most)]
 
     def dealt(self, work: Iterable[T]) -> Iterator[tuple[T, cl.CommandQueue]]:
         """Each piece of work with the queue that it goes to, after what the device's own has; :meth:`wait` for all."""
-        self._device.finish()
-        for piece, queue in zip(work, itertools.cycle(self._queues)):
+        if self._others:
+            self._device.finish()
+        for piece, queue in zip(work, itertools.cycle(self._others or [self._device.queue])):
             yield piece, queue
             with self._device.errors("failed while computing"):
                 queue.flush()
 
     def wait(self) -> None:
-        """Return once all is done."""
+        """What the device's own queue is given from now on comes after all that was dealt."""
         with self._device.errors("failed while computing"):
-            for queue in self._queues:
+            for queue in self._others:
                 queue.finish()
 
 
