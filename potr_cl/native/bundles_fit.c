@@ -126,8 +126,8 @@ POTR_EXPORT size_t potr_bundles_grouping(void)
 
 /* Contexts by expected size, and the frequencies of each.
  *
- * counts: (256, alphabet) of expected sizes and tokens, at least one. alphabet: more than the largest token. logs: (4096)
- * log2 of each number, rounded to units of 2^-16. g: room. classes: (256), filled. frequencies: (64 · alphabet), filled
+ * counts: (256, alphabet) of expected sizes and tokens, at least one. alphabet: more than the largest token. logs:
+ * (4096) log2 of each number, rounded to units of 2^-16. g: room. classes: (256), filled. frequencies: (64 · alphabet), filled
  * with (contexts, alphabet). Returns the number of contexts. */
 POTR_EXPORT size_t potr_bundles_contexts(
     const uint32_t *counts, size_t alphabet, const int64_t *logs, grouping *g, uint8_t *classes, uint16_t *frequencies)

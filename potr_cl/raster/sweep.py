@@ -11,13 +11,10 @@ from potr_cl.opencl.device import Device
 from potr_cl.raster.rules import RasterRules
 from potr_cl.raster.view_set import TILE, ViewSet, camera_struct
 
-#: Work-items of a tile's work-group on a GPU, and views of a launch there. A CPU does one view at a time, a work-item a
-#: tile.
-_GROUP = 128
-#: Views that a launch of a GPU does at most. At its end the longest tile list keeps one work-group busy when all others
-#: are done, so one launch is quicker than several. But GPUs that share the host's memory are slow, and drivers end what
-#: takes seconds.
-_MOST_VIEWS, _MOST_VIEWS_OF_SLOW = 128, 32
+#: Work-items of a tile's work-group on a GPU, and views of a launch there at most: at its end the longest tile list
+#: keeps one work-group busy when all others are done, so one launch is quicker than several. A CPU does one view at a
+#: time, a work-item a tile.
+_GROUP, _MOST_VIEWS = 128, 128
 
 
 def sweep_limits(device: Device) -> dict[str, int]:
@@ -52,9 +49,7 @@ def fixed_point_scale(width: int, height: int, largest: float) -> float:
 
 def most_views(device: Device) -> int:
     """Views that a launch over tiles does at most."""
-    if device.family == "cpu":
-        return 1
-    return _MOST_VIEWS_OF_SLOW if device.info.shares_host_memory else _MOST_VIEWS
+    return _MOST_VIEWS if device.family == "gpu" else 1
 
 
 class TileSweep:

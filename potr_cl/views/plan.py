@@ -23,7 +23,6 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.views.budget import (
     COPIED_SPLAT,
     GEOMETRY,
-    LEAST_SETS,
     Budget,
     CacheBudget,
     ClusterBudget,
@@ -93,7 +92,7 @@ def whole(numbers: Sequence[int], splats: int, memory: int) -> ViewPlan:
 
 
 def in_launches(
-    numbers: Sequence[int], strides: Mapping[int, int], cache: ViewCache, most_views: int, splat: int
+    numbers: Sequence[int], strides: Mapping[int, int], cache: ViewCache, most_views: int, splat: int, picture: int
 ) -> ViewPlan:
     """Views that a launch does together, each with room for as many splats as the first of them.
 
@@ -103,14 +102,13 @@ def in_launches(
         cache: keeps them.
         most_views: how many views a launch can do.
         splat: bytes that a splat of a view takes in buffers of a launch's own.
+        picture: bytes of a view's picture, at most.
     """
-    # The largest view has its room in any case.
-    room = max(cache.room // (LEAST_SETS * (GEOMETRY + splat)), *strides.values(), 0)
     groups: list[ViewGroup] = []
     left = tuple(numbers)
     while left:
         stride = strides[left[0]]
-        most = int(min(room // stride, most_views))
+        most = cache.most_views(most_views, (GEOMETRY + splat) * stride + picture)
         groups.append(ViewGroup(left[:most], stride, most=most))
         left = left[most:]
     cache.largest = max((len(group.numbers) * group.count for group in groups), default=0)

@@ -125,6 +125,9 @@ def test_so_is_what_queues_refuse(usual_device, refused, most, monkeypatch):
         return
     with pytest.raises(DeviceError, match="INVALID_MEM_OBJECT"):
         list(queues.dealt([1, 2]))
+    if refused == "finish":
+        with pytest.raises(DeviceError, match="INVALID_MEM_OBJECT"):
+            queues.wait()
 
 
 # -------------------------------------------------------------------------------- tiles that are swept again

@@ -60,7 +60,7 @@ def test_every_view_is_walked_once_and_shows_the_scene(device, memory, copied):
         else:
             cache = stack.enter_context(ViewCache(device, memory))
             strides = dict.fromkeys(range(len(CAMERAS)), whole.stride)
-            source, plan = WholeScene(whole), in_launches(range(len(CAMERAS)), strides, cache, most, 0)
+            source, plan = WholeScene(whole), in_launches(range(len(CAMERAS)), strides, cache, most, 0, 0)
         with ViewEngine(source, CAMERAS, plan, Views, most) as engine:
             launches = engine.walk()
             assert sorted(number for each in launches for number in each.numbers) == list(range(len(CAMERAS)))

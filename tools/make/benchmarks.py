@@ -342,7 +342,7 @@ PLOTS: tuple[Plot, ...] = (
     _knobs(
         "time_error_cpu",
         "on a CPU",
-        {"time_error/lego_cpu": "lego, small views", "time_error/lego_cpu_smallest": "the same, smallest, before"},
+        {"time_error/lego_cpu": "lego, small views", "time_error/lego_cpu_smallest": "the same, smallest"},
         (-8, 15),
     ),
     _knobs(

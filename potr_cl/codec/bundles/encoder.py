@@ -230,11 +230,10 @@ def encode_natively(
         _solved(stream, gram) if own is None else own.numbers
         for stream, gram, own in zip(streams, encoder.grams(), without, strict=True)
     ]
-    alphabets = (tokens_of(encoder.largest().astype(np.int64)).astype(int) + 1).tolist()
-    encoder.take_numbers([some.tolist() for some in numbers], max(alphabets))
+    encoder.take_numbers([some.tolist() for some in numbers])
     deque(run(encoder.count, range(bundles.number)), 0)
     # Each takes so little that threads would wait for each other.
-    found = [encoder.model(*job, log_table()) or _NOTHING for job in enumerate(alphabets)]
+    found = [encoder.model(*job, log_table()) or _NOTHING for job in enumerate(encoder.alphabets())]
     models = [model if own is None else own.model for model, own in zip(found, without, strict=True)]
     encoder.take_models(models)
     coded = list(run(encoder.code, range(bundles.number)))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.bundles.description import Model
-from potr_cl.codec.bundles.streams import Stream
+from potr_cl.codec.bundles.streams import Stream, tokens_of
 from potr_cl.codec.native.bundles import SECTIONS, STREAMS
 from potr_cl.codec.sections import SH, Property
 from potr_cl.host.threads import Spare
@@ -28,8 +28,8 @@ U32 = NDArray[np.uint32]
 COLUMNS, NUMBERS = 22, 21
 _TOKENS = 256
 _LANES, _BUNDLE = 32, 8192
-#: Memory that stays for the bundles of other files, in which some 4 MB of each have been written to.
-_KEPT = 16
+#: So many threads' working memory stays for the next file: 12 MB each, of which a usual file writes to 4.
+_KEPT = 8
 _MOST_ALPHABET, _GROUPS, _LOGS = 252, 64, 4096
 #: Words that a bundle can have at most, for each splat: of 13 streams of splats, and of 15 coefficients' patterns and
 #: values. A token and its bits take four at most.
@@ -123,8 +123,6 @@ class BundleEncoder:
         self._streams = (_Stream * STREAMS)()
         self._work = _memory(c["potr_bundles_encoding"]())
         self._sums = Spare(lambda: (np.zeros((STREAMS, COLUMNS, COLUMNS), np.int64), np.zeros(STREAMS, np.uint32)))
-        self._counts = Spare(lambda: np.zeros((STREAMS, _TOKENS, self._alphabet), np.uint32))
-        self._alphabet = 0
         self._grouping = np.empty(c["potr_bundles_grouping"](), np.uint8)
         self._words = Spare(lambda: np.empty(_WORDS * _BUNDLE + 2, np.uint16))
         for place, stream in zip(self._streams, streams, strict=True):
@@ -164,36 +162,30 @@ class BundleEncoder:
         total: I64 = np.sum([grams for grams, _ in self._sums.all()], axis=0)
         return total
 
-    def largest(self) -> U32:
-        """(25,) the largest integer of each stream, mapped to unsigned."""
-        most: U32 = np.max([largest for _, largest in self._sums.all()], axis=0)
-        return most
+    def alphabets(self) -> list[int]:
+        """Of each stream, once all bundles have been surveyed: more than its largest token."""
+        most = np.max([largest for _, largest in self._sums.all()], axis=0)
+        return [token + 1 for token in tokens_of(most.astype(np.int64)).tolist()]
 
-    def take_numbers(self, numbers: Sequence[Sequence[int]], alphabet: int) -> None:
-        """What tells the contexts of each stream, once all bundles have been surveyed.
-
-        Args:
-            numbers: weights of terms and of recent sizes, constant, biases.
-            alphabet: more than any stream's largest token.
-        """
-        if not 0 < alphabet <= _MOST_ALPHABET:
-            raise TypeError("the native path was given no tokens, or too many")
-        self._alphabet = alphabet
+    def take_numbers(self, numbers: Sequence[Sequence[int]]) -> None:
+        """What tells the contexts of each stream: weights of terms and of recent sizes, constant, biases."""
+        self._width = width = max(self.alphabets())
+        self._counts = Spare(lambda: np.zeros((STREAMS, _TOKENS, width), np.uint32))
         for to, some in zip(self._streams, numbers, strict=True):
             if len(some) != to.terms + 2 + to.coefficients:
                 raise TypeError("the native path was given too few numbers")
             to.numbers[: len(some)] = list(some)
 
     def count(self, bundle: int) -> None:
-        """Add a bundle to the counts that contexts are made of."""
+        """Add a bundle to the counts that contexts are made of; numbers have been taken."""
         with self._counts.taken() as counts, self._work.taken() as work:
             self._c["potr_bundles_count"](
                 ctypes.byref(self._integers),
                 self._checked(bundle),
                 self._streams,
                 work.ctypes.data,
-                self._alphabet,
-                address(counts, np.uint32, counts.size, True),
+                self._width,
+                address(counts, np.uint32, STREAMS * _TOKENS * self._width, True),
             )
 
     def model(self, stream: int, alphabet: int, logs: I64) -> Model | None:
@@ -204,7 +196,7 @@ class BundleEncoder:
             alphabet: more than its largest token.
             logs: (4096,) log₂ of each number, in units of 2^-16.
         """
-        if not 0 < alphabet <= self._alphabet:
+        if not 0 < alphabet <= self._width:
             raise TypeError("the native path was given no tokens, or too many")
         total = np.zeros((_TOKENS, alphabet), np.uint32)
         for counts in self._counts.all():

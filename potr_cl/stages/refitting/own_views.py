@@ -161,7 +161,9 @@ class OwnViews(Owner):
         with ExitStack() as owned:
             self._cache = owned.enter_context(ViewCache(device, room, pictures))
             self._memory = owned.enter_context(Memory(device))
-            plan = plans.in_launches(order, rooms, self._cache, sweep.most_views, _CHANGE + _TOTALS)
+            largest_picture = max((target_bytes(cameras[number]) for number in own_numbers), default=0)
+            given = (self._cache, sweep.most_views, _CHANGE + _TOTALS, largest_picture)
+            plan = plans.in_launches(order, rooms, *given)
             engine = ViewEngine(source, cameras, plan, _Attached, sweep.most_views)
             self._engine: ViewEngine[_Attached] = owned.enter_context(engine)
             if memory is not None:  # pictures are kept in what streamed views leave

@@ -125,8 +125,8 @@ class Refitted:
 
     Attributes:
         sh: (N, M, 3) float32 coefficients, R, G, B.
-        errors: mean squared error over views, pixels and channels before, and after; where colours were rounded, before
-            the last step instead, which takes off some more, and on a CPU perhaps by half of the pixels.
+        errors: mean squared error over views, pixels and channels before, and after; where colours were rounded in
+            rounds, before the last step instead, which takes off some more, and on a CPU perhaps by half of the pixels.
         steps: conjugate-gradient steps that were taken.
     """
 
