@@ -47,6 +47,17 @@ def picture(device, rasterizer, views):
     return found
 
 
+@pytest.mark.one_family
+@pytest.mark.parametrize(
+    ("memory", "picture", "wanted"), [(480_000, 5200, [3, 3, 1]), (480_000, 0, [6, 1]), (0, 9, [1] * 7)]
+)
+def test_a_launch_takes_a_sixteenth_of_the_memory_with_its_pictures(device, memory, picture, wanted):
+    """Of 7 views of 100 splats, 48 bytes each."""
+    with ViewCache(device, memory) as cache:
+        plan = in_launches(range(7), dict.fromkeys(range(7), 100), cache, 128, 0, picture)
+    assert [len(group.numbers) for group in plan.groups] == wanted
+
+
 @pytest.mark.parametrize("memory", [0, 1 << 24], ids=["streamed", "resident"])
 @pytest.mark.parametrize("copied", [False, True], ids=["all splats", "copies"])
 def test_every_view_is_walked_once_and_shows_the_scene(device, memory, copied):

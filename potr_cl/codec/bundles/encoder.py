@@ -233,7 +233,7 @@ def encode_natively(
     encoder.take_numbers([some.tolist() for some in numbers])
     deque(run(encoder.count, range(bundles.number)), 0)
     # Each takes so little that threads would wait for each other.
-    found = [encoder.model(*job, log_table()) or _NOTHING for job in enumerate(encoder.alphabets())]
+    found = [encoder.model(*job, log_table()) or _NOTHING for job in enumerate(encoder.alphabets)]
     models = [model if own is None else own.model for model, own in zip(found, without, strict=True)]
     encoder.take_models(models)
     coded = list(run(encoder.code, range(bundles.number)))

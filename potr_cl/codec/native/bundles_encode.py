@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -162,14 +162,15 @@ class BundleEncoder:
         total: I64 = np.sum([grams for grams, _ in self._sums.all()], axis=0)
         return total
 
+    @cached_property
     def alphabets(self) -> list[int]:
-        """Of each stream, once all bundles have been surveyed: more than its largest token."""
+        """Of each stream: more than its largest token. To be asked for once all bundles have been surveyed."""
         most = np.max([largest for _, largest in self._sums.all()], axis=0)
         return [token + 1 for token in tokens_of(most.astype(np.int64)).tolist()]
 
     def take_numbers(self, numbers: Sequence[Sequence[int]]) -> None:
         """What tells the contexts of each stream: weights of terms and of recent sizes, constant, biases."""
-        self._width = width = max(self.alphabets())
+        self._width = width = max(self.alphabets)
         self._counts = Spare(lambda: np.zeros((STREAMS, _TOKENS, width), np.uint32))
         for to, some in zip(self._streams, numbers, strict=True):
             if len(some) != to.terms + 2 + to.coefficients:

@@ -155,15 +155,14 @@ class OwnViews(Owner):
         # Views of a launch have about as many splats.
         order = sorted(own_numbers, key=lambda each: (-rooms[each], each))
         # To render a picture takes many times as long as to project a view, and it takes less room.
-        pictures = sum(target_bytes(cameras[number]) for number in own_numbers)
+        pictures = [target_bytes(cameras[number]) for number in own_numbers]
         later = layout.stride * (8 * layout.triangle + 4 * layout.columns * (_LATER + _EXCHANGED * shared))
         room = free_memory(device, later) if memory is None else memory
         with ExitStack() as owned:
-            self._cache = owned.enter_context(ViewCache(device, room, pictures))
+            self._cache = owned.enter_context(ViewCache(device, room, sum(pictures)))
             self._memory = owned.enter_context(Memory(device))
-            largest_picture = max((target_bytes(cameras[number]) for number in own_numbers), default=0)
-            given = (self._cache, sweep.most_views, _CHANGE + _TOTALS, largest_picture)
-            plan = plans.in_launches(order, rooms, *given)
+            most, largest = sweep.most_views, max(pictures, default=0)
+            plan = plans.in_launches(order, rooms, self._cache, most, _CHANGE + _TOTALS, largest)
             engine = ViewEngine(source, cameras, plan, _Attached, sweep.most_views)
             self._engine: ViewEngine[_Attached] = owned.enter_context(engine)
             if memory is not None:  # pictures are kept in what streamed views leave
